@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import permutations
 
 import numpy as np
 import scipy.linalg
@@ -215,7 +216,7 @@ class ToldApart:
 
     def __init__(self, coordinates: Coordinates, causes: Sequence[CollinearEffect], questions: int):
         self.coordinates, self.causes = coordinates, tuple(causes)
-        self.pairs = [(a, b) for a in self.causes for b in self.causes if a is not b]
+        self.pairs = list(permutations(self.causes, 2))
         self.words = ' and '.join(cause.key[1] for cause in causes)
         self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
         self.reachable = np.ones(len(self.pairs), bool)

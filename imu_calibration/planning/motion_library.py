@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -294,12 +294,10 @@ class MotionLibrary:
             )
         ]
         self.places = np.unique(np.round([motion.place for motion in self.motions], 9), axis=0)
-        self.place_of = np.array(
-            [
-                int(np.argmin(np.abs(self.places - motion.place).sum(axis=1)))
-                for motion in self.motions
-            ]
-        )
+        nearest = []
+        for motion in self.motions:
+            nearest.append(int(np.argmin(np.abs(self.places - motion.place).sum(axis=1))))
+        self.place_of = np.array(nearest)
 
     def _rests(self):
         for place in self.spread:
@@ -320,11 +318,9 @@ class MotionLibrary:
                     rates = np.zeros(len(self.names))
                     rates[joint] = share * self.limits.speed[joint]
                     if self.limits.endless[joint]:
-                        yield from (
-                            (MotionKind.SPIN, *self._whole_turns(place, sense * rates, seconds))
-                            for sense in (1.0, -1.0)
-                            for seconds in SPIN_TIME
-                        )
+                        for sense, seconds in product((1.0, -1.0), SPIN_TIME):
+                            turns = self._whole_turns(place, sense * rates, seconds)
+                            yield MotionKind.SPIN, *turns
                     elif made := self._sweep(place, rates):
                         yield MotionKind.SPIN, *made
 

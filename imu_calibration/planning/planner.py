@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -231,19 +232,20 @@ class Plan:
         """
         Segments of each motion, the way to it included, each going on where the last one ended.
         """
-        position, found = np.asarray(self.start), []
+        position = np.asarray(self.start)
+        all_segments = []
         for motion in self.motions:
-            found.append(motion.from_position(position))
-            position = np.asarray(found[-1][-1].end) if found[-1] else position
-        return tuple(found)
+            segments = motion.from_position(position)
+            all_segments.append(segments)
+            if segments:
+                position = np.asarray(segments[-1].end)
+        return tuple(all_segments)
 
     @property
     def points(self) -> TrajectoryPoints:
         """The whole plan as one trajectory."""
-        return trajectory(
-            tuple(self.model.joint_names),
-            tuple(segment for one in self.segments for segment in one),
-        )
+        segments = tuple(chain.from_iterable(self.segments))
+        return trajectory(tuple(self.model.joint_names), segments)
 
 
 class Planner:
@@ -490,15 +492,8 @@ def plan_by_hand(
         Samples per second.
 
     """
-    force_sd, rate_sd = (
-        float(
-            np.sqrt(
-                noise[s].low_variance.mean() / (HOLD_TIME * rate)
-                + sum(p.sd**2 for p in noise[s].bias_processes)
-            )
-        )
-        for s in ('accelerometer', 'gyroscope')
-    )
+    force_sd = _mean_sd(noise['accelerometer'], HOLD_TIME * rate)
+    rate_sd = _mean_sd(noise['gyroscope'], HOLD_TIME * rate)
     turn_sd = float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate))
     knowledge = knowledge_at_first(model, tolerances, noise=(force_sd, rate_sd, turn_sd))
     steps = foretold(knowledge)
@@ -568,6 +563,12 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _mean_sd(noise, n_samples):
+    """Return the sd of a mean of samples: sqrt(white variance / n + variances of the biases)."""
+    wander = sum(process.sd**2 for process in noise.bias_processes)
+    return float(np.sqrt(noise.low_variance.mean() / n_samples + wander))
+
+
 def trajectory_to_mapping(points: TrajectoryPoints) -> dict[str, Any]:
     """
     Return a trajectory as the fields of trajectory_msgs/JointTrajectory.
@@ -582,12 +583,10 @@ def trajectory_to_mapping(points: TrajectoryPoints) -> dict[str, Any]:
     rows = []
     for k, time in enumerate(points.time):
         seconds, nanoseconds = divmod(round(float(time) * 1e9), 1_000_000_000)
-        rows.append(
-            {
-                name: [float(f'{value:.9g}') for value in values[k]]
-                for name, values in columns.items()
-                if values is not None
-            }
-            | {'time_from_start': {'sec': seconds, 'nanosec': nanoseconds}}
-        )
+        row: dict[str, Any] = {}
+        for name, values in columns.items():
+            if values is not None:
+                row[name] = [float(f'{value:.9g}') for value in values[k]]
+        row['time_from_start'] = {'sec': seconds, 'nanosec': nanoseconds}
+        rows.append(row)
     return {'joint_names': list(points.joint_names), 'points': rows}

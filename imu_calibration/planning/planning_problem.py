@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 
@@ -103,15 +104,11 @@ class PlanningProblem:
     def ways(self) -> dict[tuple[int, int], tuple[Segment, ...]]:
         """(place, place) -> the move from one to the other."""
         places = self.library.places
-        return {
-            (a, b): (
-                MotionBuilder(len(start), limits=self.library.limits, start=start)
-                .move_to(end)
-                .segments
-            )
-            for a, start in enumerate(places)
-            for b, end in enumerate(places)
-        }
+        ways = {}
+        for a, b in product(range(len(places)), repeat=2):
+            builder = MotionBuilder(len(places[a]), limits=self.library.limits, start=places[a])
+            ways[a, b] = builder.move_to(places[b]).segments
+        return ways
 
     @cached_property
     def way_windows(self) -> dict[tuple[int, int], list[PlannedWindow]]:
@@ -121,8 +118,10 @@ class PlanningProblem:
     @cached_property
     def way_seconds(self) -> np.ndarray:
         """Length of each move, s, shape (n_places, n_places)."""
-        seconds = np.array([sum(segment.duration for segment in way) for way in self.ways.values()])
-        return seconds.reshape((len(self.library.places),) * 2)
+        seconds = np.zeros((len(self.library.places),) * 2)
+        for places, way in self.ways.items():
+            seconds[places] = sum(segment.duration for segment in way)
+        return seconds
 
     def way_information(self, place: int) -> np.ndarray:
         """
@@ -130,14 +129,11 @@ class PlanningProblem:
 
         Shape (k, m, m).
         """
-        posterior, targets = self.posterior(), self.library.place_of
-        found = np.array(
-            [
-                posterior.information_of(self.way_windows[place, b])
-                for b in range(len(self.library.places))
-            ]
-        )
-        return found[targets]
+        posterior = self.posterior()
+        of_moves = []
+        for target in range(len(self.library.places)):
+            of_moves.append(posterior.information_of(self.way_windows[place, target]))
+        return np.array(of_moves)[self.library.place_of]
 
     @property
     def prior(self) -> np.ndarray:
@@ -162,25 +158,24 @@ class PlanningProblem:
 
         Each place is the nearest one, and the first rest is longer.
         """
-        rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE]
-        left, chosen = {int(self.library.place_of[k]): None for k in rests}, []
-        # Places are in the order of their distance in attitude.
-        left = dict.fromkeys(list(left)[:LEAST_RESTS])
-        while len(chosen) < LEAST_RESTS and (left or len(chosen) > 1):
-            if not left:  # a chain with few attitudes returns to them
-                left = dict.fromkeys(
-                    int(self.library.place_of[k])
-                    for k in chosen
-                    if self.library.place_of[k] != place
-                )
-            place = min(left, key=lambda at: self.way_seconds[place, at])
-            del left[place]
-            here = [
-                k
-                for k in rests
-                if self.library.place_of[k] == place and (chosen or self.seconds[k] >= FIRST_REST)
-            ]
-            chosen.append(min(here, key=self.seconds.__getitem__))
+        # Motions at rest of each place; places are in the order of their distance in attitude.
+        rests_at: dict[int, list[int]] = {}
+        for number, motion in enumerate(self.motions):
+            if motion.kind is MotionKind.POSE:
+                rests_at.setdefault(int(self.library.place_of[number]), []).append(number)
+        unvisited = list(rests_at)[:LEAST_RESTS]
+        chosen: list[int] = []
+        visited: list[int] = []
+        while len(chosen) < LEAST_RESTS and (unvisited or len(chosen) > 1):
+            if not unvisited:  # a chain with few attitudes returns to them
+                unvisited = [at for at in dict.fromkeys(visited) if at != place]
+            place = min(unvisited, key=lambda at: self.way_seconds[place, at])
+            unvisited.remove(place)
+            visited.append(place)
+            rests = rests_at[place]
+            if not chosen:
+                rests = [number for number in rests if self.seconds[number] >= FIRST_REST]
+            chosen.append(min(rests, key=self.seconds.__getitem__))
         return chosen
 
     def variance_factor(self, windows: Sequence[PlannedWindow]) -> float:
@@ -196,9 +191,10 @@ class PlanningProblem:
         if not isinstance(self.goal, WithinTolerances):
             return 1.0
         counts = np.array([window.samples for window in windows if window.kind == 'static'])
-        rests = (counts.sum() ** 2 / (counts**2).sum() if len(counts) else 1.0) + (
-            0 if self.known is None else LEAST_RESTS
-        )
+        # Rests of equal length with the same variance of the estimate.
+        rests = counts.sum() ** 2 / (counts**2).sum() if len(counts) else 1.0
+        if self.known is not None:
+            rests += LEAST_RESTS
         return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * rests) / (BATCH_DOF * rests))
 
     def least_session(self) -> float:
@@ -208,12 +204,10 @@ class PlanningProblem:
         These are the rests with which a session begins.
         """
         rests = self.first_rests(0)
+        if len(rests) <= 1:
+            return 0.0
         away = self.way_seconds[~np.eye(len(self.way_seconds), dtype=bool)]
-        return (
-            float(self.seconds[rests].sum() + max(len(rests) - 1, 0) * away.min(initial=np.inf))
-            if len(rests) > 1
-            else 0.0
-        )
+        return float(self.seconds[rests].sum() + (len(rests) - 1) * away.min(initial=np.inf))
 
     def lower_bound(self, *, factor: float = 1.0, relaxed: Relaxation | None = None) -> float:
         """
@@ -252,21 +246,22 @@ class PlanningProblem:
 
         Infinite if they are out of reach.
         """
-        model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
+        coordinates = self.coordinates
         lengths = np.geomspace(0.01, MAX_REACHABLE_SECONDS, 2000)
+        floor = 0.0
         for sensor in SENSORS:
-            for k, parameter in enumerate(
-                range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names)))
-            ):
+            biases = coordinates.model.part(sensor, Role.OFFSET)
+            for k, parameter in enumerate(range(biases.start, biases.stop)):
+                # The observations must have at most this variance: 1/wanted = 1/prior + 1/room.
                 prior = coordinates.prior_sd[parameter] ** 2
                 wanted = coordinates.tolerances[parameter] ** 2
                 room = 1.0 / (1.0 / wanted - 1.0 / prior) if wanted < prior else np.inf
                 white = factor * self.noise[sensor].low_variance[k % 3] / self.rate
                 enough = least_bias_variance(self.noise[sensor], white, lengths) <= room
-                floor = max(
-                    floor,
-                    float(lengths[max(int(np.argmax(enough)) - 1, 0)]) if enough.any() else np.inf,
-                )
+                if not enough.any():
+                    return np.inf
+                # The last length that is too short.
+                floor = max(floor, float(lengths[max(int(np.argmax(enough)) - 1, 0)]))
         return floor
 
     def relaxation(
@@ -280,23 +275,12 @@ class PlanningProblem:
         share, seconds = common
         edges = [key for key, windows in self.way_windows.items() if windows]
         own = np.flatnonzero(self.seconds > 0)
-        everything = [
-            *(self.windows[number] for number in own),
-            *(self.way_windows[key] for key in edges),
-        ]
-        empty = np.zeros_like(self.coordinates.prior_information)
-        most = np.array(
-            [
-                sum(
-                    (
-                        additive_bound(window, self.noise, share=1.0 - share, factor=factor)
-                        for window in windows
-                    ),
-                    empty,
-                )
-                for windows in everything
-            ]
-        )
+        visits = [self.windows[number] for number in own]
+        visits += [self.way_windows[key] for key in edges]
+        most = np.zeros((len(visits), *self.coordinates.prior_information.shape))
+        for number, windows in enumerate(visits):
+            for window in windows:
+                most[number] += additive_bound(window, self.noise, share=1.0 - share, factor=factor)
         cost = np.concatenate([self.seconds[own], [self.way_seconds[key] for key in edges]])
         prior, asked = self.prior, self.coordinates.asked
         if share:
@@ -435,11 +419,8 @@ def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dic
         return noise_of_grade(GRADES[grade].noise, rate)
     figures.require_both_sensors('record both sensors')
     slow = bias_processes(figures)  # the slow part as Gauss-Markov processes
-    return {
-        sensor: NoiseModel(
-            np.array([axis.white**2 * rate for axis in figures.sensor(sensor)]),
-            np.ones(3),
-            bias_processes=slow[sensor],
-        )
-        for sensor in SENSORS
-    }
+    noise = {}
+    for sensor in SENSORS:
+        variance = np.array([axis.white**2 * rate for axis in figures.sensor(sensor)])
+        noise[sensor] = NoiseModel(variance, np.ones(3), bias_processes=slow[sensor])
+    return noise

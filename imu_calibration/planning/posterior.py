@@ -65,31 +65,30 @@ def relax(
     weights = np.full(len(asked), 1.0 / len(asked))
     if _worst(known, asked) <= 1.0:
         return Relaxation(0.0, weights)
-    if (
-        _worst(
-            known + MAX_REACHABLE_SECONDS * np.sum(information / seconds[:, None, None], axis=0),
-            asked,
-        )
-        > 1.0
-    ):
+    per_second = np.sum(information / seconds[:, None, None], axis=0)
+    if _worst(known + MAX_REACHABLE_SECONDS * per_second, asked) > 1.0:
         return Relaxation(np.nan, weights)
     flat = used = information.reshape(len(seconds), -1)
-    kept, root = np.arange(len(seconds)), np.linalg.cholesky(known)
+    kept = np.arange(len(seconds))
+    root = np.linalg.cholesky(known)
     rows = scipy.linalg.solve_triangular(root, asked.T, lower=True).T
     share = 1.0 / len(seconds) / seconds
     best = Relaxation(0.0, weights)
     for number in range(MAX_WEIGHT_STEPS):
         direction = np.tensordot(share[kept], used, 1).reshape(known.shape)
         scale = _scale(direction, root, rows)
+        # With C the covariance and w the weights: variance_p = e_p' C e_p, and the price matrix
+        # C (sum_p w_p e_p e_p') C; worth of a visit: tr(information prices) per second.
         # Nearly singular in unreachable directions.
         covariance = inverse_normal(known + scale * direction)
-        x = covariance @ asked.T
-        variance = np.einsum('pn,np->p', asked, x)
-        prices = (x * weights) @ x.T
+        columns_asked = covariance @ asked.T
+        variance = np.einsum('pn,np->p', asked, columns_asked)
+        prices = (columns_asked * weights) @ columns_asked.T
         worth = np.zeros(len(seconds))
         worth[kept] = used @ prices.ravel() / seconds[kept]
         relaxed = scale * float(share @ seconds)
         if number % 25 == 0 or number == MAX_WEIGHT_STEPS - 1:
+            # The certificate needs the worth of all motions, the steps only of the useful ones.
             worth = flat @ prices.ravel() / seconds
             factor = 1.0 / worth.max()
             bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
@@ -97,12 +96,12 @@ def relax(
                 best = Relaxation(float(bound), weights)
             if relaxed < CERTIFICATE_RATIO * best.seconds:
                 break
-            kept = np.flatnonzero(
-                (worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds))
-            )
+            is_visited = share * seconds > 1e-4 * (share @ seconds)
+            kept = np.flatnonzero((worth > 0.3 * worth.max()) | is_visited)
             used = flat[kept]
         spent = share[kept] * seconds[kept]
-        share[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / (worth[kept] @ spent / spent.sum()))
+        mean_worth = worth[kept] @ spent / spent.sum()
+        share[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / mean_worth)
         share = np.where(np.isin(np.arange(len(share)), kept) | (number <= 50), share, 0.0)
         weights = weights * variance / variance.max()
         weights /= weights.sum()
@@ -166,6 +165,22 @@ class PlannedWindow:
     """Information of the samples about their means, of both sensors together, shape (n, n)."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Part of a planned motion that becomes one window."""
+
+    motion: JointMotion
+    """At some instants."""
+    kind: str
+    """As the calibration will call it."""
+    middle: float
+    """Time since the motion began, s."""
+    length: float
+    """s, with the lost time before it."""
+    seconds: float
+    """Seconds of data."""
+
+
 WINDOW_SETTINGS = WindowSettings()
 """How the calibration will cut windows."""
 
@@ -193,61 +208,54 @@ class WindowPredictor:
 
     def predict(self, motions: Sequence[tuple[Segment, ...]]) -> list[list[PlannedWindow]]:
         """Return the windows of each of several motions, a tuple of segments each."""
-        cuts = [list(self._cut(segments)) for segments in motions]
-        flat = [cut for one in cuts for cut in one]
-        blocks = np.cumsum([len(cut[0]) for cut in flat]) // BELIEF_BLOCK_ROWS
+        cuts, n_cuts = [], []
+        for segments in motions:
+            cuts_of_motion = list(self._cut(segments))
+            cuts += cuts_of_motion
+            n_cuts.append(len(cuts_of_motion))
+
+        # The columns of several windows at a time, which limits the memory.
+        blocks = np.cumsum([len(cut.motion) for cut in cuts]) // BELIEF_BLOCK_ROWS
         # Many motions last equally long, at least a move and its way back.
         wander = cache(self._wander)
-        windows = iter(
-            [
-                window
-                for block in np.unique(blocks)
-                for window in self._windows(
-                    [flat[k] for k in np.flatnonzero(blocks == block)], wander
-                )
-            ]
-        )
-        return [[next(windows) for _ in one] for one in cuts]
+        windows = []
+        for block in np.unique(blocks):
+            windows += self._windows([cuts[k] for k in np.flatnonzero(blocks == block)], wander)
+
+        ends = np.cumsum(n_cuts)
+        return [windows[end - n : end] for end, n in zip(ends, n_cuts)]
 
     def _windows(self, cuts, wander):
-        motion = JointMotion.concatenate(cut[0] for cut in cuts)
-        edges = np.cumsum([0] + [len(cut[0]) for cut in cuts])
+        motion = JointMotion.concatenate(cut.motion for cut in cuts)
+        ends = np.cumsum([len(cut.motion) for cut in cuts])
         model = self.coordinates.folded
-        temperature = (
-            np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None
-        )
+        temperature = None
+        if model.needs_temperature:
+            temperature = np.full(len(motion), model.temperature_ref_c)
         references = References(model, self.table, motion, temperature_c=temperature)
         designs = {sensor: columns(references, sensor) for sensor in SENSORS}
-        return [
-            self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander)
-            for cut, a, b in zip(cuts, edges, edges[1:], strict=False)
-        ]
+        windows = []
+        for cut, end in zip(cuts, ends):
+            rows = slice(end - len(cut.motion), end)
+            designs_of_cut = {sensor: designs[sensor][rows] for sensor in SENSORS}
+            windows.append(self._window(cut, designs_of_cut, wander))
+        return windows
 
-    def _cut(self, segments) -> Iterator[tuple[JointMotion, str, float, float, float]]:
-        """
-        Yield (motion at some instants, kind, middle, length, seconds) of each window.
-
-        The length includes settling, and the seconds are seconds of data.
-        """
+    def _cut(self, segments) -> Iterator[_Cut]:
+        """Yield the windows into which the calibration will cut a motion."""
         begin = 0.0
         for segment in segments:
             kind = WINDOWS.get(segment.kind, 'dynamic')
             lost = 0.0 if kind == 'dynamic' else WINDOW_SETTINGS.settling
             seconds = segment.duration - lost
             if seconds >= getattr(WINDOW_SETTINGS, f'{kind}_minimum'):
-                count = (
-                    LEAST_INSTANTS
-                    if kind == 'static'
-                    else max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
-                )
+                count = LEAST_INSTANTS
+                if kind != 'static':
+                    count = max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
                 time = lost + (np.arange(count) + 0.5) / count * seconds
-                yield (
-                    Profile('', (segment,)).at(time),
-                    kind,
-                    begin + lost + seconds / 2,
-                    segment.duration,
-                    seconds,
-                )
+                motion = Profile('', (segment,)).at(time)
+                middle = begin + lost + seconds / 2
+                yield _Cut(motion, kind, middle, segment.duration, seconds)
             begin += segment.duration
 
     def _wander(self, sensor, count, seconds):
@@ -258,21 +266,23 @@ class WindowPredictor:
         mirrored covariance.
         """
         half = count // 2
-        return np.linalg.eigh(
-            self.noise[sensor].wander_within(
-                ((np.arange(count - half, count) + 0.5) / count - 0.5) * seconds
-            )
-        )
+        after_middle = ((np.arange(count - half, count) + 0.5) / count - 0.5) * seconds
+        return np.linalg.eigh(self.noise[sensor].wander_within(after_middle))
 
     def _window(self, cut, designs, wander_of):
-        motion, kind, middle, length, seconds = cut
-        samples, count = seconds * self.rate, len(motion)
-        means, variance, within = {}, {}, np.zeros((self.coordinates.size,) * 2)
+        samples = cut.seconds * self.rate
+        count = len(cut.motion)
+        means, variance = {}, {}
+        within = np.zeros((self.coordinates.size,) * 2)
         for sensor, design in designs.items():
-            slope, noise = self.coordinates.slopes[sensor], self.noise[sensor]
-            means[sensor], variance[sensor] = np.empty((3, slope.shape[2])), np.empty(3)
-            reference = noise.reference.variance([kind], np.array([seconds]))[0]
-            after, turned = wander_of(sensor, count, seconds)
+            slope = self.coordinates.slopes[sensor]
+            noise = self.noise[sensor]
+            means[sensor] = np.empty((3, slope.shape[2]))
+            variance[sensor] = np.empty(3)
+            reference = noise.reference.variance([cut.kind], np.array([cut.seconds]))[0]
+            # In the directions of the wander its values are independent, before and after the
+            # middle: the rows are weighted by the sum of both variances.
+            after, turned = wander_of(sensor, count, cut.seconds)
             wander = np.concatenate([after, np.zeros(count % 2), after])
             early, centre, late = np.split(
                 np.column_stack([np.ones(count), design]), [len(after), count - len(after)]
@@ -288,7 +298,7 @@ class WindowPredictor:
                 variance[sensor][axis] += reference
                 means[sensor][axis] = mean @ slope[:, axis]
                 within += centred.T @ (centred * weight[:, None])
-        return PlannedWindow(kind, middle, length, samples, means, variance, within)
+        return PlannedWindow(cut.kind, cut.middle, cut.length, samples, means, variance, within)
 
 
 class Posterior:
@@ -309,13 +319,12 @@ class Posterior:
     """
 
     def __init__(self, information: np.ndarray, noise: dict[str, NoiseModel]):
-        self.size, self.noise = len(information), noise
-        processes = [
-            process
-            for sensor in SENSORS
-            for process in noise[sensor].bias_processes
-            for _ in range(3)
-        ]
+        self.size = len(information)
+        self.noise = noise
+        processes = []
+        for sensor in SENSORS:
+            for process in noise[sensor].bias_processes:
+                processes += [process, process, process]  # one for each axis
         self._power = np.array([process.sd**2 for process in processes])
         self._times = np.array([process.time for process in processes])
         total = self.size + len(processes)
