@@ -365,12 +365,14 @@ def stretch(build: Callable, duration: float) -> tuple[Segment, ...]:
         When `duration` is below the time of moves and ramps with the shortest dwells.
 
     """
-    length = [sum(segment.duration for segment in build(dwell)) for dwell in (1.0, 2.0)]
-    change = length[1] - length[0]
-    if duration < (shortest := length[0] - (1.0 - SHORTEST_DWELL) * change) - 1e-6:
+    # The length is linear in the dwell.
+    length = sum(segment.duration for segment in build(1.0))
+    change = sum(segment.duration for segment in build(2.0)) - length
+    shortest = length - (1.0 - SHORTEST_DWELL) * change
+    if duration < shortest - 1e-6:
         raise InputError(
             f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s;'
             ' choose more or another profile',
             code='too_short',
         )
-    return build(1.0 + (duration - length[0]) / change)
+    return build(1.0 + (duration - length) / change)

@@ -6,6 +6,7 @@ The module also holds the motions of the two source papers.
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -127,11 +128,11 @@ def swings(
     """
     Return the tasks of swinging about each sensor axis at each amplitude (deg) and frequency (Hz).
     """
-    return [
-        swing(axis, *cycle, duration=duration)
-        for axis in range(3)
-        for cycle in amplitudes_and_frequencies
-    ]
+    tasks = []
+    for axis in range(3):
+        for amplitude, frequency in amplitudes_and_frequencies:
+            tasks.append(swing(axis, amplitude, frequency, duration=duration))
+    return tasks
 
 
 def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> list[Task]:
@@ -245,18 +246,14 @@ def _zhang_oscillations(builder, _rng):
 
 def _zhang_mixed(builder, _rng):
     _six_faces(builder)
-    tasks = [spin_vertical(axis, 200.0, 6.0) for axis in np.eye(3)] + swings(((10.0, 1.0),), 12.0)
-    for task in [
-        *tasks,
-        *(
-            two_axes(at_deg, rates, 6.0)
-            for at_deg, rates in (
-                ([0, 0, 0], [200, 0, 200]),
-                ([0, 0, 0], [200, 200, 0]),
-                ([0, 0, 90], [200, 200, 0]),
-            )
-        ),
-    ]:
+    tasks = [
+        *(spin_vertical(axis, 200.0, 6.0) for axis in np.eye(3)),
+        *swings(((10.0, 1.0),), 12.0),
+        two_axes([0, 0, 0], [200, 0, 200], 6.0),
+        two_axes([0, 0, 0], [200, 200, 0], 6.0),
+        two_axes([0, 0, 90], [200, 200, 0], 6.0),
+    ]
+    for task in tasks:
         task(builder)
 
 
@@ -268,6 +265,12 @@ A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then 
 sensor axes.
 """
 
+
+def _gimbals(order, up_axis):
+    """Return a table with axes in an order from the base, e.g. 'ZYX', and its vertical."""
+    return _table([AXIS_VECTORS[axis] for axis in order], AXIS_VECTORS[up_axis])
+
+
 REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
     **{
         f'avrutov_{order}{suffix}': (
@@ -276,14 +279,11 @@ REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
                 ' or _up_y to turn gravity'
             ),
             _equal_angles,
-            _table([AXIS_VECTORS[axis] for axis in order], up),
+            _gimbals(order, up_axis),
             3,
         )
-        for order in AXIS_ORDERS
-        for suffix, up in (
-            ('', AXIS_VECTORS['Z']),
-            ('_up_x', AXIS_VECTORS['X']),
-            ('_up_y', AXIS_VECTORS['Y']),
+        for order, (suffix, up_axis) in product(
+            AXIS_ORDERS, (('', 'Z'), ('_up_x', 'X'), ('_up_y', 'Y'))
         )
     },
     'avrutov_111': (

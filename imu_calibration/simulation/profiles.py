@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,13 @@ from imu_calibration.simulation.motion_primitives import (
     two_axes,
 )
 
+_SIGNS = list(product((1, -1), repeat=2))
 EDGES = np.array(
-    [[a, b, 0] for a in (1, -1) for b in (1, -1)]
-    + [[a, 0, b] for a in (1, -1) for b in (1, -1)]
-    + [[0, a, b] for a in (1, -1) for b in (1, -1)]
+    [[a, b, 0] for a, b in _SIGNS] + [[a, 0, b] for a, b in _SIGNS] + [[0, a, b] for a, b in _SIGNS]
 ) / np.sqrt(2)
-CORNERS = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)]) / np.sqrt(3)
+"""Directions to the middles of the edges of a cube, shape (12, 3)."""
+CORNERS = np.array(list(product((1, -1), repeat=3))) / np.sqrt(3)
+"""Directions to the corners of a cube, shape (8, 3)."""
 
 MAX_PROFILE_SWING = 0.5
 """Amplitude of a swing at most, rad or m."""
@@ -426,27 +428,20 @@ def _any_table(builder, rng):
     """Poses, spins at three speeds, swings and two joints at once for any number of joints."""
     count = builder.n_joints
     angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
-    tasks, only = [_rest_at(np.radians(row)) for row in angles], np.eye(count)
+    tasks = [_rest_at(np.radians(row)) for row in angles]
+    only = np.eye(count)
     for joint in range(count):
-        tasks += [
-            spin_joint(joint, rng.uniform(-180, 180, count), speed, dwell=4.0)
-            for speed in SPEEDS_DEG
-        ]
-        tasks += [
-            swing_at(
-                np.radians(rng.uniform(-180, 180, count)),
-                np.radians(10.0 / cycles * only[joint]),
-                cycles,
-                duration=4.0,
-                settle=False,
-            )
-            for cycles in (0.5, 1.0, 2.0)
-        ]
-        tasks += [
-            two_axes(at_deg, 120.0 * only[joint] + 80.0 * only[other], 5.0)
-            for other in range(joint)
-            for at_deg in rng.uniform(-180, 180, (3, count))
-        ]
+        for speed in SPEEDS_DEG:
+            tasks.append(spin_joint(joint, rng.uniform(-180, 180, count), speed, dwell=4.0))
+        for frequency in (0.5, 1.0, 2.0):
+            place = np.radians(rng.uniform(-180, 180, count))
+            # The same largest rate at each frequency.
+            amplitude = np.radians(10.0 / frequency * only[joint])
+            tasks.append(swing_at(place, amplitude, frequency, duration=4.0, settle=False))
+        for other in range(joint):
+            rates_deg = 120.0 * only[joint] + 80.0 * only[other]
+            for at_deg in rng.uniform(-180, 180, (3, count)):
+                tasks.append(two_axes(at_deg, rates_deg, 5.0))
     run(builder, rng, tasks)
 
 

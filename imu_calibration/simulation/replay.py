@@ -123,14 +123,16 @@ def simulate_on_recording(
     outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
     stamps = np.concatenate([window.stamp_ns for window in windows])
     period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
-    noise, rng = noise or recorded_noise(windows), np.random.default_rng([seed, 3])
-    exact = {sensor: np.concatenate([output[sensor] for output in outputs]) for sensor in SENSORS}
+    noise = noise or recorded_noise(windows)
+    rng = np.random.default_rng([seed, 3])
+    exact = {}
+    for sensor in SENSORS:
+        exact[sensor] = np.concatenate([output[sensor] for output in outputs])
     if model.uses('vibration'):  # biases follow the vibration of the readings
-        known = [
-            np.asarray(motion.vibration)[rows]
-            for motion, _, rows in map(all_samples, chunks(windows))
-        ]
-        variance = np.concatenate(known)
+        of_chunks = []
+        for motion, _, rows in map(all_samples, chunks(windows)):
+            of_chunks.append(np.asarray(motion.vibration)[rows])
+        variance = np.concatenate(of_chunks)
         unit = unit_hum(period * np.arange(len(variance)), 1.0 / period)
         exact['accelerometer'] += unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
     readings = []
@@ -140,9 +142,8 @@ def simulate_on_recording(
         noisy += gauss_markov_samples(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
         readings.append(clip(model, sensor, values, output=noisy))
     frame = next(block.imu.frame_id for block in blocks if block.imu is not None and len(block.imu))
-    joints, temperature = (
-        _joined([getattr(block, name) for block in blocks]) for name in ('joints', 'temperature')
-    )
+    joints = _joined([block.joints for block in blocks])
+    temperature = _joined([block.temperature for block in blocks])
     lost = sum(len(block.imu) for block in blocks if block.imu is not None) - len(stamps)
     return (
         SampleBlock(ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature),
