@@ -189,13 +189,12 @@ def _compensated(
 
     Or None if compensation corrects no additional one.
     """
-    sides = [
-        [question for question in some if question in found.adopted] for some in (before, after)
-    ]
-    additional = [question for question in sides[1] if question not in sides[0]]
-    return (
-        sides if any(question.effect.compensation == 'exact' for question in additional) else None
-    )
+    adopted_before = [question for question in before if question in found.adopted]
+    adopted_after = [question for question in after if question in found.adopted]
+    for question in adopted_after:
+        if question not in adopted_before and question.effect.compensation == 'exact':
+            return [adopted_before, adopted_after]
+    return None
 
 
 def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Side:
@@ -320,7 +319,9 @@ def _errors(
     references = References(at_ideal, table, motion, temperature_c=temperature)
     refs = [references.at(sensor) for sensor in SENSORS]
     ref = refs[1].select(rows)
-    raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
+    raw = []
+    for sensor in SENSORS:
+        raw.append(np.concatenate([measured(window, sensor) for window in windows]))
     count = len(values)
     known = Calibration(model, side.applied, np.zeros((count, count)), (HELD,) * count)
     corrected = compensated_samples(

@@ -203,23 +203,25 @@ def _baseline(solution: Solution, sensor: str) -> dict[str, Any]:
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
+    parameters = {}
+    for name, (value, sd, unit) in finding.parameters.items():
+        parameters[name] = {'value': value, 'sd': sd, 'unit': unit}
+    sizes_of_mates: dict[str, dict[str, Any]] = {}
+    for mate, sizes in finding.sizes_of_mates.items():
+        sizes_of_mates[mate] = {}
+        for name, (value, unit) in sizes.items():
+            sizes_of_mates[mate][name] = {'value': value, 'unit': unit}
     return {
         'effect': finding.effect,
         'sensor': finding.sensor,
         'explanation': finding.explanation,
-        'parameters': {
-            name: {'value': value, 'sd': sd, 'unit': unit}
-            for name, (value, sd, unit) in finding.parameters.items()
-        },
+        'parameters': parameters,
         'p_value': finding.p_value,
         'heldout_log_likelihood_gain': finding.heldout_gain,
         'share_of_unexplained': finding.share,
         'gain': _gain(finding.gain),
         'indistinguishable_from': finding.indistinguishable_from,
-        'sizes_of_mates': {
-            mate: {name: {'value': value, 'unit': unit} for name, (value, unit) in sizes.items()}
-            for mate, sizes in finding.sizes_of_mates.items()
-        },
+        'sizes_of_mates': sizes_of_mates,
         'separating_motion': finding.separating_motion,
         'implausible': finding.implausible,
     }

@@ -346,15 +346,11 @@ def _with_proposals(
         return None
     model = extension.result.calibration.model
     catalogue = model.catalogue.with_effects(*effects)
-    texts = {
-        sensor: '+'.join(
-            [
-                *(e.name for e in model.effects if e.sensor == sensor and e.role is not Role.LIMIT),
-                *(e.name for e in effects if e.sensor == sensor),
-            ]
-        )
-        for sensor in (*SENSORS, 'reference')
-    }
+    names: dict[str, list[str]] = {section: [] for section in (*SENSORS, 'reference')}
+    for effect in (*model.effects, *effects):
+        if effect.role is not Role.LIMIT:
+            names[effect.sensor].append(effect.name)
+    texts = {section: '+'.join(of_section) for section, of_section in names.items()}
     chosen = replace(
         extension.options,
         accelerometer_model=texts['accelerometer'],
@@ -483,16 +479,12 @@ def _onset_lines(onset: Onset | None) -> list[str]:
     largest = []
     for owner in sorted({name.partition('.')[0] for name in by_size}):
         largest += [name for name in by_size if name.partition('.')[0] == owner][:MOST_SHOWN]
-    states = [
-        [
-            in_words(state[name], onset.what, onset.units[name]).removesuffix(' 1')
-            for state in (onset.before, onset.after)
-        ]
-        for name in largest
-    ]
-    values = '; '.join(
-        f'{name} {before} before, {after} after' for name, (before, after) in zip(largest, states)
-    )
+    changes = []
+    for name in largest:
+        before = in_words(onset.before[name], onset.what, onset.units[name]).removesuffix(' 1')
+        after = in_words(onset.after[name], onset.what, onset.units[name]).removesuffix(' 1')
+        changes.append(f'{name} {before} before, {after} after')
+    values = '; '.join(changes)
     axes = f' (axis {", ".join(onset.axes)})' if onset.axes else ''
     separable = []
     if onset.temperature_c is not None:
@@ -542,12 +534,11 @@ def _formula_lines(sensor: str, rest: Unexplained, gain: Gain | None) -> list[st
 
 def _proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
     """Return the formulas of a diagnosis as effects."""
-    return [
-        effect
-        for rest in diagnosis.unexplained.values()
-        if rest.proposal is not None
-        for effect in rest.proposal.effects
-    ]
+    effects: list[Effect] = []
+    for rest in diagnosis.unexplained.values():
+        if rest.proposal is not None:
+            effects += rest.proposal.effects
+    return effects
 
 
 def nothing_named(diagnosis: Diagnosis) -> str:

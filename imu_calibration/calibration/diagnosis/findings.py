@@ -299,14 +299,15 @@ def finding(
         text += (
             f' It {beyond_known(explained, question.sensor)}. It is in no model unless requested.'
         )
-    mates = [
-        *rivals,
-        *(
-            mate
-            for mate, _ in search.confounded(named, question)
-            if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain)
-        ),
-    ]
+    mates = list(rivals)
+    rival_names = {rival.name for rival in rivals}
+    for mate, _ in search.confounded(named, question):
+        if mate.name not in rival_names and shows(place, mate, gain):
+            mates.append(mate)
+    sizes_of_mates = {}
+    for mate in mates:
+        in_place = in_its_place(mate)
+        sizes_of_mates[mate.name] = {n: (value, unit) for n, (value, _, unit) in in_place.items()}
     return Finding(
         question.name,
         question.sensor,
@@ -319,12 +320,7 @@ def finding(
         tuple(mate.name for mate in mates),
         motion_of(question, mates[0]) if mates else '',
         question.effect.against,
-        {
-            mate.name: {
-                name: (value, unit) for name, (value, _, unit) in in_its_place(mate).items()
-            }
-            for mate in mates
-        },
+        sizes_of_mates,
         score.implausible,
     )
 
@@ -421,7 +417,10 @@ def build_diagnosis(
         )
         for place in range(len(named))
     ]
-    sensors = sorted({s for q in named for s in q.effect.sensors}) or list(rests)
+    affected: set[str] = set()
+    for question in named:
+        affected |= set(question.effect.sensors)
+    sensors = sorted(affected) or list(rests)
     return Diagnosis(
         tuple(findings),
         rests,

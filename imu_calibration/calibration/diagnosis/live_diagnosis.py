@@ -154,9 +154,7 @@ def live_state_of(diagnosis: Diagnosis) -> LiveState:
     for finding in diagnosis.findings:
         values[MATES_KEY + finding.effect] = ' '.join(finding.indistinguishable_from)
         sized = {finding.effect: finding.parameters, **finding.sizes_of_mates}
-        values |= {
-            f'{SIZE_KEY}{effect}.{name}': repr(float(size))
-            for effect, sizes in sized.items()
-            for name, (size, *_) in sizes.items()
-        }
+        for effect, sizes in sized.items():
+            for name, (size, *_) in sizes.items():
+                values[f'{SIZE_KEY}{effect}.{name}'] = repr(float(size))
     return LiveState(FOUND, message, values)

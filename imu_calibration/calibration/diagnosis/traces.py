@@ -4,8 +4,10 @@ Measurement against the simulation of two models.
 Residuals over short blocks, segments, residual power and dead reckoning.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -64,23 +66,19 @@ class Distance:
 
         ``sqrt(max(mean square of measured - simulated - that of the noise, 0))``.
         """
-        found = [('window means', self.means, self.means_noise)]
+        mean_squares = [('window means', self.means, self.means_noise)]
         decade = np.floor(np.log10(self.edges[:-1]) + 1e-9).astype(int)
         for each in np.unique(decade):
             rows = decade == each
             rows[-1] = False  # the Nyquist frequency cuts it
             if self.power[0, rows].any():
                 highest = self.edges[1:][rows].max()
-                found.append(
-                    (
-                        f'{10.0**each:g} to {highest:.3g} Hz',
-                        self.power[:, rows].sum(axis=1),
-                        self.noise[rows].sum(axis=0),
-                    )
-                )
+                power = self.power[:, rows].sum(axis=1)
+                noise = self.noise[rows].sum(axis=0)
+                mean_squares.append((f'{10.0**each:g} to {highest:.3g} Hz', power, noise))
         return [
             (name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise))
-            for name, power, noise in found
+            for name, power, noise in mean_squares
         ]
 
     def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,21 +104,20 @@ class Distance:
 
         Rms beyond noise before and after, and of the noise, by band, in SI units.
         """
-        return {
-            'bands': [
+        bands = []
+        for name, (before, after), noise in self.bands():
+            bands.append(
                 {
                     'band': name,
-                    'before': rms[0].tolist(),
-                    'after': rms[1].tolist(),
+                    'before': before.tolist(),
+                    'after': after.tolist(),
                     'noise': noise.tolist(),
                 }
-                for name, rms, noise in self.bands()
-            ],
-            'reduction': {
-                measure: {'value': gain.reduction, 'ci95': list(gain.ci95)}
-                for measure, gain in self.gains.items()
-            },
-        }
+            )
+        reduction = {}
+        for measure, gain in self.gains.items():
+            reduction[measure] = {'value': gain.reduction, 'ci95': list(gain.ci95)}
+        return {'bands': bands, 'reduction': reduction}
 
 
 class DistanceSums:
@@ -147,31 +144,36 @@ class DistanceSums:
 
         The residuals are (before, after: sensor -> (n, 3)).
         """
-        n, rest = len(window), window.kind == 'static'
+        n = len(window)
+        at_rest = window.kind == 'static'
         if n < 4 or not window.period:
             return
-        line = np.fft.rfftfreq(n, window.period)[1:]
-        place = np.clip(np.searchsorted(BAND_EDGES, line, side='right') - 1, 0, len(BAND_EDGES) - 2)
-        freedom = np.full(len(line), 2.0)
-        freedom[-1] = 1.0 if n % 2 == 0 else 2.0
-        self._freedom[: 2 if rest else 1] += np.bincount(place, freedom, len(BAND_EDGES) - 1)
+        # Parseval: sum of (x - mean)^2 = sum of |X_k|^2 freedom_k / n over the frequencies above
+        # zero, with two degrees of freedom each, and one at the Nyquist frequency.
+        n_bands = len(BAND_EDGES) - 1
+        frequency = np.fft.rfftfreq(n, window.period)[1:]
+        band = np.clip(np.searchsorted(BAND_EDGES, frequency, side='right') - 1, 0, n_bands - 1)
+        freedom = np.full(len(frequency), 2.0)
+        if n % 2 == 0:
+            freedom[-1] = 1.0
+        self._freedom[: 2 if at_rest else 1] += np.bincount(band, freedom, n_bands)
         self._samples += n
         self._windows += 1
         for sensor, own_noise in noise.items():
             self._noise[sensor] += own_noise.low_variance / n
-            row = [n, rest]
-            for k, own in enumerate(residuals):
-                mean = own[sensor].mean(axis=0)
-                squares = np.abs(np.fft.rfft(own[sensor], axis=0)[1:]) ** 2 * freedom[:, None] / n
-                band = np.stack(
-                    [np.bincount(place, column, len(BAND_EDGES) - 1) for column in squares.T],
-                    axis=1,
+            row = [n, at_rest]
+            for k, of_model in enumerate(residuals):
+                residual = of_model[sensor]
+                mean = residual.mean(axis=0)
+                squares = np.abs(np.fft.rfft(residual, axis=0)[1:]) ** 2 * freedom[:, None] / n
+                power = np.stack(
+                    [np.bincount(band, column, n_bands) for column in squares.T], axis=1
                 )
-                self._power[sensor][k] += band
+                self._power[sensor][k] += power
                 self._means[sensor][k] += mean**2
-                row += [band.sum(), mean @ mean]
-                if rest and k == len(residuals) - 1:
-                    self._rest[sensor] += band
+                row += [power.sum(), mean @ mean]
+                if at_rest and k == len(residuals) - 1:
+                    self._rest[sensor] += power
             self._rows[sensor].append(row)
 
     def distances(self) -> dict[str, Distance]:
@@ -180,14 +182,13 @@ class DistanceSums:
         return {sensor: self._distance(sensor, edge) for sensor, rows in self._rows.items() if rows}
 
     def _distance(self, sensor: str, edge: int) -> Distance:
+        # Noise of a band: its power per degree of freedom at rest, in the nearest band with data.
+        noise = np.zeros((edge - 1, 3))
         known = np.flatnonzero(self._freedom[1])
-        density = self._rest[sensor][known] / self._freedom[1][known, None]
-        nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1) if len(known) else []
-        noise = (
-            density[nearest] * self._freedom[0][: edge - 1, None]
-            if len(known)
-            else np.zeros((edge - 1, 3))
-        )
+        if len(known):
+            density = self._rest[sensor][known] / self._freedom[1][known, None]
+            nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1)
+            noise = density[nearest] * self._freedom[0][: edge - 1, None]
         return Distance(
             BAND_EDGES[:edge],
             self._power[sensor][:, : edge - 1] / self._samples,
@@ -220,8 +221,10 @@ MAX_STRETCH_STEP = 0.1
 """Longest step between samples of a stretch, s."""
 MOST_STRETCHES = 12
 """Stretches of dead reckoning, evenly spread over a longer recording."""
-SEGMENT, POINTS = 10.0, 400
-"""Length of the segment with the largest difference, s, and its number of points in a plot."""
+SEGMENT = 10.0
+"""Length of the segment with the largest difference, s."""
+POINTS = 400
+"""Points of that segment in a plot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,6 +238,10 @@ class OverlaySegment:
     'measured', 'simulated before', 'simulated after': m/s^2 or rad/s, shape (n,); samples, or means
     of equal numbers of them.
     """
+
+    def difference(self, simulated: str) -> np.ndarray:
+        """Return measured minus simulated, shape (n,), of a name in `signals`."""
+        return self.signals['measured'] - self.signals[simulated]
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,61 +303,57 @@ def residual_traces(
     """
     models = [before] if after is before else [before, after]
     sensors = tuple(before.noise)
-    sums, parts, counts, warmth, spans = DistanceSums(), [], [], [], []
+    sums = DistanceSums()
+    spans: list[tuple[float, float]] = []
+    # Key -> values at each block, a part per chunk of windows.
+    parts: dict[Any, list[np.ndarray]] = defaultdict(list)
     for group in chunks(_used(windows, spans)):
-        rest, against = (
-            [residuals(group, table, each.model, values=each.values) for each in models],
-            _variables(group, table, before),
-        )
-        ends = np.cumsum([len(window) for window in group])
+        of_models = [residuals(group, table, each.model, values=each.values) for each in models]
+        old, new = of_models[0], of_models[-1]
+        lengths = [len(window) for window in group]
+        ends = np.cumsum(lengths)
         for window, stop in zip(group, ends):
             rows = slice(stop - len(window), stop)
-            sums.add(
-                window,
-                [
-                    {sensor: own[rows] for sensor, own in each.items()}
-                    for each in (rest[0], rest[-1])
-                ],
-                before.noise,
-            )
+            old_rows = {sensor: residual[rows] for sensor, residual in old.items()}
+            new_rows = {sensor: residual[rows] for sensor, residual in new.items()}
+            sums.add(window, [old_rows, new_rows], before.noise)
+
         starts = _starts(group)
-        values = [
-            np.concatenate([w.time for w in group]),
-            *against[:3],
-            *(each[sensor] for each in (rest[0], rest[-1]) for sensor in sensors),
-        ]
-        parts.append([block_means(value, starts) for value in values])
-        warmth.append(None if against[3] is None else block_means(against[3], starts))
-        counts.append(
-            (
-                np.diff(starts, append=ends[-1]),
-                np.repeat([str(w.kind) for w in group], [len(w) for w in group])[starts],
+        position, force_s, rate_s, temperature_c = _variables(group, table, before)
+        parts['time'].append(block_means(np.concatenate([w.time for w in group]), starts))
+        parts['position'].append(block_means(position, starts))
+        parts['force_s'].append(block_means(force_s, starts))
+        parts['rate_s'].append(block_means(rate_s, starts))
+        if temperature_c is not None:
+            parts['temperature_c'].append(block_means(temperature_c, starts))
+        for sensor in sensors:
+            parts['before', sensor].append(block_means(old[sensor], starts))
+            parts['after', sensor].append(block_means(new[sensor], starts))
+        parts['samples'].append(np.diff(starts, append=ends[-1]))
+        parts['kind'].append(np.repeat([str(w.kind) for w in group], lengths)[starts])
+
+    blocks = {key: np.concatenate(arrays) for key, arrays in parts.items()}
+    time = blocks['time']
+    # Known only if every chunk has temperatures.
+    temperature = blocks.get('temperature_c', np.zeros(0))
+    segments = {}
+    for sensor in sensors:
+        segments[sensor] = []
+        for axis in range(3):
+            start, stop = _largest(time, blocks['before', sensor][:, axis])
+            segments[sensor].append(
+                _segment(windows, spans, table, models, sensor, axis, start, stop)
             )
-        )
-    known = [each for each in warmth if each is not None]
-    temperature = np.concatenate(known) if len(known) == len(warmth) else None
-    time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
-    old = dict(zip(sensors, errors[: len(sensors)]))
-    new = dict(zip(sensors, errors[len(sensors) :]))
-    segments = {
-        sensor: [
-            _segment(
-                windows, spans, table, models, sensor, axis, *_largest(time, old[sensor][:, axis])
-            )
-            for axis in range(3)
-        ]
-        for sensor in sensors
-    }
     return Traces(
         time,
-        np.concatenate([kind for _, kind in counts]),
-        position,
-        force_s,
-        rate_s,
-        temperature,
-        old,
-        new,
-        np.concatenate([number for number, _ in counts]),
+        blocks['kind'],
+        blocks['position'],
+        blocks['force_s'],
+        blocks['rate_s'],
+        temperature if len(temperature) == len(time) else None,
+        {sensor: blocks['before', sensor] for sensor in sensors},
+        {sensor: blocks['after', sensor] for sensor in sensors},
+        blocks['samples'],
         _dead_reckoning(windows, spans, table, models) if len(sensors) == len(SENSORS) else None,
         segments,
         sums.distances(),
@@ -363,7 +366,8 @@ def _used(
     """
     Yield the windows that are not unused, and append (first, last) time of every window to `spans`.
     """
-    for window in (windows[number] for number in range(len(windows))):
+    for number in range(len(windows)):
+        window = windows[number]
         spans.append((window.time[0], window.time[-1]))
         if window.kind != 'unused':
             yield window
@@ -468,11 +472,11 @@ def _dead_reckoning(
             run = []
     if not stretches:
         return None
-    chosen = [
-        stretches[k]
-        for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))
-    ]
-    drifts = [_drifts([windows[k] for k in stretch], table, models) for stretch in chosen]
+    places = np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int)
+    chosen = [stretches[place] for place in np.unique(places)]
+    drifts = []
+    for stretch in chosen:
+        drifts.append(_drifts([windows[number] for number in stretch], table, models))
     velocity, position = np.median(drifts, axis=0).T
     return {
         'seconds': DEAD_RECKONING,
@@ -493,10 +497,13 @@ def _drifts(
     The errors, in m/s and m, are the ones `DEAD_RECKONING` seconds after the start of some windows.
     """
     motion, temperature, rows = all_samples(windows)
-    time, found = np.concatenate([window.time for window in windows]), []
+    time = np.concatenate([window.time for window in windows])
+    drifts = []
     for model in models:
         error = residuals(windows, table, model.model, values=model.values)
-        reference, felt = _references(model, table, motion, temperature), {}
+        reference = _references(model, table, motion, temperature)
+        # Input of a navigation: the true one plus the residual in its units.
+        felt = {}
         for sensor in SENSORS:
             matrix = model.model.matrix(sensor, model.values)
             felt[sensor] = (
@@ -512,5 +519,5 @@ def _drifts(
         errors = dead_reckoning_errors(
             true.select(some), felt['accelerometer'][some], felt['gyroscope'][some]
         )
-        found.append([float(np.linalg.norm(error[-1])) for error in errors])
-    return found
+        drifts.append([float(np.linalg.norm(error[-1])) for error in errors])
+    return drifts
