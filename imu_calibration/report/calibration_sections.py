@@ -324,9 +324,9 @@ def axis_readings(
         At rest first, then by rate; three lines per position; empty when no window fits.
 
     """
-    measured, compensated, reference = (
-        np.asarray(a, float).reshape(-1, 3) / gravity for a in (measured, compensated, reference)
-    )
+    measured = np.asarray(measured, float).reshape(-1, 3) / gravity
+    compensated = np.asarray(compensated, float).reshape(-1, 3) / gravity
+    reference = np.asarray(reference, float).reshape(-1, 3) / gravity
     rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
     rate_deg_s = np.where(rate_deg_s < STILL_DEG_S, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
     size = np.linalg.norm(reference, axis=1)
@@ -334,25 +334,26 @@ def axis_readings(
     along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
     near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
     lines = []
-    for key in sorted(
-        {
-            (r, -int(np.sign(s)), int(a))
-            for r, s, a in zip(rate_deg_s[near], along[near], axis[near])
-        }
-    ):
-        chosen = near & (rate_deg_s == key[0]) & (np.sign(along) == -key[1]) & (axis == key[2])
-        position = ('+' if key[1] < 0 else '-') + 'xyz'[key[2]]
-        means = [np.mean(values[chosen], axis=0) for values in (reference, measured, compensated)]
-        lines += [
-            AxisReading(
-                position,
-                float(key[0]),
-                int(np.sum(chosen)),
-                sensor,
-                *(float(mean[i]) for mean in means),
+    # By rate; in each position +g before -g.
+    positions = zip(rate_deg_s[near], -np.sign(along[near]), axis[near])
+    for line_rate, minus_sign, line_axis in sorted(set(positions)):
+        chosen = near & (rate_deg_s == line_rate) & (axis == line_axis)
+        chosen &= np.sign(along) == -minus_sign
+        mean_reference = np.mean(reference[chosen], axis=0)
+        mean_measured = np.mean(measured[chosen], axis=0)
+        mean_compensated = np.mean(compensated[chosen], axis=0)
+        for i, sensor in enumerate('xyz'):
+            lines.append(
+                AxisReading(
+                    ('+' if minus_sign < 0 else '-') + 'xyz'[line_axis],
+                    float(line_rate),
+                    int(np.sum(chosen)),
+                    sensor,
+                    float(mean_reference[i]),
+                    float(mean_measured[i]),
+                    float(mean_compensated[i]),
+                )
             )
-            for i, sensor in enumerate('xyz')
-        ]
     return lines
 
 
@@ -381,10 +382,9 @@ def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list
         rate=rate[chosen],
         gravity=gravity,
     )
-    return [
-        [reading for reading in readings if (reading.rate_deg_s == 0) == at_rest]
-        for at_rest in (True, False)
-    ]
+    at_rest = [reading for reading in readings if reading.rate_deg_s == 0]
+    in_rotation = [reading for reading in readings if reading.rate_deg_s != 0]
+    return [at_rest, in_rotation]
 
 
 def calibration_report(result: CalibrationResult) -> str:

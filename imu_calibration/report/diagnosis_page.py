@@ -53,13 +53,17 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     """
     diagnosis = result.diagnosis
     rests = {sensor: rest for sensor, rest in diagnosis.unexplained.items() if rest.significant}
-    word = (
-        'bad'
-        if any(rest.proposal is None for rest in rests.values())
-        else 'weak'
-        if rests or diagnosis.findings
-        else 'good'
-    )
+    word = 'good'
+    if any(rest.proposal is None for rest in rests.values()):
+        word = 'bad'
+    elif rests or diagnosis.findings:
+        word = 'weak'
+    beyond = list(timing_lines(diagnosis))
+    spectra = []
+    for sensor, rest in diagnosis.unexplained.items():
+        beyond += beyond_lines(sensor, rest)
+        if drawn := draw_tones(sensor, rest):
+            spectra.append(drawn)
     return render(
         'diagnosis.html',
         title='IMU diagnosis',
@@ -73,12 +77,8 @@ def diagnosis_report(result: DiagnosisResult) -> str:
         overlay=overlay_section(
             diagnosis.traces, diagnosis.baseline.model.joint_names, _causes(diagnosis)
         ),
-        beyond=[
-            *timing_lines(diagnosis),
-            *(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)),
-            *result.notes,
-        ],
-        spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
+        beyond=[*beyond, *result.notes],
+        spectra=spectra,
         reasons=[
             reason
             for reason in judge(result.calibration, result.tolerances).reasons
@@ -103,14 +103,13 @@ def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> Drawn:
 
 def draw_formula(diagnosis: Diagnosis, proposal: Proposal) -> Drawn:
     """Return the residual against the variable of a proposed formula, before and after, as SVG."""
-    against = tuple(kind for effect in proposal.effects for kind in effect.against)
     return draw(
         f'formula-{proposal.sensor}',
         (8.6, 3.1),
         _against_cause,
         diagnosis,
         proposal.sensor,
-        against,
+        _kinds_of(proposal),
         label=(
             'Residual against the variable of the formula, before and after:'
             f' {" and ".join(proposal.columns)}'
@@ -132,21 +131,27 @@ def draw_over_time(result: DiagnosisResult) -> Drawn:
 
 def _causes(diagnosis):
     """Return sensor -> label of the variable of its first finding, or of its formula."""
-    pairs = [
-        (
-            rest.proposal.sensor,
-            [kind for effect in rest.proposal.effects for kind in effect.against],
-        )
-        for rest in diagnosis.unexplained.values()
-        if rest.proposal is not None
-    ]
+    pairs = []
+    for rest in diagnosis.unexplained.values():
+        if rest.proposal is not None:
+            pairs.append((rest.proposal.sensor, _kinds_of(rest.proposal)))
+    # Later entries replace earlier ones: the first finding of a sensor is the last entry.
     pairs += [(finding.gain.sensor, finding.against) for finding in reversed(diagnosis.findings)]
     known = variables(diagnosis.traces, diagnosis.baseline.model.joint_names)
-    return {
-        sensor: label
-        for sensor, against in pairs
-        if (label := cause_of(diagnosis, sensor, against)[1]) in known
-    }
+    causes = {}
+    for sensor, kinds in pairs:
+        _, label, _ = cause_of(diagnosis, sensor, kinds)
+        if label in known:
+            causes[sensor] = label
+    return causes
+
+
+def _kinds_of(proposal):
+    """Return the kinds of variables that the effects of a formula depend on."""
+    kinds: tuple[str, ...] = ()
+    for effect in proposal.effects:
+        kinds += tuple(effect.against)
+    return kinds
 
 
 def explained_share(values: np.ndarray, signal: np.ndarray) -> float:
@@ -175,21 +180,16 @@ def cause_of(
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
     kinds = against if len(signal) >= FEW else ()  # bins of few poses have uncertain means
-    best = max(
-        (
-            (explained_share(values, signal[:, axis]), label, values)
-            for label, (kind, values) in variables(
-                traces, diagnosis.baseline.model.joint_names
-            ).items()
-            if kind in kinds
-        ),
-        default=(0.0, '', None),
-        key=lambda entry: entry[0],
-    )
-    if best[2] is None or best[0] < MIN_DRAWN_FIT:
+    best_share, best_label, best_values = 0.0, '', None
+    for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items():
+        if kind in kinds:
+            share = explained_share(values, signal[:, axis])
+            if best_values is None or share > best_share:
+                best_share, best_label, best_values = share, label, values
+    if best_values is None or best_share < MIN_DRAWN_FIT:
         factor, unit = for_people(UNITS[sensor])
         return axis, f'prediction of the effect, {unit}', signal[:, axis] * factor
-    return axis, best[1], best[2]
+    return axis, best_label, best_values
 
 
 def _against_cause(figure, diagnosis, sensor, against):
@@ -197,9 +197,8 @@ def _against_cause(figure, diagnosis, sensor, against):
     traces = diagnosis.traces
     axis, label, values = cause_of(diagnosis, sensor, against)
     factor, unit = for_people(UNITS[sensor])
-    before, after = (
-        residual[sensor][:, axis] * factor for residual in (traces.before, traces.after)
-    )
+    before = traces.before[sensor][:, axis] * factor
+    after = traces.after[sensor][:, axis] * factor
     left, right = figure.subplots(1, 2, sharey=True)
     some = slice(None, None, max(1, len(values) // 2500))
     for axes, residual, colour, title in (
@@ -343,23 +342,18 @@ def _sensor(traces, sensor, against, first):
                 f'{sensor} {AXES[k]}',
                 'time, s',
                 segments[k].time,
-                {
-                    when: (
-                        (segments[k].signals['measured'] - segments[k].signals[f'simulated {when}'])
-                        * factor
-                    )
-                    for when in WHEN
-                },
+                {when: segments[k].difference(f'simulated {when}') * factor for when in WHEN},
             ),
         )
+
+    def residuals(axis: int, points: slice = slice(None)) -> dict[str, np.ndarray]:
+        return {when: getattr(traces, when)[sensor][points, axis] * factor for when in WHEN}
+
     some = slice(None, None, -(-len(traces.time) // MOST_POINTS))
-    residuals = [
-        {when: getattr(traces, when)[sensor][some, k] * factor for when in WHEN} for k in range(3)
-    ]
     row(
         f'Residual, {unit}, against',
         lambda k: _chart(
-            f'{sensor} {AXES[k]}', first, against[first][some], residuals[k], kind='points'
+            f'{sensor} {AXES[k]}', first, against[first][some], residuals(k, some), kind='points'
         ),
         variables=json.dumps({label: _plain(values[some]) for label, values in against.items()}),
         first=first,
@@ -382,18 +376,12 @@ def _sensor(traces, sensor, against, first):
         )
     row(
         f'Histogram of the residual, {unit}',
-        lambda k: _histogram(
-            f'{sensor} {AXES[k]}',
-            unit,
-            {when: getattr(traces, when)[sensor][:, k] * factor for when in WHEN},
-        ),
+        lambda k: _histogram(f'{sensor} {AXES[k]}', unit, residuals(k)),
     )
-    bands = [
-        (name, rms.T * factor, float(np.sqrt(np.mean(noise**2))) * factor)
-        for name, rms, noise in (
-            traces.distances[sensor].bands() if sensor in traces.distances else ()
-        )
-    ]
+    bands = []
+    if sensor in traces.distances:
+        for name, rms, noise in traces.distances[sensor].bands():
+            bands.append((name, rms.T * factor, float(np.sqrt(np.mean(noise**2))) * factor))
     return {'sensor': sensor, 'unit': unit, 'bands': bands, 'rows': rows}
 
 

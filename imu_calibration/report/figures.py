@@ -100,15 +100,18 @@ class Drawn(str):
 
         List of (label, x (n,), y (n,)) as arrays in the units of the labels.
         """
-        return [
-            {
-                'title': axes.get_title(loc='left'),
-                'x': axes.get_xlabel(),
-                'y': axes.get_ylabel(),
-                'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()],
-            }
-            for axes in self.axes
-        ]
+        panels = []
+        for axes in self.axes:
+            lines = [(line.get_label(), *line.get_data()) for line in axes.get_lines()]
+            panels.append(
+                {
+                    'title': axes.get_title(loc='left'),
+                    'x': axes.get_xlabel(),
+                    'y': axes.get_ylabel(),
+                    'lines': lines,
+                }
+            )
+        return panels
 
 
 INK, GREY, FAINT = '#1b2430', '#5c6877', '#98a2b0'

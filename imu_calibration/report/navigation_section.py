@@ -156,14 +156,9 @@ def expected_growth(
             )[None],
         ),
     }
-    total = Growth(
-        time,
-        *(
-            np.sqrt(sum(getattr(part, name) ** 2 for part in parts.values()))
-            for name in ('velocity', 'position')
-        ),
-    )
-    return total, parts
+    velocity_variance = sum(part.velocity**2 for part in parts.values())
+    position_variance = sum(part.position**2 for part in parts.values())
+    return Growth(time, np.sqrt(velocity_variance), np.sqrt(position_variance)), parts
 
 
 def _constant_variances(uncertainty, force):
@@ -192,16 +187,14 @@ def noise_densities(result: CalibrationResult) -> list[float]:
 
     The units are m/s^2/sqrt(Hz) and rad/s/sqrt(Hz).
     """
-    found = [result.calibration.statistics[sensor] for sensor in ('accelerometer', 'gyroscope')]
-    return [
-        float(
-            np.sqrt(
-                np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0)))
-                * result.period
-            )
-        )
-        for f in found
-    ]
+    densities = []
+    for sensor in ('accelerometer', 'gyroscope'):
+        statistics = result.calibration.statistics[sensor]
+        # density^2 = variance of a sample * period, with the variance at low frequency.
+        factor = np.asarray(statistics.get('low_frequency_factor', 1.0))
+        variance = np.mean(np.square(statistics['noise_sd']) * factor)
+        densities.append(float(np.sqrt(variance * result.period)))
+    return densities
 
 
 def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:
@@ -221,17 +214,16 @@ def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:
     length = min(w.time[-1] - w.time[0] for w in windows)
     pairs = [_moving_runs(result, window, length) for window in windows]
     grid = np.linspace(0.0, length, RUN_INSTANTS)
-    before, after = (
-        Growth(
-            grid,
-            *(
-                np.array([getattr(pair[k], name) for pair in pairs])
-                for name in ('velocity', 'position')
-            ),
-        )
-        for k in range(2)
-    )
+    before = _joined_growth(grid, [raw for raw, _ in pairs])
+    after = _joined_growth(grid, [corrected for _, corrected in pairs])
     return before, after
+
+
+def _joined_growth(time, runs):
+    """Return the Growth of several stretches on one grid of times, s."""
+    return Growth(
+        time, np.array([run.velocity for run in runs]), np.array([run.position for run in runs])
+    )
 
 
 def _moving_runs(result, window, length):

@@ -114,6 +114,12 @@ def noise_report(
     tables = {sensor: {} for sensor in figures.sensors}
     for row in document.rows(figures):
         tables[row.sensor].setdefault((row.title, row.unit), []).append(row)
+    # The sensor filters its noise at averaging times of more than one sample.
+    left_out = []
+    for sensor in figures.sensors:
+        for letter, axis in zip(AXES, figures.sensor(sensor)):
+            if axis.shortest * figures.rate > 1.5:
+                left_out.append((f'{sensor} {letter}', axis.shortest))
     return render(
         'noise.html',
         title='Noise of an IMU',
@@ -129,10 +135,5 @@ def noise_report(
         rates=sorted({*RATES, round(figures.rate, 3)}),
         runs=document.position_budget(figures),
         duration=document.duration,
-        left_out=[
-            (f'{sensor} {letter}', axis.shortest)
-            for sensor in figures.sensors
-            for letter, axis in zip(AXES, figures.sensor(sensor))
-            if axis.shortest * figures.rate > 1.5
-        ],
+        left_out=left_out,
     )

@@ -365,17 +365,17 @@ def _equation(effect):
 
     Empty where it changes the reference motion.
     """
-    columns = [text for group in effect.groups for text in group.text]
+    columns = []
+    for group in effect.groups:
+        columns += group.text
     if not columns or effect.warp is not None:
         return ''
-    shown = ' + '.join(
-        f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}'
-        for n, text in enumerate(columns[:MAX_SHOWN_COLUMNS], 1)
-    )
-    return (
-        'output_i +='
-        f' {shown}{f" + ... ({len(columns)} columns)" if len(columns) > MAX_SHOWN_COLUMNS else ""}'
-    )
+    terms = []
+    for number, text in enumerate(columns[:MAX_SHOWN_COLUMNS], 1):
+        terms.append(f'k{number} * ({text})' if ' ' in text else f'k{number} * {text}')
+    if len(columns) > MAX_SHOWN_COLUMNS:
+        terms.append(f'... ({len(columns)} columns)')
+    return f'output_i += {" + ".join(terms)}'
 
 
 LABELS = ('serial', 'operator')

@@ -371,11 +371,10 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
     """
     for finding in document.get('findings') or ():
         if finding.get('indistinguishable_from'):
-            sizes = {
-                name: float(size['value'])
-                for mate in finding.get('sizes_of_mates', {}).values()
-                for name, size in mate.items()
-            }
+            sizes = {}
+            for sizes_of_mate in finding.get('sizes_of_mates', {}).values():
+                for name, size in sizes_of_mate.items():
+                    sizes[name] = float(size['value'])
             return (finding['effect'], *finding['indistinguishable_from']), sizes
     raise InputError(
         'the diagnosis must have a finding with collinear effects, it has none; no effects need to'

@@ -31,7 +31,7 @@ from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.report.diagnosis_page import WHEN, histogram
+from imu_calibration.report.diagnosis_page import histogram
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.recordings import Stand
@@ -53,32 +53,29 @@ def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, An
 
     Without bands where the uncertainty of the values is unknown.
     """
-    units = [effect.unit_of(k) for effect in calibration.model.effects for k in range(effect.size)]
-    rows: list[dict[str, Any]] = [
-        {
+    units = []
+    for effect in calibration.model.effects:
+        units += [effect.unit_of(k) for k in range(effect.size)]
+    rows = []
+    for index, name in enumerate(calibration.param_names):
+        value = float(calibration.values[index])
+        sd = float(calibration.sd[index])
+        tolerance = float(tolerances[index])
+        row: dict[str, Any] = {
             'name': name,
-            'value': float(value),
-            'unit': unit,
-            'tolerance': float(tolerance),
-            'status': str(status),
+            'value': value,
+            'unit': units[index],
+            'tolerance': tolerance,
+            'status': str(calibration.status[index]),
         }
-        for name, value, unit, tolerance, status in zip(
-            calibration.param_names,
-            calibration.values,
-            units,
-            tolerances,
-            calibration.status,
-            strict=True,
-        )
-    ]
-    for row, sd in zip(rows, map(float, calibration.sd)):
         if calibration.uncertainty_known and np.isfinite(sd):  # JSON has no infinity
-            row.update(
-                sd=sd,
-                low=row['value'] - BAND * sd,
-                high=row['value'] + BAND * sd,
-                ratio=sd / row['tolerance'],
-            )
+            row |= {
+                'sd': sd,
+                'low': value - BAND * sd,
+                'high': value + BAND * sd,
+                'ratio': sd / tolerance,
+            }
+        rows.append(row)
     return {'parameters': rows}
 
 
@@ -89,19 +86,18 @@ def residual(result: CalibrationResult) -> dict[str, Any]:
     The expected residual from noise is returned too.
     """
     errors = result.window_errors()
-    return {
-        'windows': [
+    windows = []
+    for k in np.argsort(errors.time, kind='stable'):
+        windows.append(
             {
                 'time': float(errors.time[k]),
                 'motion': str(errors.kind[k]),
-                **{
-                    which: _by_sensor(getattr(errors, which), k)
-                    for which in ('before', 'after', 'floor')
-                },
+                'before': _by_sensor(errors.before, k),
+                'after': _by_sensor(errors.after, k),
+                'floor': _by_sensor(errors.floor, k),
             }
-            for k in np.argsort(errors.time, kind='stable')
-        ]
-    }
+        )
+    return {'windows': windows}
 
 
 LONGEST_SEGMENT = 1024
@@ -275,13 +271,13 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
             color=color(rgb),
         )
 
-    (seen, of_seen, diameter), (above, of_line, line) = seen_of(coverage), label_of(coverage)
-    balls = [ball(*cell) for cell in sphere_cells(coverage)] + [
-        ball(place, of_seen, diameter) for place in seen
-    ]
+    balls = [ball(*cell) for cell in sphere_cells(coverage)]
+    seen, colour_of_seen, diameter = seen_of(coverage)
+    balls += [ball(place, colour_of_seen, diameter) for place in seen]
+    above, colour_of_line, line = label_of(coverage)
     arrows = [arrow(start, end - start, rgb) for _, start, end, rgb in arrows_of(coverage)]
     text = found.TextPrimitive(
-        pose=pose(above), billboard=True, font_size=0.09, color=color(of_line), text=line
+        pose=pose(above), billboard=True, font_size=0.09, color=color(colour_of_line), text=line
     )
     entity = found.SceneEntity(
         timestamp=found.Timestamp(0),
@@ -324,60 +320,48 @@ def overlay_topics(
         for axis, segment in zip(AXES, traces.segments.get(sensor, ())):
             names = [name.replace(' ', '_') for name in segment.signals]
             rows = np.column_stack(list(segment.signals.values()))
-            yield (
-                f'/overlay/{sensor}/{axis}',
-                [
-                    (time, dict(zip(names, row)))
-                    for time, row in zip(segment.time.tolist(), rows.tolist())
-                ],
-            )
-        yield (
-            f'/residual/{sensor}',
-            [
-                (float(traces.time[k]), _residual(traces, sensor, joint_names, k))
-                for k in range(len(traces.time))
-            ],
-        )
+            messages = []
+            for time, row in zip(segment.time.tolist(), rows.tolist()):
+                messages.append((time, dict(zip(names, row))))
+            yield f'/overlay/{sensor}/{axis}', messages
+        messages = []
+        for k, time in enumerate(traces.time.tolist()):
+            messages.append((time, _residual(traces, sensor, joint_names, k)))
+        yield f'/residual/{sensor}', messages
+        # Spectrum and histograms belong to the whole time.
         if sensor in traces.distances:
-            frequency, density, noise = traces.distances[sensor].density()
-            yield (
-                f'/residual_spectrum/{sensor}',
-                [
-                    (
-                        time,
-                        {
-                            'frequency': frequency.tolist(),
-                            'noise': _by_axis(noise),
-                            **{when: _by_axis(own) for when, own in zip(WHEN, density)},
-                        },
-                    )
-                    for time in (0.0, end)
-                ],
-            )
+            frequency, (before, after), noise = traces.distances[sensor].density()
+            content = {
+                'frequency': frequency.tolist(),
+                'noise': _by_axis(noise),
+                'before': _by_axis(before),
+                'after': _by_axis(after),
+            }
+            yield f'/residual_spectrum/{sensor}', [(0.0, content), (end, content)]
         for k, axis in enumerate(AXES):
             middles, counts = histogram(
-                {when: getattr(traces, when)[sensor][:, k] for when in WHEN}
+                {'before': traces.before[sensor][:, k], 'after': traces.after[sensor][:, k]}
             )
             content = {
                 'residual': middles.tolist(),
-                **{when: own.tolist() for when, own in counts.items()},
+                'before': counts['before'].tolist(),
+                'after': counts['after'].tolist(),
             }
-            yield f'/residual_histogram/{sensor}/{axis}', [(time, content) for time in (0.0, end)]
+            yield f'/residual_histogram/{sensor}/{axis}', [(0.0, content), (end, content)]
 
 
 def _residual(traces, sensor, joint_names, k):
-    found = {
+    content = {
         'time': float(traces.time[k]),
         'force': _named(traces.force_s[k]),
         'rate': _named(traces.rate_s[k]),
         'angle': dict(zip(joint_names, traces.position[k].tolist())),
-        **{when: _named(getattr(traces, when)[sensor][k]) for when in WHEN},
+        'before': _named(traces.before[sensor][k]),
+        'after': _named(traces.after[sensor][k]),
     }
-    return (
-        found
-        if traces.temperature_c is None
-        else found | {'temperature_c': float(traces.temperature_c[k])}
-    )
+    if traces.temperature_c is not None:
+        content['temperature_c'] = float(traces.temperature_c[k])
+    return content
 
 
 def _by_axis(values):
@@ -440,13 +424,11 @@ class View:
         shown: dict[str, Any] = dict(self.contents)
         if self.coverage is not None:
             shown[SPHERE_TOPIC] = scene_of(self.coverage, self.calibration.frame_id or 'imu_link')
-        times = (0.0, max(self.seconds, MIN_FILE_SECONDS))  # visible at any playback time
-        files.write_whole(
-            path,
-            mcap_bytes(
-                (topic, [(time, content) for time in times]) for topic, content in shown.items()
-            ),
-        )
+        end = max(self.seconds, MIN_FILE_SECONDS)
+        topics = []
+        for topic, content in shown.items():  # visible at any playback time
+            topics.append((topic, [(0.0, content), (end, content)]))
+        files.write_whole(path, mcap_bytes(topics))
 
 
 def view(
@@ -481,12 +463,10 @@ def view(
         }
         frequency, density = residual_spectrum(result, result.gathered.kept)
         if len(frequency):
-            contents[SPECTRUM_TOPIC] = {
-                'lines': [
-                    {'frequency': float(f), **_by_sensor(density, k)}
-                    for k, f in enumerate(frequency)
-                ]
-            }
+            lines = []
+            for k, line_frequency in enumerate(frequency):
+                lines.append({'frequency': float(line_frequency), **_by_sensor(density, k)})
+            contents[SPECTRUM_TOPIC] = {'lines': lines}
         return View(
             result.calibration,
             contents,
