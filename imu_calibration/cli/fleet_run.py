@@ -146,51 +146,60 @@ CSV_KEYS = (
 def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
     found = find_units(options.folder, options.output)
-    table = _table(options, [path for _, paths in found for path in paths])
+    recordings = []
+    names_of_recordings = {}
+    for name, paths in found:
+        recordings += paths
+        names_of_recordings[name] = [path.name for path in paths]
+    table = _table(options, recordings)
     choices = options.choices()
     used = provenance_with('fleet', (), choices, stand=options.stand())['options']
     exclusions = exclusions_of_units(
-        parse_exclusions(options.exclude) if options.exclude else (),
-        {name: [path.name for path in paths] for name, paths in found},
+        parse_exclusions(options.exclude) if options.exclude else (), names_of_recordings
     )
-    units = [
-        fleet_unit(
-            name,
-            paths,
-            topics_of(choices),
-            joint_names=table.joint_names,
-            options=used,
-            exclusions=exclusions[name],
+    units = []
+    for name, paths in found:
+        units.append(
+            fleet_unit(
+                name,
+                paths,
+                topics_of(choices),
+                joint_names=table.joint_names,
+                options=used,
+                exclusions=exclusions[name],
+            )
         )
-        for name, paths in found
-    ]
     if not options.force:
         _require_same_units(Path(options.output), units, report=not options.no_report)
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
-        mapper = (
-            cluster_mapper(options.scheduler, lambda result: advance(1))
-            if options.scheduler
-            else process_mapper(jobs_for(options.jobs, len(units)), lambda result: advance(1))
-        )
-        results = mapper(
-            FleetStep(table, settings, None if options.no_report else calibration_report), units
-        )
+        if options.scheduler:
+            mapper = cluster_mapper(options.scheduler, lambda result: advance(1))
+        else:
+            mapper = process_mapper(jobs_for(options.jobs, len(units)), lambda result: advance(1))
+        step = FleetStep(table, settings, None if options.no_report else calibration_report)
+        results = mapper(step, units)
         spreads = summarise(results)
+        reasons = []
         for result in results:
+            reasons += [f'{result.name}: {line}' for line in result.reasons]
             if result.files:
                 files.write_texts(folder / result.name, result.files)
-        rows = {'summary.csv': fleet_parameter_rows(spreads), 'units.csv': fleet_unit_rows(results)}
+        parameter_rows = fleet_parameter_rows(spreads)
+        unit_rows = fleet_unit_rows(results)
         files.write_texts(
             folder,
-            {name: csv_text(table) for name, table in rows.items()}
-            | {'summary.html': summary_html(results, spreads)},
+            {
+                'summary.csv': csv_text(parameter_rows),
+                'units.csv': csv_text(unit_rows),
+                'summary.html': summary_html(results, spreads),
+            },
         )
         show_fleet(results, spreads, folder, hints=options.hints())
     return VerbResult(
         3 if any(result.exit_code for result in results) else 0,
-        {'units': rows['units.csv'], 'parameters': rows['summary.csv']},
-        [f'{result.name}: {line}' for result in results for line in result.reasons],
+        {'units': unit_rows, 'parameters': parameter_rows},
+        reasons,
     )
 
 
@@ -225,25 +234,21 @@ def _table(options, bags):
 
 def fleet_parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
     """Return the summary: one row per parameter, SI."""
-    return [
-        dict(
-            zip(
-                CSV_KEYS,
-                (
-                    s.name,
-                    s.unit,
-                    s.count,
-                    s.mean,
-                    s.spread,
-                    s.typical_sd,
-                    s.ratio,
-                    *s.lowest,
-                    *s.highest,
-                ),
-            )
+    rows = []
+    for spread in spreads:
+        cells = (
+            spread.name,
+            spread.unit,
+            spread.count,
+            spread.mean,
+            spread.spread,
+            spread.typical_sd,
+            spread.ratio,
+            *spread.lowest,
+            *spread.highest,
         )
-        for s in spreads
-    ]
+        rows.append(dict(zip(CSV_KEYS, cells, strict=True)))
+    return rows
 
 
 def fleet_unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
@@ -253,26 +258,21 @@ def fleet_unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
     Decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI; None:
     unknown.
     """
-    names = list(
-        dict.fromkeys(
-            name
-            for result in results
-            if result.calibration
-            for name in result.calibration.param_names
-        )
-    )
-    headings = [heading for name in names for heading in (name, f'{name}.sd')]
+    # Every row has the parameters of all units, in the order of the first unit with each.
+    parameters: dict[str, float | None] = {}
+    for result in results:
+        if result.calibration is not None:
+            for name in result.calibration.param_names:
+                parameters |= {name: None, f'{name}.sd': None}
     rows = []
     for result in results:
-        known, dropped = {}, None
+        numbers = dict(parameters)
+        dropped = None
         if result.calibration is not None:
-            known = dict(
-                zip(
-                    result.calibration.param_names,
-                    zip(result.calibration.values, result.calibration.sd),
-                )
-            )
-            dropped = sum((result.calibration.statistics.get('dropped') or {}).values())
+            calibration = result.calibration
+            for name, value, sd in zip(calibration.param_names, calibration.values, calibration.sd):
+                numbers |= {name: value, f'{name}.sd': sd}
+            dropped = sum((calibration.statistics.get('dropped') or {}).values())
         row = {
             'name': result.name,
             'decision': result.verdict,
@@ -281,14 +281,7 @@ def fleet_unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
             'error': result.error,
             'dropped': dropped,
         }
-        rows.append(
-            row
-            | dict(
-                zip(
-                    headings, (number for name in names for number in known.get(name, (None, None)))
-                )
-            )
-        )
+        rows.append(row | numbers)
     return rows
 
 
@@ -301,7 +294,8 @@ def csv_text(rows: Sequence[dict[str, Any]]) -> str:
     text = io.StringIO()
     written = csv.DictWriter(text, rows[0] if rows else CSV_KEYS, lineterminator='\n')
     written.writeheader()
-    written.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
+    for row in rows:
+        written.writerow({key: _cell(value) for key, value in row.items()})
     return text.getvalue()
 
 
@@ -377,13 +371,11 @@ def show_fleet(
 def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> str:
     """Return the summary as one page."""
     verdicts = [result.verdict for result in results]
-    word = (
-        HELPS
-        if set(verdicts) == {HELPS}
-        else UNPROVEN
-        if set(verdicts) <= {HELPS, UNPROVEN}
-        else HARMS
-    )
+    word = HARMS
+    if set(verdicts) == {HELPS}:
+        word = HELPS
+    elif set(verdicts) <= {HELPS, UNPROVEN}:
+        word = UNPROVEN
     headline = (
         f'The calibration helps both sensors of {verdicts.count(HELPS)} of {len(results)} units'
     )

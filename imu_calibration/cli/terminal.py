@@ -60,17 +60,14 @@ class Terminal:
 
     def styled(self, text: str, style: str) -> str:
         """Return the text in a style of `STYLE_CODES`; '' is plain."""
-        return (
-            f'\x1b[{STYLE_CODES[style]}m{text}\x1b[0m' if self.coloured and style and text else text
-        )
+        if not (self.coloured and style and text):
+            return text
+        return f'\x1b[{STYLE_CODES[style]}m{text}\x1b[0m'
 
     def print(self, text: str = '', style: str = '', indent: str | None = None) -> None:
         """Print the lines of a text; `indent` as for `wrapped`."""
-        self.write(
-            self.styled(part, style)
-            for line in text.splitlines() or ['']
-            for part in wrapped(line, self.width, indent)
-        )
+        for line in text.splitlines() or ['']:
+            self.write(self.styled(part, style) for part in wrapped(line, self.width, indent))
 
     def write(self, lines: Iterable[str]) -> None:
         """Print lines as they are."""
@@ -106,32 +103,31 @@ class Terminal:
         """
         if not rows:
             return []
-        cells = [[cell if isinstance(cell, tuple) else (cell, '') for cell in row] for row in rows]
-        columns = [[text for text, _ in column] for column in zip(*cells, strict=True)]
-        widths = [
-            max(len(word) for text in column for word in [*text.split(), '']) for column in columns
-        ]
+        texts, styles = [], []
+        for row in rows:
+            cells = [cell if isinstance(cell, tuple) else (cell, '') for cell in row]
+            texts.append([text for text, _ in cells])
+            styles.append([style for _, style in cells])
+
+        # Each column is at least as wide as its longest word, and wider while there is room.
+        columns = list(zip(*texts, strict=True))
+        widths = [max(map(len, ['', *' '.join(column).split()])) for column in columns]
         room = self.width - sum(widths) - gap * (len(widths) - 1)
         for k in sorted(range(len(widths)), key=lambda k: k not in right):
             wider = max(0, min(room, max(map(len, columns[k])) - widths[k]))
-            widths[k], room = widths[k] + wider, room - wider
+            widths[k] += wider
+            room -= wider
+
         lines = []
-        for row in cells:
-            for parts in zip_longest(
-                *(wrapped(text, width) for (text, _), width in zip(row, widths, strict=True)),
-                fillvalue='',
-            ):
-                padded = [
-                    part.rjust(width) if k in right else part.ljust(width)
-                    for k, (part, width) in enumerate(zip(parts, widths))
-                ]
-                last = len(padded) - 1
-                padded[last] = padded[last].rstrip()
-                lines.append(
-                    (' ' * gap)
-                    .join(self.styled(part, style) for part, (_, style) in zip(padded, row))
-                    .rstrip()
-                )
+        for row_texts, row_styles in zip(texts, styles):
+            wrapped_cells = map(wrapped, row_texts, widths)
+            for parts in zip_longest(*wrapped_cells, fillvalue=''):
+                padded = []
+                for k, (part, width) in enumerate(zip(parts, widths)):
+                    padded.append(part.rjust(width) if k in right else part.ljust(width))
+                padded[-1] = padded[-1].rstrip()
+                line = (' ' * gap).join(map(self.styled, padded, row_styles))
+                lines.append(line.rstrip())
         return lines
 
 
