@@ -9,6 +9,7 @@ adding one is adding an entry.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -437,7 +438,7 @@ class Preflight(EvidenceGatherer):
         self.streams, self.lost = cleaner.statistics(), cleaner.lost
         evidence = self.evidence(self.streams, cleaner.readings)
         if 'imu' in evidence.streams:
-            self.findings = tuple(finding for check in CHECKS for finding in check(evidence))
+            self.findings = tuple(chain.from_iterable(check(evidence) for check in CHECKS))
             self.without_readings = without_readings(evidence)
             self.resolution = evidence.resolution
         if self._one_sensor:

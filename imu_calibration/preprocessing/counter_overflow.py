@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -15,7 +16,7 @@ LEAST_STEP_NS = 1_000_000_000
 
 def sizes_of_counters(ticks_ns: Sequence[float]) -> tuple[int, ...]:
     """Return the sizes of the steps back at an overflow, ns, in order, for these ticks."""
-    sizes = {round(2**bits * tick) for bits in COUNTER_BITS for tick in ticks_ns}
+    sizes = {round(2**bits * tick) for bits, tick in product(COUNTER_BITS, ticks_ns)}
     return tuple(sorted(size for size in sizes if size > LEAST_STEP_NS))
 
 

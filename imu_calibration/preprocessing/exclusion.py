@@ -78,10 +78,10 @@ def exclusions_by_recording(
                 key='exclude',
                 code='exclude_recording',
             )
-    return [
-        [exclusion for exclusion in exclusions if exclusion.recording in ('', name)]
-        for name in names
-    ]
+    of_recordings = []
+    for name in names:
+        of_recordings.append([each for each in exclusions if each.recording in ('', name)])
+    return of_recordings
 
 
 def exclusions_of_units(

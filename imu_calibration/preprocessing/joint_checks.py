@@ -88,14 +88,15 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     step = np.min([smallest_step(window.rate_s) for window in windows], axis=0)
     known = np.isfinite(step)  # an axis without motion has the steps of the other axes
     step = np.where(known, step, step[known].max(initial=0.0)) if coarse else np.zeros(3)
-    spans = _joined(
-        (float(window.time[start]), float(window.time[stop - 1]))
-        for window, flags, turns, rate in zip(windows, same, turning, expected)
-        for start, stop in runs_of(flags)
-        if window.time[stop - 1] - window.time[start] >= LASTING
-        and turns[start:stop].mean() > 0.5
-        and not _rounded(window.rate_s[start], rate[start:stop], bias, step)
-    )
+    repeated = []
+    for window, flags, turns, rate in zip(windows, same, turning, expected):
+        for start, stop in runs_of(flags):
+            first, last = float(window.time[start]), float(window.time[stop - 1])
+            if last - first < LASTING or turns[start:stop].mean() <= 0.5:
+                continue
+            if not _rounded(window.rate_s[start], rate[start:stop], bias, step):
+                repeated.append((first, last))
+    spans = _joined(repeated)
     if spans:
         return CheckFinding(
             'frozen',
@@ -149,11 +150,10 @@ def _unsaturated(windows):
 
 def _frozen_spans(windows, table, expected, *, joint):
     """Return the joined spans of all windows in which a joint is frozen."""
-    return _joined(
-        span
-        for window, rate in zip(windows, expected)
-        for span in _frozen(window, table, rate, joint=joint)
-    )
+    spans = []
+    for window, rate in zip(windows, expected):
+        spans += _frozen(window, table, rate, joint=joint)
+    return _joined(spans)
 
 
 def _frozen(window, table, expected, *, joint):

@@ -250,19 +250,24 @@ def _candidates(n_joints):
 
     The description itself is the first of the candidates.
     """
-    identity, plus = list(range(n_joints)), [1.0] * n_joints
+    identity = list(range(n_joints))
+    plus = [1.0] * n_joints
     if n_joints <= MAX_PERMUTED_JOINTS:
-        return [
-            (list(order), list(signs))
-            for order in permutations(identity)
-            for signs in product((1.0, -1.0), repeat=n_joints)
-        ]
-    reversed_joints = [(identity, [-1.0 if k == j else 1.0 for k in identity]) for j in identity]
-    return [
-        (identity, plus),
-        *reversed_joints,
-        *(([{a: b, b: a}.get(k, k) for k in identity], plus) for a, b in combinations(identity, 2)),
-    ]
+        all_signs = list(product((1.0, -1.0), repeat=n_joints))
+        pairs = product(permutations(identity), all_signs)
+        return [(list(order), list(signs)) for order, signs in pairs]
+
+    # Of more joints one is reversed, or two are exchanged.
+    candidates = [(identity, plus)]
+    for joint in identity:
+        signs = list(plus)
+        signs[joint] = -1.0
+        candidates.append((identity, signs))
+    for a, b in combinations(identity, 2):
+        order = list(identity)
+        order[a], order[b] = b, a
+        candidates.append((order, plus))
+    return candidates
 
 
 def _joint_phrases(names, order, signs):

@@ -7,6 +7,7 @@ The checks of messages are of the header and covariance of single messages.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -291,9 +292,8 @@ def check_messages(evidence: MessageEvidence) -> tuple[CheckFinding, ...]:
     """Return the findings in `MessageEvidence`; empty without messages."""
     if not evidence.frame_ids:
         return ()
-    return tuple(
-        finding for check in (frame, covariance, orientation, age) for finding in check(evidence)
-    )
+    checks = (frame, covariance, orientation, age)
+    return tuple(chain.from_iterable(check(evidence) for check in checks))
 
 
 def frame(evidence: MessageEvidence) -> Iterator[CheckFinding]:

@@ -455,9 +455,8 @@ def _trimmed(imu, found, period, shortest):
 
     A turn begins below the noise.
     """
-    first, last = (
-        np.array([getattr(piece, end) for piece in found], int) for end in ('start', 'stop')
-    )
+    first = np.array([piece.start for piece in found], int)
+    last = np.array([piece.stop for piece in found], int)
     width = 2 * int(round(BELOW / period / 2)) + 1
     for values in (imu.force_s, imu.rate_s) if found else ():
         slow = [_low_passed_piece(values, a, b, width) for a, b in zip(first, last)]

@@ -363,11 +363,10 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
 
 def frozen_parts(chunks: Chunks, frozen: dict[str, np.ndarray]) -> list[FrozenPart]:
     """Return the stretches of `frozen_chunks` in order of time."""
-    parts = [
-        _part(chunks, sensor, start, stop)
-        for sensor, flags in frozen.items()
-        for start, stop in long_runs(flags)
-    ]
+    parts = []
+    for sensor, flags in frozen.items():
+        for start, stop in long_runs(flags):
+            parts.append(_part(chunks, sensor, start, stop))
     return sorted(parts, key=lambda part: part.start)
 
 

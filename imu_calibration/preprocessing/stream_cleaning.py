@@ -584,8 +584,11 @@ class BlockCleaner:
     @property
     def n_buffered(self) -> int:
         """Samples held at the moment."""
-        ready = sum(len(part) for parts in self._ready.values() for _, part in parts)
-        return ready + sum(len(part) for parts in self._raw.values() for part in parts)
+        n_buffered = 0
+        for stream in STREAMS:
+            n_buffered += sum(len(part) for _, part in self._ready[stream])
+            n_buffered += sum(len(part) for part in self._raw[stream])
+        return n_buffered
 
     @property
     def counts(self) -> dict[str, int]:
@@ -595,11 +598,11 @@ class BlockCleaner:
         'imu not finite', 'joints repeated stamp', ... -> number of samples.
         """
         self._clean()
-        return {
-            f'{name} {reason}': count
-            for name, check in self._checks.items()
-            for reason, count in check.counts.items()
-        }
+        counts = {}
+        for name, check in self._checks.items():
+            for reason, count in check.counts.items():
+                counts[f'{name} {reason}'] = count
+        return counts
 
     def epoch(self, stream: str) -> int:
         """Return how often the clock of a stream was reset."""
@@ -669,18 +672,17 @@ class BlockCleaner:
     def _clean(self) -> None:
         for name, parts in self._raw.items():
             if parts:
-                self._ready[name] += self._checks[name].push(
-                    parts[0] if len(parts) == 1 else _SAMPLE_TYPES[name].concatenate(parts)
-                )
+                samples = parts[0]
+                if len(parts) > 1:
+                    samples = _SAMPLE_TYPES[name].concatenate(parts)
+                self._ready[name] += self._checks[name].push(samples)
                 self._raw[name] = []
 
     def _hand_on(self):
-        cleaned = CleanedBlock(
-            **{
-                name: [(epoch, part) for epoch, part in parts if len(part)]
-                for name, parts in self._ready.items()
-            }
-        )
+        filled = {}
+        for name, parts in self._ready.items():
+            filled[name] = [(epoch, part) for epoch, part in parts if len(part)]
+        cleaned = CleanedBlock(**filled)
         self._ready = {name: [] for name in STREAMS}
         if len(self._without):
             cleaned = replace(cleaned, imu=self._readings_only(cleaned.imu))

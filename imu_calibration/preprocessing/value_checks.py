@@ -3,6 +3,7 @@ Checks of the readings: units, axes, clipping outputs, biases, gravity, resoluti
 """
 
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -219,7 +220,8 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Angular rate is in rad/s: gravity turns by the integral of the rates."""
     turning = evidence.turning
     stated = evidence.readings.gyroscope
-    largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
+    ends_of_rates = chain.from_iterable(evidence.ends[3:])
+    largest = max((end.level for end in ends_of_rates), default=0.0)
     if turning is not None:
         ratio = 1.0 / turning.factor
         raw_ratio = ratio * float(np.mean(stated.scale))

@@ -484,9 +484,10 @@ class WindowCutter:
         The pieces are of at most the longest length.
         """
         pieces = max(1, ceil((samples.time[-1] - samples.time[0]) / self._longest(use)))
-        return [
-            window for part in _equal_parts(samples, pieces) for window in self._finished(part, use)
-        ]
+        windows = []
+        for part in _equal_parts(samples, pieces):
+            windows += self._finished(part, use)
+        return windows
 
     def _least(self, use):
         settings = self._settings

@@ -72,7 +72,8 @@ class MotionGatherer:
             without=without,
             unusable=unusable,
         )
-        self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
+        self._settings = settings
+        self._noise_rad = None if table is None else table.joint_noise_rad
         self._queue = {name: [] for name in STREAMS}
         self._epoch_shift = dict.fromkeys(STREAMS, 0)
         self._turns = _Unwrapper()
@@ -85,7 +86,9 @@ class MotionGatherer:
     @property
     def n_buffered(self) -> int:
         """Number of buffered samples; bounded for a session of any length."""
-        waiting = sum(len(part) for name in STREAMS for _, part in self._queue[name])
+        waiting = 0
+        for queue in self._queue.values():
+            waiting += sum(len(part) for _, part in queue)
         return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_waiting
 
     @property
@@ -122,9 +125,16 @@ class MotionGatherer:
         """Return the remaining windows; no block may be added after this."""
         self._enqueue(self.cleaner.finish())
         windows = self._work()
-        while any(epoch > self._epoch for name in STREAMS for epoch, _ in self._queue[name]):
+        while self._has_later_epoch():
             windows += self._next_epoch() + self._work()
         return windows + self._end_epoch() + self._cutter.push(None, final=True)
+
+    def _has_later_epoch(self):
+        """Return whether samples of a later epoch are in a queue."""
+        for queue in self._queue.values():
+            if any(epoch > self._epoch for epoch, _ in queue):
+                return True
+        return False
 
     def change(self, settings: WindowSettings) -> None:
         """
@@ -147,18 +157,18 @@ class MotionGatherer:
 
     def all_of(self, blocks: Iterable[SampleBlock]) -> list[Window]:
         """Return the windows of a recording."""
-        return [window for block in blocks for window in self.push(block)] + self.finish()
+        windows = []
+        for block in blocks:
+            windows += self.push(block)
+        return windows + self.finish()
 
     def _enqueue(self, cleaned):
         """Queue samples by epoch."""
         for name in STREAMS:
             for epoch, samples in getattr(cleaned, name):
-                self._queue[name].append(
-                    (
-                        epoch + self._epoch_shift[name],
-                        self._turns.unwrap(samples) if name == 'joints' else samples,
-                    )
-                )
+                if name == 'joints':
+                    samples = self._turns.unwrap(samples)
+                self._queue[name].append((epoch + self._epoch_shift[name], samples))
 
     def _work(self):
         """Process the samples of this epoch; advance to the next epoch when the streams have."""
@@ -193,10 +203,8 @@ class MotionGatherer:
 
     def _next_epoch(self):
         windows = self._end_epoch()
-        old, self._chunks = (
-            self._chunks,
-            MotionChunks(self._settings, self._noise_rad, self._floors),
-        )
+        old = self._chunks
+        self._chunks = MotionChunks(self._settings, self._noise_rad, self._floors)
         self._chunks.time_origin = old.end_time + self._settings.gap
         self._lost_counts.update(old.counts)
         self._epoch += 1
@@ -216,7 +224,10 @@ class MotionGatherer:
         return self._cut(self._chunks.take(final=True))
 
     def _cut(self, chunks):
-        return [window for chunk in chunks for window in self._cutter.push(chunk)]
+        windows = []
+        for chunk in chunks:
+            windows += self._cutter.push(chunk)
+        return windows
 
 
 class _Unwrapper:
@@ -254,11 +265,11 @@ def session_truth(blocks: Iterable[SampleBlock], table: Table) -> tuple[ImuSampl
     Where joints and IMU are both present.
     """
     windows = MotionGatherer(table, WindowSettings(), keep_unused=True).all_of(blocks)
+    samples = ImuSamples(
+        np.concatenate([window.stamp_ns for window in windows]),
+        np.concatenate([window.force_s for window in windows]),
+        np.concatenate([window.rate_s for window in windows]),
+    )
     motion, _, rows = all_samples(windows)
-    stamp_ns, force_s, rate_s, time = (
-        np.concatenate([getattr(window, name) for window in windows])
-        for name in ('stamp_ns', 'force_s', 'rate_s', 'time')
-    )
-    return ImuSamples(stamp_ns, force_s, rate_s), replace(
-        reference_motion(table, motion).select(rows), time=time
-    )
+    reference = reference_motion(table, motion).select(rows)
+    return samples, replace(reference, time=np.concatenate([window.time for window in windows]))
