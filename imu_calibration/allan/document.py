@@ -1,8 +1,9 @@
 """noise.yaml and its summary for people."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -138,7 +139,7 @@ def noise_to_text(figures: NoiseFigures, horizon: float = HORIZON) -> str:
 
 def noise_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
     """Return the document as plain dicts, lists, numbers and strings, in a fixed order."""
-    document = {
+    document: dict[str, Any] = {
         'format': NOISE_FORMAT,
         'frame_id': figures.frame_id,
         'sampling_rate': float(f'{figures.rate:.9g}'),
@@ -146,37 +147,26 @@ def noise_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
     }
     for sensor in figures.sensors:
         document[sensor] = _sensor_section(sensor, figures.sensor(sensor))
-    document['for_filters'] = {'horizon': horizon} | {
-        sensor: _for_filters(figures, sensor, horizon) for sensor in figures.sensors
-    }
-    document['allan_deviation'] = {'tau': list(figures.tau)} | {
-        sensor: [list(axis.deviation) for axis in figures.sensor(sensor)]
-        for sensor in figures.sensors
-    }
+    document['for_filters'] = {'horizon': horizon}
+    document['allan_deviation'] = {'tau': list(figures.tau)}
+    for sensor in figures.sensors:
+        document['for_filters'][sensor] = _for_filters(figures, sensor, horizon)
+        deviations = [list(axis.deviation) for axis in figures.sensor(sensor)]
+        document['allan_deviation'][sensor] = deviations
     document['provenance'] = figures.provenance
     return document
 
 
 def _sensor_section(sensor, axes):
-    section: dict = {}
-    for name in TERMS:
-        if any(name in axis.terms for axis in axes):
-            section[name] = _entry(
-                [axis.terms.get(name) for axis in axes], NOISE_UNITS[sensor][name]
-            )
+    section = _entries(sensor, [axis.terms for axis in axes])
     section['slow_part'] = [list(axis.form) for axis in axes]
-    section['also_possible'] = [[list(form) for form in axis.others] for axis in axes]
-    section['alternatives'] = {
-        name: _entry([axis.alternatives.get(name) for axis in axes], NOISE_UNITS[sensor][name])
-        for name in TERMS
-        if any(name in axis.alternatives for axis in axes)
-    }
+    section['also_possible'] = [list(map(list, axis.others)) for axis in axes]
+    section['alternatives'] = _entries(sensor, [axis.alternatives for axis in axes])
     section['taken_out'] = _trends(sensor, axes)
-    section['record_for'] = {
-        name: [axis.record_for.get(name) for axis in axes]
-        for name in TERMS
-        if any(name in axis.record_for for axis in axes)
-    }
+    section['record_for'] = {}
+    for name in TERMS:
+        if any(name in axis.record_for for axis in axes):
+            section['record_for'][name] = [axis.record_for.get(name) for axis in axes]
     section['sample_sd'] = [float(axis.sample_sd) for axis in axes]
     section['shortest_averaging_time'] = [float(axis.shortest) for axis in axes]
     section['excess'] = [float(axis.excess) for axis in axes]
@@ -187,19 +177,30 @@ def _sensor_section(sensor, axes):
     return section
 
 
+def _entries(sensor, terms_of_axes):
+    """Return name -> entry of each term that an axis has, in the order of `TERMS`."""
+    entries: dict[str, Any] = {}
+    for name in TERMS:
+        if any(name in terms for terms in terms_of_axes):
+            terms_of_name = [terms.get(name) for terms in terms_of_axes]
+            entries[name] = _entry(terms_of_name, NOISE_UNITS[sensor][name])
+    return entries
+
+
 def _entry(terms, unit):
     """
     Return value, interval, status, reason and unit of three axes.
 
     None where an axis has no such figure.
     """
+    values, intervals = [], []
+    for term in terms:
+        has_value = term is not None and term.value is not None
+        values.append(float(term.value) if has_value else None)
+        intervals.append(None if term is None else list(map(finite, term.interval)))
     return {
-        'value': [
-            None if term is None or term.value is None else float(term.value) for term in terms
-        ],
-        'interval95': [
-            None if term is None else [finite(end) for end in term.interval] for term in terms
-        ],
+        'value': values,
+        'interval95': intervals,
         'status': [None if term is None else term.status for term in terms],
         'reason': ['' if term is None else term.reason for term in terms],
         'unit': unit,
@@ -207,22 +208,23 @@ def _entry(terms, unit):
 
 
 def _trends(sensor, axes):
-    names = dict.fromkeys(trend.name for axis in axes for trend in axis.trends)
-    found: dict[str, Any] = {}
-    for name in names:
-        trends = [
-            next((trend for trend in axis.trends if trend.name == name), None) for axis in axes
-        ]
-        found[name] = {
-            key: [None if trend is None else float(getattr(trend, key)) for trend in trends]
-            for key in ('value', 'sd')
+    # Name -> trend of each axis, in the order of the first axis that has it.
+    trends_of: dict[str, list[Any]] = {}
+    for index, axis in enumerate(axes):
+        for trend in axis.trends:
+            trends_of.setdefault(trend.name, [None] * len(axes))[index] = trend
+    entries: dict[str, Any] = {}
+    for name, trends in trends_of.items():
+        entry: dict[str, Any] = {
+            'value': [None if trend is None else float(trend.value) for trend in trends],
+            'sd': [None if trend is None else float(trend.sd) for trend in trends],
         }
         if name == 'turn_on':
-            found[name]['time_constant'] = [
-                None if trend is None else float(trend.time) for trend in trends
-            ]
-        found[name]['unit'] = NOISE_UNITS[sensor][name]
-    return found
+            times = [None if trend is None else float(trend.time) for trend in trends]
+            entry['time_constant'] = times
+        entry['unit'] = NOISE_UNITS[sensor][name]
+        entries[name] = entry
+    return entries
 
 
 def _for_filters(figures, sensor, horizon):
@@ -373,16 +375,14 @@ def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]
 
     By sensor, of the worst axes.
     """
-    return [
-        (
-            seconds,
-            {
-                sensor: max(_of_axis(axis, sensor, seconds) for axis in figures.sensor(sensor))
-                for sensor in figures.sensors
-            },
-        )
-        for seconds in RUNS
-    ]
+    budget = []
+    for seconds in RUNS:
+        worst = {}
+        for sensor in figures.sensors:
+            axes = figures.sensor(sensor)
+            worst[sensor] = max(_of_axis(axis, sensor, seconds) for axis in axes)
+        budget.append((seconds, worst))
+    return budget
 
 
 def _of_axis(axis: AxisFigures, sensor: str, seconds: float) -> float:
@@ -555,17 +555,21 @@ def requested(axis: AxisFigures) -> list[Term]:
     White noise and the slow part, or the random walk where no slow part is seen.
     """
     names = [WHITE.name, *(axis.form or (RANDOM_WALK.name,))]
-    return [axis.terms[name] for name in [*names, *([TIME_KEY] if GAUSS_MARKOV in names else [])]]
+    if GAUSS_MARKOV in names:
+        names.append(TIME_KEY)
+    return [axis.terms[name] for name in names]
+
+
+def _all_axes(figures: NoiseFigures) -> Iterator[AxisFigures]:
+    """Return the axes of all sensors."""
+    return chain.from_iterable(figures.sensor(sensor) for sensor in figures.sensors)
 
 
 def counts(figures: NoiseFigures) -> dict[str, int]:
     """Return how many of the figures that count are determined, weak and held."""
-    statuses = [
-        term.status
-        for sensor in figures.sensors
-        for axis in figures.sensor(sensor)
-        for term in requested(axis)
-    ]
+    statuses: list[str] = []
+    for axis in _all_axes(figures):
+        statuses += [term.status for term in requested(axis)]
     return {status: statuses.count(status) for status in STATUSES}
 
 
@@ -601,12 +605,7 @@ def lines(figures: NoiseFigures) -> list[str]:
     for sensor in figures.sensors:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
             found += _axis_lines(f'{sensor} {letter}', sensor, axis)
-    if any(
-        name in SLOW_PROCESSES
-        for sensor in figures.sensors
-        for axis in figures.sensor(sensor)
-        for name in axis.form
-    ):
+    if any(set(axis.form) & set(SLOW_PROCESSES) for axis in _all_axes(figures)):
         found.append(
             'slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for'
             ' this recording; values of a second recording can lie outside'
@@ -706,16 +705,14 @@ def said(form: tuple[str, ...]) -> str:
 
 def _longest(figures):
     """Return the recording time that determines all required figures, or ''."""
-    needed = [
-        axis.record_for[term.name]
-        for sensor in figures.sensors
-        for axis in figures.sensor(sensor)
-        for term in requested(axis)
-        if term.name in axis.record_for
-    ]
+    needed = []
+    for axis in _all_axes(figures):
+        names = [term.name for term in requested(axis)]
+        needed += [axis.record_for[name] for name in names if name in axis.record_for]
     if not needed:
         return ''
-    most = None if any(seconds is None for seconds in needed) else max(needed)
+    known = [seconds for seconds in needed if seconds is not None]
+    most = max(known) if len(known) == len(needed) else None
     return (
         'to determine all of them: record '
         + ('more than two days' if most is None else duration(most))
