@@ -11,101 +11,91 @@ deviations instead. So do alternatives to a chosen effect that fit nearly as wel
 unexplained residual: by the change of a bias that it may cause.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from imu_calibration.calibration.calibrate import conclude
-from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
-from imu_calibration.calibration.table_calibration import (
-    SolvedWindows,
-    TableRecordings,
-    WindowSource,
-)
-from imu_calibration.calibration.window_observations import TableResult
+from imu_calibration.calibration.calibrate import Solved, conclude
+from imu_calibration.calibration.from_solution import Estimate, ModelChanges, ModelExtension
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import Role
-from imu_calibration.effects.sensor_model import BARE, SensorModel
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.session_noise import WEIGHTLESS
 from imu_calibration.estimation.solution import CONVENTION_SHARE, SAMPLE_NOISE, Solution
 from imu_calibration.estimation.solver import solve
-from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.references.turntable.session_data import SessionData
-from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
-from imu_calibration.selection.investigation import Investigation
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.parameter_space import ParameterSpace
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.residual_analysis import ResidualAnalysis, inquire
 from imu_calibration.selection.saturation import Saturation
-from imu_calibration.selection.search import FAMILY_WISE
-from imu_calibration.selection.unexplained import biases_off
+from imu_calibration.selection.search import FAMILY_WISE, SelectedEffects, SelectionSettings
+
+
+class ModelSource(Protocol[Estimate]):
+    """Recordings of one IMU with a reference, or a live session."""
+
+    def solved(self, options: CalibrationOptions) -> Solved[Estimate]:
+        """Return the solution of the model that options request, at a valid linearisation."""
 
 
 def calibrate_by_evidence(
-    sources: Sequence[Callable],
-    table: Table,
+    source: ModelSource[Estimate],
     options: CalibrationOptions = CalibrationOptions(),
     *,
     provenance: dict | None = None,
-    mapper: Callable = map,
-    names: Sequence[str] | None = None,
-) -> TableResult:
+) -> CalibrationResult[Estimate]:
     """
-    Calibrate from one or several recordings of the same IMU.
+    Calibrate from recordings of one IMU with any reference.
 
     Effects that they support are added to the requested model.
 
     Parameters
     ----------
-    sources, table, options, provenance, mapper, names
-        As for `calibrate`.
+    source : ModelSource
+        `TableRecordings`, or `PoseRecording` by hand.
+    options : CalibrationOptions
+        Of the requested model.
+    provenance : dict, optional
+        Names of recordings, hashes and options for the document.
 
     Raises
     ------
     InputError
-        As `calibrate`.
+        When a recording cannot be used, or a requested effect needs a table that is not there.
+    NotObservableError
+        When no parameter is determined.
 
     """
-    recordings = TableRecordings.of(
-        sources, table, mapper=mapper, names=names, keep_windows=not options.as_asked
-    )
-    selected = solve_by_evidence(recordings, table, options)
+    selected = solve_by_evidence(source, options)
     return conclude(selected, selected.extension.options(options), provenance=provenance)
 
 
 def solve_by_evidence(
-    source: WindowSource, table: Table, options: CalibrationOptions
-) -> SolvedWindows:
+    source: ModelSource[Estimate], options: CalibrationOptions = CalibrationOptions()
+) -> Solved[Estimate]:
     """
     Return the solution of the requested model with the effects that the recordings support.
 
     Parameters
     ----------
-    source : WindowSource
-        With the windows of the search.
-    table : Table
+    source : ModelSource
     options : CalibrationOptions
         Options of the requested model.
 
     """
-    # Solve the requested model, and search in each recording with enough windows.
+    # Solve the requested model, and search in each recording with enough data.
     first = source.solved(options)
-    parts = windows_to_ask(first.data.gathered)
-    if not parts:
+    searches = list(first.data.searches(first.solution, options))
+    if not searches:
         return first
-    baseline = _baseline_model(options, table, first.solution.model)
-    found, *others = (
-        _examined(inquire(windows, table, baseline, bias_processes=options.bias_processes))
-        for windows in parts
-    )
+    found, *others = searches
     from_others = _named_elsewhere(found, others)
-    requested = first.data.model
+    requested = first.model
 
     # An effect of the requested model is judged with the added effects in the solution: the misfit
     # of a missing delay or encoder zero widens every standard deviation.
@@ -115,23 +105,27 @@ def solve_by_evidence(
             added: tuple[tuple[str, str], ...] = ()
             point: dict[str, np.ndarray] = {}
             solved = first
-            found = _without_faint(found, solved.solution)
+            found = _without_faint(found, solved.solution, requested)
             break
 
         # Solve again with the added effects, linearised at their estimates.
         point = {}
         for each in (*others, found):
-            point |= _point(each)
+            point |= each.point_of_adopted
         added = tuple(question.effect.key for question in beyond)
         solved = source.solved(replace(options, added=added, point=point))
         solution = solved.solution
 
         # Possible rivals of the effects found in the largest recording are removed first.
-        significant = [question for question in from_others if not _is_faint(solution, question)]
+        significant = [
+            question
+            for question in from_others
+            if not _is_faint(solution, question, found.settings)
+        ]
         if len(significant) < len(from_others):
             from_others = significant
             continue
-        found = _without_faint(found, solution)
+        found = _without_faint(found, solution, requested)
         if len(_beyond((*found.adopted, *from_others), requested)) == len(beyond):
             break
     extension = ModelExtension(
@@ -143,8 +137,8 @@ def solve_by_evidence(
 
 
 def ask_kept(
-    solved: SolvedWindows, table: Table, options: CalibrationOptions, *, known: ModelExtension
-) -> SolvedWindows:
+    solved: Solved[Estimate], options: CalibrationOptions, *, known: ModelExtension
+) -> Solved[Estimate]:
     """
     Return the supported effects when columns cannot be recomputed.
 
@@ -152,25 +146,19 @@ def ask_kept(
 
     Parameters
     ----------
-    solved : SolvedWindows
+    solved : Solved
         Of the requested model with the added effects.
-    table, options
+    options : CalibrationOptions
         As for `solve_by_evidence`.
     known : ModelExtension
         The effects that were supported when the columns were computed.
 
     """
-    solution, model = solved.solution, solved.data.model
-    parts = windows_to_ask(solved.data.gathered)
-    if not parts:
+    solution, model = solved.solution, solved.model
+    found = next(solved.data.searches(solution, options), None)
+    if found is None:
         return replace(solved, extension=known)
-    found = inquire(
-        parts[0],
-        table,
-        _baseline_model(options, table, solution.model),
-        bias_processes=options.bias_processes,
-    )
-    found = _without_faint(_examined(found), solution)
+    found = _without_faint(found, solution, model)
     # After a limit was found, the solution is that of the search.
     lacking = [] if found.limits else _beyond(found.adopted, model)
     changes = replace(
@@ -182,20 +170,7 @@ def ask_kept(
     return replace(solved, solution=extension.applied(solution), extension=extension, found=found)
 
 
-def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
-    """
-    Return the windows of each recording that suffice for a search of effects.
-
-    The largest recording is first.
-    """
-    return [
-        windows
-        for windows in (spread.windows for spread in gathered.spreads)
-        if len(windows) >= MIN_FOLD_WINDOWS
-    ]
-
-
-def _clipped(found: ResidualAnalysis) -> Solution | None:
+def _clipped(found: SelectedEffects) -> Solution | None:
     """
     Return the solution of a search that found a limit.
 
@@ -214,21 +189,13 @@ def _clipped(found: ResidualAnalysis) -> Solution | None:
     )
 
 
-def _examined(found: ResidualAnalysis) -> ResidualAnalysis:
-    """Return a search whose unexplained residual is evaluated and whose blocks are freed."""
-    found.released()
-    return found
-
-
-def _changes(
-    searches: Sequence[ResidualAnalysis], added: Sequence[tuple[str, str]]
-) -> ModelChanges:
+def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str]]) -> ModelChanges:
     """
     Return the changes of the requested model by searches, and their effects.
 
     The first search has priority.
     """
-    found, model = searches[0], searches[0].problem.baseline
+    found, model = searches[0], searches[0].baseline_model
     clipping = (
         model.with_role(limit.sensor, Role.LIMIT).effect_of(limit.sensor, Role.LIMIT).name
         for limit in found.limits
@@ -236,7 +203,7 @@ def _changes(
     rests = {
         sensor: rest.entry
         for each in reversed(searches)
-        for sensor, rest in each.released().items()
+        for sensor, rest in each.unexplained_rests().items()
         if rest.significant
     }
     return ModelChanges(
@@ -244,7 +211,7 @@ def _changes(
         tuple(question.name for question in found.unstable),
         _strange(searches),
         unexplained=rests,
-        stamp_jitter=found.stamp_jitter.to_mapping(),
+        stamp_jitter=dict(found.jitter_entry),
     )
 
 
@@ -253,26 +220,34 @@ def _beyond(named: Iterable[Question], model: SensorModel) -> list[Question]:
     return [question for question in named if question.effect.key not in model.slices]
 
 
-def _is_faint(solution: Solution, question: Question) -> bool:
+def _is_faint(
+    solution: Solution, question: Question, settings: SelectionSettings = SelectionSettings()
+) -> bool:
     """Return whether an effect is in a solution but not significant."""
-    return question.effect.key in solution.model.slices and not stands_out(solution, question)
+    if question.effect.key not in solution.model.slices:
+        return False
+    return not stands_out(solution, question, joint_test=settings.joint_test)
 
 
-def _without_faint(found: ResidualAnalysis, solution: Solution) -> ResidualAnalysis:
-    """Return the Investigation without findings that are in a solution but not significant."""
-    faint = [question for question in found.named if _is_faint(solution, question)]
-    return (
-        replace(
-            found,
-            named=[question for question in found.named if question not in faint],
-            unstable=[*found.unstable, *faint],
-        )
-        if faint
-        else found
+def _without_faint(
+    found: SelectedEffects, solution: Solution, requested: SensorModel
+) -> SelectedEffects:
+    """Return the search without findings that are in a solution but not significant."""
+    faint = []
+    for question in found.named:
+        is_judged = found.settings.judge_requested or question.effect.key not in requested.slices
+        if is_judged and _is_faint(solution, question, found.settings):
+            faint.append(question)
+    if not faint:
+        return found
+    return replace(
+        found,
+        named=[question for question in found.named if question not in faint],
+        unstable=[*found.unstable, *faint],
     )
 
 
-def _named_elsewhere(found: Investigation, others: Sequence[Investigation]) -> list[Question]:
+def _named_elsewhere(found: SelectedEffects, others: Sequence[SelectedEffects]) -> list[Question]:
     """
     Return the effects that the search found in other recordings only, larger recordings first.
     """
@@ -285,14 +260,14 @@ def _named_elsewhere(found: Investigation, others: Sequence[Investigation]) -> l
     return list(from_others.values())
 
 
-def stands_out(solution: Solution, question: Question) -> bool:
+def stands_out(solution: Solution, question: Question, *, joint_test: bool = True) -> bool:
     """
     Return whether an effect belongs into the model of a solution.
 
     With standard deviations that include all allowances.
 
     Its size is plausible, by the threshold that the verdict uses; it differs from its prior
-    significantly, and so does one coefficient.
+    significantly (`joint_test`), and so does one coefficient.
     """
     effect, part = question.effect, solution.model.slices[question.sensor, question.name]
     at = np.arange(part.start, part.start + effect.n_amplitudes)
@@ -302,6 +277,8 @@ def stands_out(solution: Solution, question: Question) -> bool:
     far = (solution.values - make_prior(solution.model).mean)[at]
     if not one_significant(far, np.sqrt(np.diag(solution.covariance)[at])):
         return False
+    if not joint_test:
+        return True
     sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
     # The lever arms of three sensors sum to zero by convention.
     known = sizes > CONVENTION_SHARE * sizes[-1]
@@ -310,41 +287,7 @@ def stands_out(solution: Solution, question: Question) -> bool:
     )
 
 
-def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
-    """
-    Return the options of the baseline model of the search.
-
-    Effects that were not requested have to be significant.
-    """
-    return replace(
-        options,
-        accelerometer_model=options.accelerometer_model or BARE,
-        reference_model=options.reference_model or 'none',
-    )
-
-
-def _baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
-    """
-    Return the baseline model of the search.
-
-    Parameters
-    ----------
-    options : CalibrationOptions
-    table : Table
-    solved : SensorModel
-        The model of a solution; the same effects are linearised at its point.
-
-    """
-    model = choose_model(baseline_options(options), table)
-    names = {effect.name for effect in model.effects}
-    return replace(
-        model,
-        point={name: value for name, value in solved.point.items() if name in names},
-        temperature_ref_c=solved.temperature_ref_c,
-    )
-
-
-def _strange(found: Sequence[Investigation]) -> dict[str, float]:
+def _strange(found: Sequence[SelectedEffects]) -> dict[str, float]:
     """
     Return implausible effect -> share of the excess variance that it explains.
 
@@ -357,30 +300,18 @@ def _strange(found: Sequence[Investigation]) -> dict[str, float]:
     }
 
 
-def _point(found: Investigation) -> dict[str, np.ndarray]:
-    """Return effect -> values at which its columns are linearised, of the effects found."""
-    model = found.problem.recording.model
-    return {
-        question.name: model.point[question.name]
-        for question in found.adopted
-        if question.name in model.point
-    }
-
-
 def _moves(
-    found: ResidualAnalysis, lacking: Sequence[Question] = ()
-) -> tuple[tuple[dict[str, float], float], ...]:
+    found: SelectedEffects, lacking: Sequence[Question] = ()
+) -> tuple[tuple[Mapping[str, float], float], ...]:
     """
     Return (changes of parameters by other choices of effects, weight).
 
-    Rejected, doubtful, implausible or missing effects, rivals.
+    Rejected, doubtful, implausible or missing effects, and what the search found besides.
     """
-    moves = [
-        (found.search.moved_by(found.named, question, found.problem.space.names), 1.0)
-        for question in (*found.unstable, *found.rejected, *found.implausible, *lacking)
-    ]
-    moves += [(moved, 1.0) for moved in biases_off(found.problem.baseline, found.rests)]
-    return (*moves, *((rival.moves, rival.weight) for rival in found.rivals))
+    moves = []
+    for question in (*found.unstable, *found.rejected, *found.implausible, *lacking):
+        moves.append((found.search.moved_by(found.named, question, found.param_names), 1.0))
+    return (*moves, *found.further_moves)
 
 
 def extended_solution(

@@ -4,15 +4,16 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, Generic
 
-from imu_calibration.calibration.from_solution import ModelExtension, document
+from imu_calibration.calibration.from_solution import Estimate, ModelExtension, document
 from imu_calibration.calibration.plain_fit import (
     PlainFit,
     changes_with,
     plain_entries,
     with_plain_fits,
 )
-from imu_calibration.calibration.result import CalibrationResult, Estimate, Observations
+from imu_calibration.calibration.result import CalibrationResult, Observations
 from imu_calibration.document.proof_entry import Proof
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import tolerances_of, with_weak_replaced
 from imu_calibration.references.options import CalibrationOptions
 
@@ -29,6 +30,11 @@ class Solved(Generic[Estimate]):
     """Effects that the search added; nothing without a search."""
     found: Any = None
     """Result of the search; None without one, or with too few data."""
+
+    @property
+    def model(self) -> SensorModel:
+        """The model of the data, of which the solved one may be a part."""
+        return self.solution.model
 
 
 def conclude(

@@ -11,6 +11,7 @@ import numpy as np
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
@@ -102,9 +103,10 @@ class FleetStep:
 
     def _calibrated(self, unit: Unit) -> UnitResult:
         provenance = unit.provenance() if unit.provenance is not None else None
-        result = calibrate_by_evidence(
-            unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None
+        recordings = TableRecordings.of(
+            unit.sources, self.table, names=unit.bags or None, keep_windows=True
         )
+        result = calibrate_by_evidence(recordings, self.options, provenance=provenance)
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         report_of = self.report
         if report_of is not None:

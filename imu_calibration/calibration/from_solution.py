@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -38,6 +38,9 @@ from imu_calibration.preprocessing.checks import unusable, visible_findings
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
+
+Estimate = TypeVar('Estimate', bound=Solution)
+"""Solution of a reference."""
 
 
 @dataclass(frozen=True)
@@ -115,13 +118,14 @@ class ModelExtension:
             total += weight * np.outer(shift, shift)
         return total
 
-    def applied(self, solution: Solution) -> Solution:
+    def applied(self, solution: Estimate) -> Estimate:
         """
         Return a solution of `options`, or that without clipped samples.
 
         With the covariance of rejected and collinear effects.
         """
-        found = self.clipped or solution
+        # A clipped solution is of the same reference.
+        found = cast('Estimate', self.clipped or solution)
         return replace(
             found, terms=with_term(found.terms, REJECTED, self.disagreement(found.param_names))
         )

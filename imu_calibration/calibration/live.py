@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import ask_kept, solve_by_evidence
-from imu_calibration.calibration.calibrate import conclude
+from imu_calibration.calibration.calibrate import Solved, conclude
 from imu_calibration.calibration.collector import (
     LiveCollector,
     copied,
@@ -38,6 +38,7 @@ from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import height_setting, setting
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import gravity_of_settings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import check_units
@@ -102,15 +103,12 @@ class LiveSnapshot:
             total = self.gathered.anew(reduced, judged_from)
         return solved_windows(WindowObservations(self.table, total, model), options)
 
-    def evidence(self) -> SolvedWindows:
+    def evidence(self) -> Solved[Solution]:
         """Return the solution with the supported effects, as `calibrate_by_evidence`."""
         if self.store.complete:
-            return solve_by_evidence(self, self.table, self.options)
+            return solve_by_evidence(self, self.options)
         return ask_kept(
-            self.solved(self.extension.options(self.options)),
-            self.table,
-            self.options,
-            known=self.extension,
+            self.solved(self.extension.options(self.options)), self.options, known=self.extension
         )
 
 

@@ -1,6 +1,6 @@
 """Poses and turns of a calibration by hand, with the errors that they have before and after."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -42,8 +42,11 @@ from imu_calibration.references.gravity.hand_calibration import (
 from imu_calibration.references.gravity.hand_parameters import (
     CROSS_TERMS,
     HandOptions,
+    hand_options,
 )
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
+from imu_calibration.selection.search import SelectedEffects
 
 HandResult = CalibrationResult[HandCalibration]
 """A calibration by hand."""
@@ -90,6 +93,22 @@ class PoseObservations:
     def absent(self) -> tuple[str, ...]:
         """Sensors without readings."""
         return self.data.absent
+
+    def searches(
+        self, solution: HandCalibration, options: CalibrationOptions
+    ) -> Iterator[SelectedEffects]:
+        """Yield the search of effects in the recording, if it has enough poses."""
+        # Here, because its import is slow.
+        from imu_calibration.references.gravity.model_selection import (
+            MIN_FOLD_POSES,
+            investigate_by_hand,
+        )
+
+        # The search compares both sensors in poses and turns: with one sensor it has no data.
+        data = self.data
+        if options.as_asked or data.absent or len(data.poses.start) < MIN_FOLD_POSES:
+            return
+        yield investigate_by_hand(data, hand_options(options), solution)
 
     def gauge(self, solution: HandCalibration) -> dict[str, Any]:
         """Return the conventions of origin and axes."""

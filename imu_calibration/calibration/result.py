@@ -5,32 +5,31 @@ A reference contributes the data that it gathered (`Observations`) and predictio
 (`HeldOutData`); what follows from a solution is concluded once, in `calibrate.conclude`.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol
 
 import numpy as np
 
+from imu_calibration.calibration.from_solution import Estimate
 from imu_calibration.calibration.plain_fit import PlainFit
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected, usage
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
+from imu_calibration.selection.search import SelectedEffects
 
 GRAVITY_SD = 5e-4
 """
 Standard deviation of the local gravity where a table description or the options give it without
 one, m/s^2.
 """
-Estimate = TypeVar('Estimate', bound=Solution)
-"""Solution of a reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +135,15 @@ class Observations(Protocol[Estimate]):
     @property
     def tested(self) -> tuple[str, ...]:
         """Parameters that a likelihood-ratio test holds at their prior."""
+
+    def searches(
+        self, solution: Estimate, options: CalibrationOptions
+    ) -> Iterator[SelectedEffects]:
+        """
+        Yield the search of effects that a solution lacks, in each recording with enough data.
+
+        The largest recording is first; nothing where options request no search.
+        """
 
     def gauge(self, solution: Estimate) -> dict[str, Any]:
         """Return the conventions of origin and axes."""

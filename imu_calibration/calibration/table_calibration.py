@@ -79,6 +79,11 @@ class SolvedWindows(Solved[Solution]):
     data: WindowObservations
     """The windows."""
 
+    @property
+    def model(self) -> SensorModel:
+        """The model of the columns of the windows."""
+        return self.data.model
+
 
 def solved_windows(data: WindowObservations, options: CalibrationOptions) -> SolvedWindows:
     """Return the solution of windows (`solve_gathered`)."""
@@ -142,7 +147,7 @@ class TableRecordings:
     ) -> SolvedWindows:
         """Read all recordings once; see `WindowSource.solved_at`."""
         # The search has its windows when effects are added.
-        keep_windows = self.keep_windows and not options.added
+        keep_windows = self.keep_windows and not (options.added or options.as_asked)
         step = GatherStep(
             self.table,
             model,

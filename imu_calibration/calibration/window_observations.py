@@ -35,6 +35,7 @@ from imu_calibration.calibration.result import (
     Needs,
     WindowErrors,
 )
+from imu_calibration.calibration.window_search import search_windows
 from imu_calibration.core.units import ARCMIN
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected, latest_settling, uncorrected_on_table
@@ -59,7 +60,9 @@ from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import CheckFinding, with_findings_of
 from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock, SessionData
+from imu_calibration.selection.residual_analysis import ResidualAnalysis
 from imu_calibration.selection.residual_blocks import residuals
 
 TableResult = CalibrationResult[Solution]
@@ -372,6 +375,12 @@ class WindowObservations:
     def with_reference_errors(self, solution: Solution) -> Solution:
         """Return the solution with the uncertainty of gravity in its covariance."""
         return with_gravity_uncertainty(solution, self.table)
+
+    def searches(
+        self, solution: Solution, options: CalibrationOptions
+    ) -> Iterator[ResidualAnalysis]:
+        """Yield the search of effects in each recording with enough windows."""
+        return search_windows(self.gathered, self.table, solution.model, options=options)
 
     def held_out(self, solution: Solution) -> 'HeldOutWindows':
         """Return the windows in folds, with the parameters of a solution without each fold."""

@@ -35,7 +35,7 @@ from imu_calibration.selection.rivals import (
     settle_rivals,
     simpler,
 )
-from imu_calibration.selection.saturation import Saturation, windows_at, without_clipping
+from imu_calibration.selection.saturation import windows_at, without_clipping
 from imu_calibration.selection.search import SelectedEffects
 
 LINEARISATIONS = 5
@@ -51,31 +51,14 @@ needs up to eight linearisations.
 """
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Investigation(SelectedEffects):
     """Numerical result of a search, without sentences."""
 
     used: list[Window]
     """Windows that were fitted to, without clipped samples."""
     problem: LinearisedProblem
-    """The last linearisation with its evidence."""
     explained: ExplainedWindows
-    """Expected loss from noise and losses of choices."""
-    named: Sequence[Question]
-    """Questions that became findings, in the order found."""
-    limits: list[Saturation]
-    """Saturations."""
-    not_testable: list[dict]
-    """Effects that could not be tested."""
-    unstable: Sequence[Question] = field(default_factory=list)
-    """
-    Questions that would have become findings, but the parts of the recording disagree on them.
-    """
-    rejected: Sequence[Question] = field(default_factory=list)
-    """
-    Questions selected by likelihood but not named: their gain is too small, or the remaining excess
-    too large.
-    """
     rivals: Sequence[Rival] = field(default_factory=list)
     """Alternatives to findings that fit nearly as well."""
     onset: Onset | None = None
@@ -83,6 +66,26 @@ class Investigation(SelectedEffects):
     Parameters that change at one moment: the other results are those of the longer part of the
     recording.
     """
+
+    @property
+    def param_names(self) -> Sequence[str]:
+        """Names of the parameters of the baseline and of the effects under test."""
+        return self.problem.space.names
+
+    @property
+    def baseline_model(self) -> SensorModel:
+        """The model that the search extends."""
+        return self.problem.baseline
+
+    @property
+    def point_of_adopted(self) -> dict[str, np.ndarray]:
+        """Effect -> values at which its columns are linearised, of the adopted effects."""
+        point = self.problem.recording.model.point
+        return {
+            question.name: point[question.name]
+            for question in self.adopted
+            if question.name in point
+        }
 
 
 def investigate(
@@ -172,7 +175,15 @@ def investigate(
     ]
     rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
     return Investigation(
-        used, problem, outcome.explained, named, limits, not_testable, unstable, rejected, rivals
+        used=used,
+        problem=problem,
+        explained=outcome.explained,
+        named=named,
+        not_testable=not_testable,
+        unstable=unstable,
+        rejected=rejected,
+        limits=limits,
+        rivals=rivals,
     )
 
 

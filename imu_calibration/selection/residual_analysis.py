@@ -4,9 +4,10 @@ The search of `calibrate` and `diagnose`.
 Supported effects, without findings that a formula or a regime replaces.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from imu_calibration.selection.stamp_jitter import StampJitter
 from imu_calibration.selection.unexplained import (
     Unexplained,
     beyond_noise,
+    biases_off,
     scatter_in_motion,
     unexplained,
 )
@@ -220,7 +222,22 @@ class ResidualAnalysis(Investigation):
         )
         return replace(found, significant=True, rms=float(np.hypot.reduce(sizes)))
 
-    def released(self) -> dict[str, Unexplained]:
+    @property
+    def jitter_entry(self) -> dict[str, Any]:
+        """Independent errors of the stamps, for a document."""
+        return self.stamp_jitter.to_mapping()
+
+    @property
+    def further_moves(self) -> list[tuple[Mapping[str, float], float]]:
+        """(changes of parameters, weight) by the unexplained residual and by rivals."""
+        moves: list[tuple[Mapping[str, float], float]] = []
+        for moved in biases_off(self.problem.baseline, self.rests):
+            moves.append((moved, 1.0))
+        for rival in self.rivals:
+            moves.append((rival.moves, rival.weight))
+        return moves
+
+    def unexplained_rests(self) -> dict[str, Unexplained]:
         """
         Return `unexplained` and free the blocks and their fits, which are computed again on demand.
 

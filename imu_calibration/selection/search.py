@@ -4,15 +4,16 @@ Choosing effects one after the other by held-out evidence.
 With earlier choices reconsidered after each step.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import AbstractSet, Any
+from typing import AbstractSet, Any, ClassVar
 
 import numpy as np
 
 from imu_calibration.core.progress import reported
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
 
@@ -372,11 +373,73 @@ def least_angle(effect: Effect, encoder_step: float) -> float:
     return 0.5 * encoder_step / angles[effect.unit] if effect.unit in angles else 0.0
 
 
-class SelectedEffects:
-    """Findings of a search, separated by plausibility of their sizes."""
+@dataclass(frozen=True)
+class SelectionSettings:
+    """How a solution with the findings of a search judges them."""
 
+    joint_test: bool = True
+    """Whether the coefficients of an effect have to be significant together, besides one alone."""
+    judge_requested: bool = True
+    """Whether findings that are in the requested model have to be significant, too."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SelectedEffects:
+    """
+    Findings of a search on data of any reference, separated by plausibility of their sizes.
+
+    A reference that searches for more than effects overrides the properties that are empty here.
+    """
+
+    settings: ClassVar[SelectionSettings] = SelectionSettings()
     problem: Any
+    """Rows, evidence and search."""
+    explained: Any
+    """Excess over noise, and the share of it that effects remove (`Explained`)."""
     named: Sequence[Question]
+    """Questions that became findings, in the order found."""
+    not_testable: list[dict]
+    """Effects that could not be tested."""
+    unstable: Sequence[Question] = ()
+    """
+    Questions that would have become findings, but the parts of the recording disagree on them.
+    """
+    rejected: Sequence[Question] = ()
+    """
+    Questions selected by likelihood but not named: their gain is too small, or the remaining excess
+    too large.
+    """
+    limits: Sequence[Any] = ()
+    """Saturations (`Saturation`)."""
+
+    @property
+    def jitter_entry(self) -> Mapping[str, Any]:
+        """Independent errors of the stamps, for a document."""
+        return {}
+
+    @property
+    def further_moves(self) -> Sequence[tuple[Mapping[str, float], float]]:
+        """(changes of parameters by other causes than effects that are not named, weight)."""
+        return ()
+
+    @property
+    def param_names(self) -> Sequence[str]:
+        """Names of the parameters of the baseline and of the effects under test."""
+        raise NotImplementedError
+
+    @property
+    def baseline_model(self) -> SensorModel:
+        """The model that the search extends."""
+        raise NotImplementedError
+
+    @property
+    def point_of_adopted(self) -> dict[str, np.ndarray]:
+        """Effect -> values at which its columns are linearised, of the adopted effects."""
+        raise NotImplementedError
+
+    def unexplained_rests(self) -> Mapping[str, Any]:
+        """Return sensor -> its residual that no finding explains, and free what it needed."""
+        raise NotImplementedError
 
     @property
     def search(self) -> Search:

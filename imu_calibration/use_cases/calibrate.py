@@ -18,6 +18,7 @@ from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.pose_readings import errors_by_hand
 from imu_calibration.calibration.result import CalibrationResult, summary
+from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.calibration.window_readings import errors_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
@@ -229,7 +230,8 @@ def _side_by_side(sources, table, options, recordings, jobs):
     ]
     advance = counter('recordings', len(recordings) if jobs > 1 else 0)
     mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-    return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names)
+    recordings = TableRecordings.of(sources, table, mapper=mapper, names=names, keep_windows=True)
+    return calibrate_by_evidence(recordings, options)
 
 
 def check_recording(

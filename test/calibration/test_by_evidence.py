@@ -29,6 +29,7 @@ from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.residual_analysis import ResidualAnalysis
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
+from imu_calibration.selection.search import SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
 from worlds.candidates import FEW, with_candidates
@@ -244,15 +245,18 @@ def test_a_finding_of_the_model_as_asked_must_stand_out_too(examined, monkeypatc
     solution = extended_solution(
         found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named
     )
-    assert by_evidence._without_faint(found, solution) is found
+    assert by_evidence._without_faint(found, solution, solution.model) is found
     monkeypatch.setattr(
-        by_evidence, 'stands_out', lambda solution, question: question is not found.named[0]
+        by_evidence, 'stands_out', lambda _, question, **settings: question is not found.named[0]
     )
-    less = by_evidence._without_faint(found, solution)
+    less = by_evidence._without_faint(found, solution, solution.model)
     assert found.named[0] not in less.named and list(less.unstable) == [
         *found.unstable,
         found.named[0],
     ]
+    # By hand an effect stays that was requested.
+    monkeypatch.setattr(type(found), 'settings', SelectionSettings(judge_requested=False))
+    assert by_evidence._without_faint(found, solution, solution.model) is found
 
 
 def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out(
@@ -291,12 +295,15 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
         )
 
     assert stands_out(of([6.0, 1.0], 0.0), pair)
+    # One coefficient is significant, but not both together (chi2 12 with 2 degrees of freedom).
+    alone = of([3.5, 0.0], 0.0)
+    assert not stands_out(alone, pair) and stands_out(alone, pair, joint_test=False)
     # Significant together (chi2 125), but no coefficient is.
     assert not stands_out(of([2.5, -2.5], 0.9), pair)
     # A size of no instrument.
     assert not stands_out(of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair)
     monkeypatch.undo()
-    monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda *_, **settings: False)
     faint = imu.calibrate(late[0].block, late[1], candidates=FEW).calibration
     assert (
         'time_offset' in faint.statistics['denied']
@@ -312,7 +319,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
 
 @pytest.mark.long
 def test_an_effect_that_is_removed_as_faint_leaves_an_unexplained_residual(monkeypatch):
-    monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda *_, **settings: False)
     session = make_session(5, {'accel_quadratic': 2e-4}, 'realistic', **COARSE)
     found = imu.calibrate(
         session.block, Table.from_mapping(session.table), candidates=FEW
@@ -330,7 +337,7 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     With a formula for the cube that name is in no model.
     """
     # Another guard, which sees to it here too.
-    monkeypatch.setattr(by_evidence, 'stands_out', lambda *some: True)
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda *_, **settings: True)
     session = make_session(
         141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141), **COARSE
     )

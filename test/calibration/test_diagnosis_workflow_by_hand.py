@@ -16,7 +16,6 @@ from refusal import refused
 from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
 from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand
-from imu_calibration.calibration.hand_workflow import extended_by_hand
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
@@ -76,7 +75,8 @@ def stops(force, rate, time, pose):
 def diagnose_by_hand(data, options):
     """The findings and the extended calibration."""
     found = investigate_by_hand(data, options)
-    hand = extended_by_hand(data, found, options)
+    added = tuple(question.effect.key for question in found.adopted)
+    hand = solve_by_hand(data, replace(options, added=added, point=found.point_of_adopted))
     return SimpleNamespace(diagnosis=diagnosis_by_hand(found, hand), hand=hand, search=found)
 
 

@@ -20,6 +20,7 @@ from imu_calibration.calibration.diagnosis.live_diagnosis import (
 )
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
+from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.progress import LiveState, report
 from imu_calibration.core.samples import SampleBlock
@@ -148,7 +149,8 @@ def test_a_delay_is_taken_at_its_size_like_offline():
         live.push(block)
     live.solve(pending=True)
     assert live.adopt(question_about(live).answer().extension)
-    expected = calibrate_by_evidence([lambda: iter([pair.first.block])], table, OPTIONS).calibration
+    recordings = TableRecordings.of([lambda: iter([pair.first.block])], table, keep_windows=True)
+    expected = calibrate_by_evidence(recordings, OPTIONS).calibration
     found = live.solve(pending=True).calibration
     assert 'time_offset' in found.statistics['added']
     assert_same(found, expected)

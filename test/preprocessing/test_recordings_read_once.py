@@ -79,7 +79,7 @@ def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, 
         assert len(windows) >= 10
         raise ImuCalibrationError(code='enough')
 
-    monkeypatch.setattr('imu_calibration.calibration.by_evidence.inquire', enough)
+    monkeypatch.setattr('imu_calibration.calibration.window_search.inquire', enough)
     with refused(ImuCalibrationError, 'enough'):
         diagnose_recording(source_of(BAG, Topics(), table.joint_names), table)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0

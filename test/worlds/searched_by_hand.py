@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from imu_calibration.calibration.by_evidence import solve_by_evidence
 from imu_calibration.calibration.hand_recording import HandRecording
-from imu_calibration.calibration.hand_workflow import solve_hand_by_evidence
+from imu_calibration.calibration.hand_workflow import PoseRecording
 from imu_calibration.calibration.pose_observations import PoseObservations
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.references.gravity.hand_parameters import HandOptions
+from imu_calibration.references.options import CalibrationOptions
 
 from worlds.hand_sessions import GRAVITY
 
@@ -14,6 +15,7 @@ NO_SAMPLES = HandRecording(ImuSamples(np.zeros(0, np.int64), *np.zeros((2, 0, 3)
 """The search needs the means only."""
 
 
-def searched(data, options=HandOptions(GRAVITY)):
+def searched(data, options=CalibrationOptions(gravity=GRAVITY)):
     """Return the solution with the effects that poses and turns support."""
-    return solve_hand_by_evidence(PoseObservations(data, NO_SAMPLES, options.gravity), options)
+    observations = PoseObservations(data, NO_SAMPLES, options.gravity)
+    return solve_by_evidence(PoseRecording(observations), options)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
+from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
@@ -29,6 +29,7 @@ from imu_calibration.calibration.hand_workflow import calibrate_poses
 from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
 from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.calibration.window_observations import TableResult
+from imu_calibration.calibration.window_search import baseline_options
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HARM
@@ -233,8 +234,9 @@ def diagnose_recording(
 
     """
     reader = StoredRecording()
+    recordings = TableRecordings.of([source], table, mapper=reader, keep_windows=True)
     result = calibrate_by_evidence(
-        [source], table, replace(options, as_asked=False), provenance=provenance, mapper=reader
+        recordings, replace(options, as_asked=False), provenance=provenance
     )
     if result.found is None:
         raise too_few_windows(len(result.gathered.spreads[0].windows))

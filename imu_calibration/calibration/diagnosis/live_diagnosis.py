@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-from imu_calibration.calibration.by_evidence import windows_to_ask
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
     diagnosis_lines,
@@ -13,6 +12,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration, LiveSnapshot
+from imu_calibration.calibration.window_search import windows_to_ask
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.text_enum import StrEnum

@@ -299,18 +299,15 @@ def gather_by_hand(
     )
 
 
-def solve_by_hand(
-    data: HandData, options: HandOptions, point: dict | None = None
-) -> HandCalibration:
+def solve_by_hand(data: HandData, options: HandOptions) -> HandCalibration:
     """
     Estimate from given poses and turns.
 
-    See `calibrate_by_hand`. `point`: effect -> values at which its columns are first computed.
-    Cross terms of the accelerometer that no attitude tests are held at their prior
-    (`tested_directions`).
+    See `calibrate_by_hand`. Cross terms of the accelerometer that no attitude tests are held at
+    their prior (`tested_directions`).
     """
     report('solving')
-    free = _solved(data, options, point)
+    free = _solved(data, options)
     if 'accelerometer' in data.absent:
         return free
     model, poses = free.hand_model, free.used_poses
@@ -319,7 +316,7 @@ def solve_by_hand(
     if not names:
         return free
     testing = turns_between(up, free.used_turns)
-    held = _solved(data, options, point, untested=names)
+    held = _solved(data, options, untested=names)
     if len(testing) < TESTING_TURNS:
         # Norms decide, with one error for all rests of a placement. The readings are those of the
         # recording: outliers and a wandering bias were estimated with one of the models, whose
@@ -345,7 +342,7 @@ def _missed_by(hand: HandCalibration, turn: TurnData) -> float:
 
 
 def _solved(
-    data: HandData, options: HandOptions, point: dict | None, *, untested: tuple[str, ...] = ()
+    data: HandData, options: HandOptions, *, untested: tuple[str, ...] = ()
 ) -> HandCalibration:
     """Return the calibration with the cross terms `untested` held at their prior."""
     poses, turns = data.poses, data.turns
@@ -362,9 +359,12 @@ def _solved(
         options.accelerometer or BASE,
         options.gyroscope or default,
         temperature_ref_c=reference_c,
-        point=point or {},
+        point=options.point,
         catalogue=options.catalogue,
     )
+    for sensor, name in options.added:
+        if (sensor, name) not in sensors.slices:
+            sensors = sensors.with_effect(sensor, name)
     model = HandModel(sensors, options.gravity, untested=untested, absent=data.absent)
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
@@ -379,7 +379,7 @@ def _solved(
     solved = partial(solve_joint, gravity_sd=options.gravity_sd)
     for effect in model.extras:
         # A time constant distant from the prior does not converge from there.
-        if effect.time_constant and effect.name not in (point or {}):
+        if effect.time_constant and effect.name not in options.point:
             trials = [
                 replace(model, model=each)
                 for each in at_time_constants(model.model, effect, float(poses.time[-1]))

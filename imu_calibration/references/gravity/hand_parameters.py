@@ -333,6 +333,10 @@ class HandOptions:
     """Effects to estimate; None: bias and matrix."""
     gyroscope: tuple[str, ...] | None = None
     """The same; None: bias and matrix, and the g-sensitivity when the poses show it."""
+    added: tuple[tuple[str, str], ...] = ()
+    """(sensor, effect) that the recording demands in addition."""
+    point: dict[str, np.ndarray] = field(default_factory=dict)
+    """Effect -> values at which its columns are first computed."""
     catalogue: Catalogue = CATALOGUE
     """Declarations of the effects."""
 
@@ -377,5 +381,7 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
         tolerances=options.tolerances,
         accelerometer=accelerometer,
         gyroscope=gyroscope,
+        added=options.added,
+        point=options.point,
         catalogue=options.catalogue,
     )

@@ -5,14 +5,15 @@ The search of a diagnosis, on poses and turns instead of windows on a table.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Effect, Role
-from imu_calibration.effects.sensor_model import BASE
+from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import (
@@ -27,6 +28,7 @@ from imu_calibration.references.gravity.hand_parameters import (
 )
 from imu_calibration.references.gravity.pose_residual import unexplained_by_hand
 from imu_calibration.references.gravity.pose_rows import build_rows, gravity_turns
+from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.questions import (
     TEMPERATURE_SPAN,
     Question,
@@ -35,7 +37,7 @@ from imu_calibration.selection.questions import (
 )
 from imu_calibration.selection.row_evidence import RowBlock, RowEvidence, RowSpace
 from imu_calibration.selection.row_search import ChoiceWithout, RowProblem, choose_effects
-from imu_calibration.selection.search import SelectedEffects
+from imu_calibration.selection.search import SelectedEffects, SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained
 
 MIN_SPARE_POSES = 3
@@ -44,33 +46,48 @@ MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 """With fewer poses none can be held out."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class HandInvestigation(SelectedEffects):
     """Result of a search, before its report."""
 
+    # The amplitudes of an effect are few, and a requested effect stays in the model.
+    settings: ClassVar[SelectionSettings] = SelectionSettings(
+        joint_test=False, judge_requested=False
+    )
     baseline: HandCalibration
     """The calibration under diagnosis."""
     problem: RowProblem
-    """Rows, evidence and search."""
-    named: Sequence[Question]
-    """Questions that became findings, in the order found."""
+    explained: Explained
     held_out: Sequence[ChoiceWithout]
     """The complete search, repeated without each part of the poses."""
-    not_testable: list[dict]
-    """Effects that could not be tested."""
     constants: np.ndarray
     """Time constants of the warm-ups under test, s."""
     turns: Sequence[TurnData]
     """Turns of the rows."""
-    unstable: Sequence[Question] = field(default_factory=list)
-    """Effects that were rejected because the estimates of the two halves differ significantly."""
 
     @property
-    def names(self) -> dict[str, tuple[str, ...]]:
-        """Sensor -> effects for the model."""
+    def param_names(self) -> Sequence[str]:
+        """Names of the parameters of the baseline."""
+        return self.baseline.param_names
+
+    @property
+    def baseline_model(self) -> SensorModel:
+        """The model that the search extends."""
+        return self.baseline.model
+
+    @property
+    def point_of_adopted(self) -> dict[str, np.ndarray]:
+        """Effect -> values at which its columns are linearised, of the adopted warm-ups."""
+        point = self.point(self.problem, self.named)
         return {
-            sensor: tuple(q.name for q in self.adopted if q.sensor == sensor) for sensor in SENSORS
+            question.name: point[question.name]
+            for question in self.adopted
+            if question.name in point
         }
+
+    def unexplained_rests(self) -> dict[str, Unexplained]:
+        """Return `unexplained`; it is small."""
+        return self.unexplained
 
     @cached_property
     def unexplained(self) -> dict[str, Unexplained]:
@@ -126,7 +143,9 @@ class HandInvestigation(SelectedEffects):
         return model, values, fit[hand.hand_model.size]
 
 
-def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) -> HandInvestigation:
+def investigate_by_hand(
+    data: HandData, options: HandOptions = HandOptions(), solved: HandCalibration | None = None
+) -> HandInvestigation:
     """
     Test every effect that is observable by hand on held-out poses.
 
@@ -141,6 +160,8 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
         From `gather_by_hand`.
     options : HandOptions
         Reference, tolerances, and the effects of the baseline: by default bias and matrix.
+    solved : HandCalibration, optional
+        The solution of these data with `options`, which is the baseline if its effects are those.
 
     Raises
     ------
@@ -151,14 +172,16 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     poses = data.poses
     if len(poses.start) < MIN_FOLD_POSES:
         raise too_few_poses(len(poses.start))
-    baseline = solve_by_hand(
-        data,
-        replace(
-            options,
-            accelerometer=options.accelerometer or BASE,
-            gyroscope=options.gyroscope or BASE,
-        ),
-    )
+    accelerometer, gyroscope = options.accelerometer or BASE, options.gyroscope or BASE
+    if solved is not None and (solved.model.accelerometer, solved.model.gyroscope) == (
+        accelerometer,
+        gyroscope,
+    ):
+        baseline = solved
+    else:
+        baseline = solve_by_hand(
+            data, replace(options, accelerometer=accelerometer, gyroscope=gyroscope)
+        )
     follows_gravity = shown(g_sensitivity_evidence(poses))
     effects, not_testable = sort_effects(
         baseline.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity)
@@ -171,14 +194,15 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     problem = RowProblem(blocks, space, questions, baseline=base)
     chosen = choose_effects(problem)
     return HandInvestigation(
-        baseline,
-        problem,
-        chosen.named,
-        chosen.held_out,
-        not_testable,
-        constants,
-        gravity_turns(data.turns),
-        chosen.unstable,
+        baseline=baseline,
+        problem=problem,
+        explained=problem.explained,
+        named=chosen.named,
+        held_out=chosen.held_out,
+        not_testable=not_testable,
+        constants=constants,
+        turns=gravity_turns(data.turns),
+        unstable=chosen.unstable,
     )
 
 
