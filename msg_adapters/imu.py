@@ -11,7 +11,6 @@ from msg_adapters.layout import (
     aligned,
     frame_head,
     open_header,
-    overlapping,
 )
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
@@ -108,11 +107,8 @@ def patch_imu_group(
         uint8, shape (n, n_bytes): one message per row.
 
     """
-    table = (
-        overlapping(packed.buffer, f'V{layout.size}')[packed.start]
-        .view(np.uint8)
-        .reshape(-1, layout.size)
-    )
+    rows = np.array(packed.items_at(0, f'V{layout.size}'))
+    table = rows.view(np.uint8).reshape(-1, layout.size)
     for name, values in fields.items():
         offset, count = layout.offsets[name]
         table[:, offset : offset + 8 * count] = np.ascontiguousarray(

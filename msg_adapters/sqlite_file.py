@@ -35,6 +35,13 @@ SMALL_BYTES = 16384
 STRETCH_ROWS = 8192
 STRETCH_BYTES = 16 << 20
 """Rows, or bytes of messages, that complete a stretch."""
+RANGE_IDS = 4096
+"""
+Ids whose messages SQLite appends to each other. Half as many rows of one topic complete a stretch:
+they are not copied again, and they fit into the cache of the processor.
+"""
+FEWEST_ROWS = 64
+"""Messages in such a range; where it has fewer, rows are read one by one."""
 CAN_LIMIT = sys.version_info >= (3, 11)
 """Whether the bytes of one result can be limited; without it all rows are read one by one."""
 FIRST_ID, LAST_ID = -(2**63), 2**63 - 1
@@ -190,6 +197,7 @@ class SqliteFile(StorageFile):
     def _stretches(self, topics):
         wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
         self._n_calls = self._n_steps = 0
+        enough_rows = RANGE_IDS // 2 if len(wanted) == 1 else STRETCH_ROWS
         n_total = n_rows = n_bytes = 0
         parts: list[Part] = []
         for part in self._parts(wanted):
@@ -200,7 +208,7 @@ class SqliteFile(StorageFile):
             parts.append(part)
             n_rows += len(part.sizes)
             n_bytes += len(part.messages)
-            if n_rows >= STRETCH_ROWS or n_bytes >= STRETCH_BYTES:
+            if n_rows >= enough_rows or n_bytes >= STRETCH_BYTES:
                 yield _stretch(parts)
                 parts, n_rows, n_bytes = [], 0, 0
         if parts:
@@ -235,31 +243,35 @@ class SqliteFile(StorageFile):
 
     def _equal_messages(self, topic_id):
         """
-        Yield the Parts of one topic while its messages have one size.
+        Yield the Parts of one topic while its messages have one size and its ids are dense.
 
-        SQLite appends the messages to each other, which needs half the time of one object per row.
-        It treats the bytes as text, which changes nothing in a database with UTF-8; the size of the
-        result shows that nothing is missing. Return the last id, None at the end of the file.
+        SQLite appends the messages of a range of ids to each other, which needs half the time of
+        one object per row. It treats the bytes as text, which changes nothing in a database with
+        UTF-8. The sizes are equal where their sum is the number of messages times the largest one.
+        Return the id behind which other rows may follow.
         """
-        after = FIRST_ID
-        chosen = f'WHERE topic_id = {topic_id} AND _rowid_ > ? LIMIT {STRETCH_ROWS}'
-        rows = f'FROM messages NOT INDEXED {chosen}'
-        statement = (
-            "SELECT max(id), count(*), min(size), max(size), CAST(group_concat(data, '') AS BLOB)"
-            f' FROM (SELECT _rowid_ AS id, length(data) AS size, data {rows})'
+        chosen = (
+            f'FROM messages NOT INDEXED WHERE topic_id = {topic_id} AND _rowid_ > ?'
+            ' AND _rowid_ <= ?'
         )
+        statement = (
+            "SELECT count(*), max(length(data)), CAST(group_concat(data, '') AS BLOB) " + chosen
+        )
+        after = FIRST_ID
         longest = self._limit_length(STRETCH_BYTES)
         try:
-            while True:
-                found = self.connection.execute(statement, (after,)).fetchone()
-                last, count, size, largest, messages = found
-                if not count:
-                    return None
-                if size is None or size != largest or len(messages) != count * size:
+            (first,) = self.connection.execute('SELECT min(_rowid_) FROM messages').fetchone()
+            until = FIRST_ID if first is None else max(first - 1, FIRST_ID)
+            count = RANGE_IDS
+            while count >= FEWEST_ROWS:
+                after, until = until, min(until + RANGE_IDS, LAST_ID)
+                ids = (after, until)
+                count, size, messages = self.connection.execute(statement, ids).fetchone()
+                if size is None or len(messages) != count * size:
                     return after
-                times = partial(self._times, f'SELECT timestamp {rows}', after)
+                times = partial(self._times, f'SELECT timestamp {chosen}', ids)
                 yield Part(messages, np.full(count, size), np.full(count, topic_id), times)
-                after = last
+            return until
         except sqlite3.Error:
             return after
         finally:
@@ -271,8 +283,8 @@ class SqliteFile(StorageFile):
             return self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, n_bytes)
         return n_bytes
 
-    def _times(self, statement, after):
-        return [value for (value,) in self.connection.execute(statement, (after,))]
+    def _times(self, statement, ids):
+        return [value for (value,) in self.connection.execute(statement, ids)]
 
     def _behind_damage(self, after, wanted, others):
         """

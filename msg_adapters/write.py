@@ -64,7 +64,7 @@ def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarra
     With an empty sequence of velocities when these are left out.
     """
     count = struct.pack('<I', len(joints.names))
-    # Joined once: a sum that grows by each of many names takes quadratic time.
+    # Joined once: a sum that grows by each of many names needs quadratic time.
     names = [_padded(_string(name), 4) for name in joints.names]
     head = b''.join([_padded(_string(''), 4), count, *names])
     velocity = [count + bytes(4), joints.velocity] if with_velocity and joints.names else [bytes(4)]

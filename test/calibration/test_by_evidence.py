@@ -254,7 +254,7 @@ def test_a_finding_of_the_model_as_asked_must_stand_out_too(examined, monkeypatc
         *found.unstable,
         found.named[0],
     ]
-    # By hand an effect stays that was requested.
+    # By hand a requested effect remains.
     monkeypatch.setattr(type(found), 'settings', SelectionSettings(judge_requested=False))
     assert by_evidence._without_faint(found, solution, solution.model) is found
 

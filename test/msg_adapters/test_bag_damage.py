@@ -287,6 +287,29 @@ def test_rows_of_other_types_and_sizes_are_read_or_counted(bags, session, tmp_pa
     assert lost['rows with values of other types of sqlite3_0.db3'] == 1
 
 
+@pytest.mark.parametrize(
+    'change',
+    [
+        'id = id + 1000000000000 WHERE id > 6000',
+        'id = id * 1000000',
+        'id = id - 9223372036854775807',
+    ],
+)
+def test_rows_with_distant_ids_are_read(bags, session, tmp_path, change):
+    """Rows that were deleted between them, or ids that another program chose."""
+    folder = tmp_path / 'distant'
+    shutil.copytree(bags / 'sqlite3', folder)
+    connection = sqlite3.connect(storage_file(folder))
+    connection.execute(f'UPDATE messages SET {change}')
+    connection.commit()
+    connection.close()
+    with open_recording(folder, want_joints=False, want_temperature=False) as recording:
+        imu = ImuSamples.concatenate([block.imu for block in recording.blocks()])
+        assert not recording.lost
+    assert_true_samples(imu, session[0], ('stamp_ns', 'force_s', 'rate_s'))
+    assert len(imu) == N
+
+
 def test_messages_in_overflow_pages_and_of_other_types(tmp_path, session):
     """Long names make JointState larger than a page; other topics hold anything."""
     names = tuple('joint_' + 200 * c for c in 'abcdefghijklmnopqrstuvwx')

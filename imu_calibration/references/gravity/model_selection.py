@@ -50,7 +50,7 @@ MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 class HandInvestigation(SelectedEffects):
     """Result of a search, before its report."""
 
-    # The amplitudes of an effect are few, and a requested effect stays in the model.
+    # The amplitudes of an effect are few, and a requested effect remains in the model.
     settings: ClassVar[SelectionSettings] = SelectionSettings(
         joint_test=False, judge_requested=False
     )
