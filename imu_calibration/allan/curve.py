@@ -354,13 +354,15 @@ class RestReader:
     nominal: RawReadings | None = None
     """For recordings in volts or counts."""
 
-    def read(self, *bare: Sink, raw: Sequence[Sink] = ()) -> None:
+    def read(self, *bare: Sink, raw: Sequence[Sink] = ()) -> RestOutliers:
         """
         Push the samples of each part into the sinks `bare` and `raw`.
 
-        The samples in `bare` are without trends and the samples in `raw` are unchanged.
+        The samples in `bare` are without trends and the samples in `raw` are unchanged. Returns the
+        search for outliers, which were replaced.
         """
-        for (epoch, _), pieces in groupby(self._pieces(), key=itemgetter(0, 1)):
+        outliers = RestOutliers()
+        for (epoch, _), pieces in groupby(self._pieces(outliers), key=itemgetter(0, 1)):
             grid = SampleGrid(self.period)
             for *_, imu in pieces:
                 values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
@@ -375,15 +377,16 @@ class RestReader:
                     sink.push(*spread(values, steps))
             for sink in (*bare, *raw):
                 sink.end_stretch()
+        return outliers
 
-    def _pieces(self):
+    def _pieces(self, outliers):
         """Yield (epoch, number of the part, accepted samples)."""
         bounds = [
             np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2)
             for parts in self.parts
         ]
         cleaner = BlockCleaner(nominal=self.nominal, one_sensor=True)
-        for cleaned in without_outliers(cleaner.all_of(self.source()), RestOutliers()):
+        for cleaned in without_outliers(cleaner.all_of(self.source()), outliers):
             for epoch, imu in cleaned.imu:
                 for number, (first, last) in enumerate(
                     np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()
@@ -398,7 +401,7 @@ class RestReader:
         )
         bare, faults = AllanSums(factors, 6), FaultSearch()
         raw = AllanSums(factors, 6) if any(self.detrending.trends) else None
-        self.read(bare, raw=(faults,) if raw is None else (raw, faults))
+        outliers = self.read(bare, raw=(faults,) if raw is None else (raw, faults))
         usable = bare.terms > 0
         variance, terms = (values[:, usable] for values in bare.by_stretch())
         parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
@@ -409,5 +412,5 @@ class RestReader:
             (raw or bare).variance()[usable],
             tuple(bare.lengths),
             parts,
-            faults.result(),
+            faults.result(outliers.share),
         )

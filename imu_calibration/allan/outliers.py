@@ -12,6 +12,8 @@ PIECE = 1024
 """Samples that are decided together, with one estimate of their scatter."""
 MEDIAN_SAMPLES = 7
 """Samples of the running median: three outliers among them do not shift it to one of them."""
+LEVEL_SAMPLES = 129
+"""Samples around an outlier whose median is the level of the reading in its place."""
 CONTEXT_SAMPLES = 8
 """Samples on either side of a piece that its running median and its counts use."""
 FAR = 5.5
@@ -26,19 +28,36 @@ NORMAL_QUARTILE = 0.6745
 
 class RestOutliers:
     """
-    Removes the single readings that deviate from their neighbours at rest.
+    Replaces the single readings that deviate from their neighbours at rest.
 
     The filter of a moving stream (`SpikeFilter`) must tolerate fast motion, and passes outliers
     that are close to each other. At rest the running median of seven readings predicts each of
     them, and the scatter about it is known. A torn register read (high byte of one reading, low
     byte of the next) deviates by 256 steps, and dozens of them can be in a minute. Where many
     readings deviate together, the IMU moved: they are kept, and the search for rest decides.
+
+    The other five readings of the sample are kept, because holes would bias the means. In place of
+    an outlier is the reading before, reflected about the level of a second or so by chance::
+
+        x[k] = level +- (x[j] - level),  E[(x[k] - level) (x[j] - level)] = 0
+
+    so that means have the variance of independent readings: a copy would count twice, and the
+    median of few neighbours would give them more weight.
     """
 
     def __init__(self) -> None:
-        self.dropped = 0
+        self.replaced = 0
+        """Samples with a replaced reading."""
+        self._n_samples = 0
+        self._n_readings = np.zeros(6)
+        self._signs = np.random.default_rng(0)
         self._held: ImuSamples | None = None
         self._n_before = 0
+
+    @property
+    def share(self) -> np.ndarray:
+        """Share of the readings of each axis that are replaced, shape (6,)."""
+        return self._n_readings / max(self._n_samples, 1)
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return the samples with a decision; at most `PIECE` + `CONTEXT_SAMPLES` are buffered."""
@@ -63,21 +82,42 @@ class RestOutliers:
         context = self._held.select(slice(0, min(stop + CONTEXT_SAMPLES, len(self._held))))
         values = np.hstack([context.force_s, context.rate_s])
         decided = slice(self._n_before, stop)
-        outlying = outliers(values)[decided]
+        outlying = outliers(values)
         kept = self._held.select(decided)
-        self.dropped += int(np.count_nonzero(outlying))
-        if outlying.any():
-            kept = kept.select(~outlying)
+        self._n_samples += len(kept)
+        self._n_readings += np.count_nonzero(outlying[decided], axis=0)
+        n_samples = int(np.count_nonzero(outlying[decided].any(axis=1)))
+        if n_samples:
+            self.replaced += n_samples
+            values = self._without(values, outlying)[decided]
+            kept = replace(kept, force_s=values[:, :3], rate_s=values[:, 3:])
         first = max(stop - CONTEXT_SAMPLES, 0)
         self._n_before = stop - first
         self._held = self._held.select(slice(first, None))
         return kept
 
+    def _without(self, values, outlying):
+        """Return the values with another reading in place of each outlier."""
+        row, column = np.nonzero(outlying)
+        rows = np.arange(len(values))[:, None]
+        last_good = np.maximum.accumulate(np.where(outlying, 0, rows), axis=0)
+        donor = last_good[row, column]
+
+        n_around = min(LEVEL_SAMPLES, len(values))
+        first = np.clip(row - n_around // 2, 0, len(values) - n_around)
+        around = values[first[:, None] + np.arange(n_around), column[:, None]]
+        level = np.median(around, axis=1)
+
+        sign = self._signs.choice([-1.0, 1.0], len(row))
+        replaced = values.copy()
+        replaced[row, column] = level + sign * (values[donor, column] - level)
+        return replaced
+
 
 def without_outliers(
     blocks: Iterable[CleanedBlock], search: RestOutliers
 ) -> Iterator[CleanedBlock]:
-    """Yield cleaned blocks without the outliers of the IMU; each epoch of the clock is a stream."""
+    """Yield cleaned blocks with replaced outliers; each epoch of the clock is a stream."""
     filters = EpochFilters(search)
     for cleaned in blocks:
         imu = []
@@ -93,7 +133,7 @@ def _not_empty(parts):
 
 def outliers(values: np.ndarray) -> np.ndarray:
     """
-    Return which rows hold a single outlier, shape (n,).
+    Return which readings are single outliers, shape (n, n_columns).
 
     ``|x - median7| > FAR sd``; sd from the median and the 90 % quantile of the same deviations.
 
@@ -105,7 +145,7 @@ def outliers(values: np.ndarray) -> np.ndarray:
     from scipy.ndimage import median_filter, uniform_filter1d  # here, because its import is slow
 
     if len(values) < 4 * CONTEXT_SAMPLES:
-        return np.zeros(len(values), bool)
+        return np.zeros(values.shape, bool)
     deviation = np.abs(values - median_filter(values, (MEDIAN_SAMPLES, 1), mode='nearest'))
     # The quantile is for readings that repeat, of which many deviate by zero.
     middle = np.median(deviation, axis=0) / NORMAL_QUARTILE
@@ -121,5 +161,4 @@ def outliers(values: np.ndarray) -> np.ndarray:
         scatter[column] = max(scatter[column], typical_change)
     far = deviation > FAR * scatter
     around = uniform_filter1d(far.astype(float), 2 * CONTEXT_SAMPLES + 1, axis=0, mode='constant')
-    single = far & (around * (2 * CONTEXT_SAMPLES + 1) < MOST_AROUND + 0.5)
-    return single.any(axis=1)
+    return far & (around * (2 * CONTEXT_SAMPLES + 1) < MOST_AROUND + 0.5)

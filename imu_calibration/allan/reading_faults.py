@@ -4,19 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.allan.outliers import NORMAL_QUARTILE
+from imu_calibration.allan.independent_errors import excess_of_errors
 from imu_calibration.allan.torn_reads import HIGH_BYTE, Excess, excess_of_torn_reads
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 LEAST_STEPS_IN_SCATTER = 4.0
 """Steps of the converter within the scatter, at least: below, its quantiles are those of steps."""
-WIDENING_SDS = 1.0
-"""sds of an excess from which on it widens the interval of the white noise."""
 NAMED_EXCESS, NAMED_SDS = 0.015, 3.0
 """Excess from which on it is named, as a share and in its sds."""
-CORE_STEPS = 40
-"""Iterations of the scale of a core; each reduces its error by a third or more."""
 SMALLEST_TORN, LARGEST_TORN = 2.5, 10.0
 """
 Standard deviations of an error by a torn read that tails can have: smaller errors lie in the
@@ -24,6 +20,8 @@ core, and larger ones are outliers, which are excluded before.
 """
 MEAN_DEVIATION = 0.8
 """Mean of the absolute value of a standard normal variable."""
+ROUNDING = 1e-12
+"""Share of a reading that is rounding, where an outlier was replaced."""
 READINGS_PER_MEAN = 32
 """
 Neighbouring readings whose mean is subtracted: motion and drift are slower, and an outlier moves
@@ -33,50 +31,13 @@ NAMED_REPEATED_SHARE = 0.05
 """Share of repeated readings above which they are named."""
 TOGETHER = 0.9
 """Where an axis repeats its reading, the other axes do in at least this share: no chance."""
-LEAST_CORE_READINGS = 1024
-"""Readings of the core, at least."""
+NONE_REPLACED = np.zeros(6)
+MOST_LEFT_OUT = 0.5
+"""Largest share of missing readings that is taken into account."""
+LEAST_EXAMINED = 1024
+"""Readings whose distribution is examined, at least."""
 MOST_KEPT_READINGS = 200_000
 """Readings that are kept."""
-
-
-@dataclass(frozen=True)
-class Core:
-    """Readings about the centre, whose scale does not depend on the tails."""
-
-    limit: float
-    """Standard deviations within which a reading belongs to the core."""
-    mean_square: float
-    """Mean square of a standard normal variable within the limit."""
-    ratio_sd: float
-    """
-    sd of the ratio of both standard deviations for Gaussian noise, times the root of the number of
-    readings.
-    """
-
-    def sd(self, deviation: np.ndarray) -> float:
-        """
-        Return the standard deviation of Gaussian noise from its core, whatever its tails are.
-
-        ``sd^2 = mean(x^2 where |x| < limit sd) / mean_square``, iterated from the quartiles.
-
-        Parameters
-        ----------
-        deviation : ndarray, shape (n,)
-            Readings about their mean.
-
-        """
-        size = np.abs(deviation)
-        sd = float(np.median(size)) / NORMAL_QUARTILE
-        for _ in range(CORE_STEPS):
-            core = size[size < self.limit * sd]
-            if not len(core):
-                break
-            sd = float(np.sqrt(np.mean(core**2) / self.mean_square))
-        return sd
-
-
-CORES = (Core(1.5, 0.5515, 1.65), Core(2.0, 0.7737, 0.95))
-"""The narrow one is free of torn reads with large noise, the wide one detects few of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +55,21 @@ class ReadingFaults:
     Root of the mean square over the mean of the numbers of repetitions, shape (2,): readings that
     count unequally raise the noise of means by it.
     """
+    missing: np.ndarray
+    """
+    Share of the readings that are missing or replaced, shape (6,): the noise of means is that of
+    the others.
+    """
 
     def factor(self, column: int) -> float:
         """Return by how much the white noise of a column may be too high, at least 1."""
-        return float(self.tails[column] * self.repetition[column // 3])
+        of_number = 1.0 / np.sqrt(1.0 - self.missing[column])
+        return float(self.tails[column] * self.repetition[column // 3] * of_number)
 
 
-NO_FAULTS = ReadingFaults(np.ones(6), np.zeros(6, bool), np.zeros(2), np.ones(2))
+NO_FAULTS = ReadingFaults(
+    np.ones(6), np.zeros(6, bool), np.zeros(2), np.ones(2), missing=np.zeros(6)
+)
 
 
 class FaultSearch:
@@ -114,6 +83,7 @@ class FaultSearch:
         self._next_block = dict.fromkeys(SENSORS, np.zeros((0, 3)))
         self._smallest_step = np.full(6, np.inf)
         self._n_pairs = 0
+        self._n_periods, self._n_missing = 0, 0
         # Pairs of neighbours with one reading: of each axis, and of all axes of a sensor.
         self._n_same_axis = np.zeros(6)
         self._n_same_sensor = np.zeros(2)
@@ -126,6 +96,8 @@ class FaultSearch:
 
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
         """Add the next samples of a rest, shape (n, 6)."""
+        self._n_periods += len(present)
+        self._n_missing += int(np.count_nonzero(~present))
         rows = values[present]
         if self._last is not None:
             rows = np.vstack([self._last, rows])
@@ -135,7 +107,7 @@ class FaultSearch:
         if len(rows) < 2:
             return
         difference = np.diff(rows, axis=0)
-        same = difference == 0
+        same = np.abs(difference) <= ROUNDING * np.abs(rows).max(axis=0)
         self._n_pairs += len(same)
         self._n_same_axis += same.sum(axis=0)
         steps = np.where(same, np.inf, np.abs(difference))
@@ -175,8 +147,16 @@ class FaultSearch:
         self._next_block = dict.fromkeys(SENSORS, np.zeros((0, 3)))
         self._run_length = np.ones(2)
 
-    def result(self) -> ReadingFaults:
-        """Return the faults of all rests."""
+    def result(self, replaced: np.ndarray = NONE_REPLACED) -> ReadingFaults:
+        """
+        Return the faults of all rests.
+
+        Parameters
+        ----------
+        replaced : ndarray, shape (6,)
+            Share of the readings of each axis that replace an outlier.
+
+        """
         if not self._n_pairs:
             return NO_FAULTS
         share = self._n_same_sensor / self._n_pairs
@@ -191,8 +171,7 @@ class FaultSearch:
         named = np.zeros(6, bool)
         for column, excesses in enumerate(self._excesses()):
             for excess in excesses:
-                if excess.sds > WIDENING_SDS:
-                    ratios[column] = max(ratios[column], excess.ratio)
+                ratios[column] = max(ratios[column], excess.ratio)
                 if excess.sds > NAMED_SDS and excess.ratio > 1.0 + NAMED_EXCESS:
                     named[column] = True
         return ReadingFaults(
@@ -200,13 +179,14 @@ class FaultSearch:
             named,
             np.where(repeats, share, 0.0),
             np.where(repeats, np.maximum(repetition, 1.0), 1.0),
+            np.minimum(replaced + self._n_missing / self._n_periods, MOST_LEFT_OUT),
         )
 
     def _excesses(self):
         """Return the list of `Excess` of each axis, by tails and by torn reads."""
         of_axes: list[list[Excess]] = []
         for sensor, columns in SENSOR_COLUMNS.items():
-            if self._n_kept[sensor] < LEAST_CORE_READINGS:
+            if self._n_kept[sensor] < LEAST_EXAMINED:
                 of_axes += [[], [], []]
                 continue
             of_sensor = np.concatenate(self._readings[sensor]).T
@@ -214,29 +194,27 @@ class FaultSearch:
                 if not np.isfinite(step):  # constant readings
                     of_axes.append([])
                     continue
-                tails = _excesses_of_tails(readings, step)
-                of_axes.append([*tails, excess_of_torn_reads(readings, step)])
+                excesses = [excess_of_torn_reads(readings, step)]
+                tails = _excess_of_tails(readings, step)
+                if tails is not None:
+                    excesses.append(tails)
+                of_axes.append(excesses)
         return of_axes
 
 
-def _excesses_of_tails(readings, smallest_step):
-    """Return the `Excess` that the tails of an axis give, one for each core with known scale."""
+def _excess_of_tails(readings, smallest_step):
+    """Return the bound of the `Excess` by errors of an axis, None within few steps."""
     blocks = readings.reshape(-1, READINGS_PER_MEAN)
     deviation = (blocks - blocks.mean(axis=1, keepdims=True)).ravel()
-    sd = float(np.sqrt(np.mean(deviation**2)))
-    excesses = []
-    for core in CORES:
-        core_sd = core.sd(deviation)
-        # The quantiles of few steps are those of the steps.
-        if core_sd < LEAST_STEPS_IN_SCATTER * smallest_step:
-            continue
-        excess = sd / core_sd - 1.0
-        if excess <= 0.0:
-            continue
-        n_sds = excess / core.ratio_sd * len(deviation) ** 0.5
-        ratio = excess_of_means(1.0 + excess, core_sd / smallest_step)
-        excesses.append(Excess(ratio, n_sds))
-    return excesses
+    excess = excess_of_errors(deviation, READINGS_PER_MEAN)
+    noise_steps = float(np.sqrt(np.mean(deviation**2))) / excess.ratio / smallest_step
+    # The distribution within few steps is that of the steps.
+    if noise_steps < LEAST_STEPS_IN_SCATTER:
+        return None
+    # Only errors that are there can be torn reads.
+    if excess.sds > NAMED_SDS:
+        return Excess(excess_of_means(excess.ratio, noise_steps), excess.sds)
+    return excess
 
 
 def excess_of_means(ratio: float, noise_steps: float) -> float:

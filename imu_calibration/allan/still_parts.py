@@ -265,8 +265,8 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
             if reason != 'clock reset'
         }
     )
-    if outliers.dropped:
-        dropped['outlier'] = outliers.dropped
+    if outliers.replaced:
+        dropped['outlier'] = outliers.replaced
     epochs = [item.chunks() for _, item in sorted(series.items())]
     return Survey(
         epochs,

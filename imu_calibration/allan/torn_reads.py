@@ -10,6 +10,8 @@ LARGEST_PARTIAL_STEP = 0.05
 """Largest median distance of readings from whole steps: beyond, the pages are not known."""
 LEAST_SENSITIVITY = 0.1
 """Share of pairs that a torn read moves to one page, less that of a filter, at least."""
+LEAST_SDS = 1.0
+"""sds of the share of torn reads from which on it raises the noise."""
 MOST_ORDER = 4
 """Terms of the series of the probability of equal pages, in the correlation of neighbours."""
 HALVINGS = 40
@@ -109,6 +111,8 @@ def excess_of_torn_reads(readings: np.ndarray, step: float) -> Excess:
     same_variance = max(chance + chance**2 - 2.0 * cubes - pages.coefficients[0] ** 2, 0.0)
     share_sd = np.sqrt(same_variance / len(counts)) / pages.sensitivity
     share = _torn_share(pages)
+    if share <= LEAST_SDS * share_sd:
+        return NO_EXCESS
 
     # Variance of the noise: that of a torn read is the sum of both bytes' variances.
     page_variance = float(np.var(HIGH_BYTE * page))
