@@ -227,14 +227,29 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
         Whether stamps are times of arrival, of which the earliest fit.
 
     """
-    step = np.diff(stamp)
     if len(stamp) < MIN_PART:
         return [slice(0, len(stamp))]
+    parts = _parts_between_gaps(stamp, period)
+    own_period = _period_within(parts, stamp, period)
+    number = np.arange(len(stamp), dtype=float)
+    found = []
+    for part in parts:
+        late = stamp[part] - own_period * number[part]
+        clock = own_period * number[part] + (late.min() if arrivals else late.mean())
+        computed_error = np.linalg.norm(times[part] - clock)
+        recorded_error = np.linalg.norm(stamp[part] - clock)
+        if len(clock) < MIN_PART or computed_error > recorded_error:
+            found.append(part)
+    return found
+
+
+def _parts_between_gaps(stamp: np.ndarray, period: float) -> list[slice]:
+    """Return the parts of stamps, ns, between long steps at which samples were lost."""
+    step = np.diff(stamp)
     # The usual step is that within a packet if it would mean more than MOST_LOST lost samples for
     # each received one.
-    least_period = period / (1 + MOST_LOST)
     usual = float(np.median(step))
-    if not least_period < usual < period:
+    if not _least_period(period) < usual < period:
         usual = period
     long = step > MAX_REGULAR_STEP * usual
 
@@ -245,25 +260,26 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
         if lost_scatter > LOST_SCATTER * late_scatter:
             long[:] = False
     edges = [0, *(np.flatnonzero(long) + 1), len(stamp)]
-    parts = [slice(int(start), int(stop)) for start, stop in zip(edges, edges[1:])]
+    return [slice(int(start), int(stop)) for start, stop in zip(edges, edges[1:])]
 
-    # The parts have one period, estimated within them. Samples of a packet have none.
+
+def _period_within(parts: list[slice], stamp: np.ndarray, period: float) -> float:
+    """
+    Return the one period of the stamps within all parts, ns.
+
+    With numbers k and stamps s about their means in each part: ``sum(k s) / sum(k^2)``. Samples of
+    a packet have none, and `period` is returned.
+    """
     number = np.arange(len(stamp), dtype=float)
     numbers_apart = np.concatenate([number[part] - number[part].mean() for part in parts])
     stamps_apart = np.concatenate([stamp[part] - stamp[part].mean() for part in parts])
     own_period = float(numbers_apart @ stamps_apart / max(numbers_apart @ numbers_apart, 1.0))
-    if own_period < least_period:
-        own_period = period
+    return own_period if own_period >= _least_period(period) else period
 
-    found = []
-    for part in parts:
-        late = stamp[part] - own_period * number[part]
-        clock = own_period * number[part] + (late.min() if arrivals else late.mean())
-        computed_error = np.linalg.norm(times[part] - clock)
-        recorded_error = np.linalg.norm(stamp[part] - clock)
-        if len(clock) < MIN_PART or computed_error > recorded_error:
-            found.append(part)
-    return found
+
+def _least_period(period: float) -> float:
+    """Return the shortest step that is not within a packet."""
+    return period / (1 + MOST_LOST)
 
 
 def _scatter(number_step: np.ndarray, stamp: np.ndarray) -> float:
