@@ -4,7 +4,7 @@ The search from windows to named effects.
 Remove clipped samples, linearise, choose, prove, relinearise.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import AbstractSet
@@ -78,14 +78,9 @@ class Investigation(SelectedEffects):
         return self.problem.baseline
 
     @property
-    def point_of_adopted(self) -> dict[str, np.ndarray]:
-        """Effect -> values at which its columns are linearised, of the adopted effects."""
-        point = self.problem.recording.model.point
-        return {
-            question.name: point[question.name]
-            for question in self.adopted
-            if question.name in point
-        }
+    def point_of_named(self) -> Mapping[str, np.ndarray]:
+        """Effect -> values at which its columns are linearised."""
+        return self.problem.recording.model.point
 
 
 def investigate(

@@ -433,9 +433,16 @@ class SelectedEffects:
         raise NotImplementedError
 
     @property
+    def point_of_named(self) -> Mapping[str, np.ndarray]:
+        """Effect -> values at which its columns are linearised, in the model with all findings."""
+        raise NotImplementedError
+
+    @property
     def point_of_adopted(self) -> dict[str, np.ndarray]:
         """Effect -> values at which its columns are linearised, of the adopted effects."""
-        raise NotImplementedError
+        point = self.point_of_named
+        adopted = [question.name for question in self.adopted]
+        return {name: point[name] for name in adopted if name in point}
 
     def unexplained_rests(self) -> Mapping[str, Any]:
         """Return sensor -> its residual that no finding explains, and free what it needed."""

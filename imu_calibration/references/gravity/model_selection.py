@@ -4,7 +4,7 @@ Test of every effect on a recording by hand.
 The search of a diagnosis, on poses and turns instead of windows on a table.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -76,14 +76,9 @@ class HandInvestigation(SelectedEffects):
         return self.baseline.model
 
     @property
-    def point_of_adopted(self) -> dict[str, np.ndarray]:
-        """Effect -> values at which its columns are linearised, of the adopted warm-ups."""
-        point = self.point(self.problem, self.named)
-        return {
-            question.name: point[question.name]
-            for question in self.adopted
-            if question.name in point
-        }
+    def point_of_named(self) -> Mapping[str, np.ndarray]:
+        """Warm-up -> values at which its columns are linearised."""
+        return self.point(self.problem, self.named)
 
     def unexplained_rests(self) -> dict[str, Unexplained]:
         """Return `unexplained`; it is small."""
@@ -172,13 +167,14 @@ def investigate_by_hand(
     poses = data.poses
     if len(poses.start) < MIN_FOLD_POSES:
         raise too_few_poses(len(poses.start))
-    accelerometer, gyroscope = options.accelerometer or BASE, options.gyroscope or BASE
-    if solved is not None and (solved.model.accelerometer, solved.model.gyroscope) == (
-        accelerometer,
-        gyroscope,
+    accelerometer = options.accelerometer or BASE
+    gyroscope = options.gyroscope or BASE
+    baseline = solved
+    if (
+        baseline is None
+        or baseline.model.accelerometer != accelerometer
+        or baseline.model.gyroscope != gyroscope
     ):
-        baseline = solved
-    else:
         baseline = solve_by_hand(
             data, replace(options, accelerometer=accelerometer, gyroscope=gyroscope)
         )
