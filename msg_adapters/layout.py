@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -73,12 +74,16 @@ class Packed:
 
         A strided view where the messages have one distance: a gather needs four times as long.
         """
+        if self._distance is None:
+            return overlapping(self.buffer, dtype)[self.start + offset]
+        first = int(self.start[0]) + offset
+        return np.ndarray((len(self),), dtype, self.buffer, first, (self._distance,))
+
+    @cached_property
+    def _distance(self) -> int | None:
+        """Bytes between the starts of neighbours, None where they differ."""
         steps = np.diff(self.start)
-        if len(steps) and (steps == steps[0]).all():
-            return np.ndarray(
-                (len(self),), dtype, self.buffer, int(self.start[0]) + offset, (int(steps[0]),)
-            )
-        return overlapping(self.buffer, dtype)[self.start + offset]
+        return int(steps[0]) if len(steps) and (steps == steps[0]).all() else None
 
     def select(self, index: np.ndarray) -> 'Packed':
         """Return some of the messages."""
