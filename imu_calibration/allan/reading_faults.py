@@ -32,6 +32,7 @@ NAMED_REPEATED_SHARE = 0.05
 TOGETHER = 0.9
 """Where an axis repeats its reading, the other axes do in at least this share: no chance."""
 NONE_REPLACED = np.zeros(6)
+"""Share of replaced readings of each axis where no outlier was found."""
 MOST_LEFT_OUT = 0.5
 """Largest share of missing readings that is taken into account."""
 LEAST_EXAMINED = 1024
@@ -67,9 +68,7 @@ class ReadingFaults:
         return float(self.tails[column] * self.repetition[column // 3] * of_number)
 
 
-NO_FAULTS = ReadingFaults(
-    np.ones(6), np.zeros(6, bool), np.zeros(2), np.ones(2), missing=np.zeros(6)
-)
+NO_FAULTS = ReadingFaults(np.ones(6), np.zeros(6, bool), np.zeros(2), np.ones(2), NONE_REPLACED)
 
 
 class FaultSearch:
@@ -83,7 +82,8 @@ class FaultSearch:
         self._next_block = dict.fromkeys(SENSORS, np.zeros((0, 3)))
         self._smallest_step = np.full(6, np.inf)
         self._n_pairs = 0
-        self._n_periods, self._n_missing = 0, 0
+        self._n_periods = 0
+        self._n_missing = 0
         # Pairs of neighbours with one reading: of each axis, and of all axes of a sensor.
         self._n_same_axis = np.zeros(6)
         self._n_same_sensor = np.zeros(2)

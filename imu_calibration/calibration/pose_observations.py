@@ -14,9 +14,7 @@ from imu_calibration.calibration.hand_proof import (
     values_without,
 )
 from imu_calibration.calibration.hand_recording import HandRecording
-from imu_calibration.calibration.plain_fit import (
-    PlainFit,
-)
+from imu_calibration.calibration.plain_fit import PlainFit
 from imu_calibration.calibration.plain_fit_by_hand import better_plain_fits_by_hand
 from imu_calibration.calibration.result import (
     GRAVITY_SD,
