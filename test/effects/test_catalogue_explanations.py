@@ -33,8 +33,9 @@ from imu_calibration.effects.forward_equations import (
     sensor_output,
 )
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.rotations import Reference
 from tools.tolerance_file import rendered
+
+from worlds.random_motion import random_reference
 
 ROOT = Path(__file__).resolve().parents[2]
 ALSO_WORDS = {'bias', 'matrix'}
@@ -168,18 +169,6 @@ FORMULA = {
 SENSOR = {name: definition['sensor'] for name, definition in ADDED.items()}
 
 
-def motion(n=40):
-    rng = np.random.default_rng(3)
-    vectors = [rng.normal(0.0, size, (n, 3)) for size in (8.0, 2.0, 5.0)]
-    return Reference(
-        np.linspace(0.0, 400.0, n),
-        np.broadcast_to(np.eye(3), (n, 3, 3)),
-        *vectors,
-        9.8,
-        np.full(n, 30.0),
-    )
-
-
 def with_values(name, share=1.0):
     """Return (model of bias, matrix and an added effect, values)."""
     model = SensorModel(catalogue=MINE).with_effect(SENSOR[name], name)
@@ -191,7 +180,7 @@ def with_values(name, share=1.0):
 
 @pytest.mark.parametrize('name', ADDED)
 def test_an_added_effect_does_what_its_text_says(name):
-    (model, values), ref, sensor = with_values(name), motion(), SENSOR[name]
+    (model, values), ref, sensor = with_values(name), random_reference(40, seed=3), SENSOR[name]
     plain = SensorModel()
     change = sensor_output(model, sensor, values, ref=ref) - sensor_output(
         plain, sensor, plain.start(), ref=ref
@@ -206,7 +195,7 @@ def test_an_added_effect_does_what_its_text_says(name):
 
 @pytest.mark.parametrize('name', ADDED)
 def test_its_derivative_is_that_of_differences(name):
-    (model, values), ref, sensor = with_values(name), motion(), SENSOR[name]
+    (model, values), ref, sensor = with_values(name), random_reference(40, seed=3), SENSOR[name]
     at = model.at(values)
     design = np.concatenate(
         [group.columns(ref, at.full_point()) for group in at.layout(sensor).groups.values()], axis=1
@@ -268,7 +257,7 @@ def test_compensation_takes_it_out_offline_and_live():
     from validation.imu_messages import parse_imu
 
     truth = replace(session(*INVERTED).truth, frame_id='')
-    ref = motion(400)
+    ref = random_reference(400, seed=3)
     model, values = truth.model, truth.values
     measured = [
         sensor_output(model, sensor, values, ref=replace(ref, alpha_s=np.zeros((400, 3))))

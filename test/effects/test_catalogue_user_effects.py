@@ -24,7 +24,6 @@ from imu_calibration.document import files
 from imu_calibration.effects.catalogue import CATALOGUE, term
 from imu_calibration.effects.expressions import PLACES, ColumnGroup, read
 from imu_calibration.effects.sensor_model import BASE, SensorModel
-from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import (
@@ -36,6 +35,7 @@ from imu_calibration.simulation.session import (
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.candidates import FEW
+from worlds.random_motion import random_reference
 from worlds.stands import stand
 
 MINE = """
@@ -54,18 +54,6 @@ effects:
 def mine(tmp_path):
     (tmp_path / 'mine.yaml').write_text(MINE)
     return tmp_path / 'mine.yaml'
-
-
-def reference(n=50):
-    rng = np.random.default_rng(1)
-    vectors = [rng.normal(0.0, size, (n, 3)) for size in (8.0, 2.0, 5.0)]
-    return Reference(
-        np.linspace(0.0, 400.0, n),
-        np.broadcast_to(np.eye(3), (n, 3, 3)),
-        *vectors,
-        9.8,
-        np.full(n, 30.0),
-    )
 
 
 @pytest.mark.long
@@ -254,7 +242,7 @@ def test_a_column_without_a_value_is_refused_in_one_line(column):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         with refused(InputError, 'column_not_finite', 'mine'):
-            ColumnGroup('mine', (column,)).columns(reference(), {})
+            ColumnGroup('mine', (column,)).columns(random_reference(50, seed=1), {})
 
 
 def _random_column(rng):
@@ -332,7 +320,7 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
             called.append(event)
 
     sys.addaudithook(watch)
-    rng, ref, passed = random.Random(1), reference(), 0
+    rng, ref, passed = random.Random(1), random_reference(50, seed=1), 0
     point = {'mine': np.array([0.0, 0.0, 0.0, 300.0])}
     ColumnGroup('mine', ('sin(f_x)',), 'mine').columns(ref, point)
     armed = True
