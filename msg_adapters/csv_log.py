@@ -24,6 +24,7 @@ from imu_calibration.core.progress import remark
 from imu_calibration.core.readings import READING_SPELLINGS, UNIT_SIZES, unit_of
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.document.files import name_of_path
 from imu_calibration.preprocessing.counter_overflow import (
     CounterStamps,
     longer_gaps,
@@ -264,7 +265,7 @@ def read_csv(
     """
     path = Path(path)
     table = _Table(path)
-    found = [_parse(text) for text in columns]
+    found = [table.stated(_parse(text)) for text in columns]
     given = {(each.quantity, each.joint) for each in found}
     stated = {each.quantity for each in found}
     guessed = _guess(table, stated)
@@ -774,6 +775,21 @@ class _Table:
             f'a column must be in {self.path}, got {name!r}; it has'
             f' {shortened(", ".join(self.names), 300)}'
         )
+
+    def stated(self, columns):
+        """
+        Return Columns that the user states with the names of this table in place of numbers.
+
+        Of a date and a time of day in two columns the time of day remains: midnights are counted.
+        """
+        names = []
+        for name in columns.names:
+            sign = '-' if name.startswith('-') and name not in self.names else ''
+            names.append(sign + self.names[self.column(name)])
+        if columns.quantity == 'time':
+            clocks = [name for name in names if self.column(name) in self.clocks | self.dates]
+            names = clocks[-1:] or names
+        return replace(columns, names=tuple(names))
 
     def load(self, names, where=()):
         """
@@ -1402,18 +1418,17 @@ def read_directly(path: Path, raw: Sequence[str] = (), where: Sequence[str] = ()
         )
     else:
         log = read_logs([path], where=where)
-    remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
+    name = name_of_path(path)
+    remark(f'{name} is read as {"; ".join(map(str, log.columns))}')
     if log.joined is not None:
-        remark(f'{path.name}: {log.joined.text}')
+        remark(f'{name}: {log.joined.text}')
     if log.n_dropped:
-        remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
+        remark(f'{name}: {log.n_dropped} lines with too few columns are left out')
     if log.n_overflows:
         steps = np.diff(log.imu.stamp_ns)
         n_gaps = int(np.count_nonzero(steps > GAP_PERIODS * np.median(steps)))
         longer = longer_gaps(log.counter_size_ns, n_gaps)
-        remark(
-            f'{path.name}: the counter of time overflows {log.n_overflows} times: undone{longer}'
-        )
+        remark(f'{name}: the counter of time overflows {log.n_overflows} times: undone{longer}')
     return log
 
 
@@ -1447,7 +1462,7 @@ class ConvertedLog:
     def __init__(self, path: Path, raw: tuple[str, ...] = (), where: tuple[str, ...] = ()):
         log, folder = read_directly(path, raw, where), mkdtemp(prefix='imu_calibration_')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self.bag = Path(folder, path.stem)
+        self.bag = Path(folder, 'log')
         write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')
 
 

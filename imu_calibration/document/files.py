@@ -49,6 +49,11 @@ def user_path(text: str) -> Path:
         ) from error
 
 
+def name_of_path(path: str | PathLike[str]) -> str:
+    """Return the name of a file or folder, of ``.`` and ``..`` too."""
+    return os.path.basename(os.path.abspath(path))
+
+
 def read_text(path: str | PathLike[str], what: str) -> str:
     """
     Return the text of a file, or refuse in one line; not more than a document may hold is read.

@@ -132,7 +132,7 @@ def read_blocks(
         path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature
     )
     advance = counter(
-        f'reading {Path(path).name}',
+        f'reading {files.name_of_path(path)}',
         0 if quiet else recording.message_counts.get(recording.imu_topic, 0),
     )
     with recording:
@@ -324,7 +324,9 @@ def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: d
 
 def name_of(recording: str | PathLike | SampleBlock) -> str:
     """Return the name of a recording in documents."""
-    return 'samples in memory' if isinstance(recording, SampleBlock) else Path(recording).name
+    if isinstance(recording, SampleBlock):
+        return 'samples in memory'
+    return files.name_of_path(recording)
 
 
 def _hash_of(recording):

@@ -199,3 +199,15 @@ def test_other_units_of_time_are_refused(tmp_path, motion, unit):
     with pytest.raises(InputError) as caught:
         read_csv(path, [f'time=time:{unit}'])
     assert caught.value.key == 'columns'
+
+
+@pytest.mark.parametrize('header', ['', 'day,clock,aX,aY,aZ,gX,gY,gZ'])
+def test_a_date_and_a_time_of_day_by_number_are_the_time(tmp_path, motion, header):
+    time, force, rate = motion
+    in_mg = readings(-1e3 * force / G, np.degrees(rate))
+    lines = [f'31.12.2024,{c},{row}' for c, row in zip(clock(time, ''), in_mg, strict=True)]
+    path = written(tmp_path / 'card.csv', 'card ready', *([header] if header else []), *lines)
+    columns = ['time=1,2', 'force=-3,-4,-5:mg', 'rate=6,7,8:deg/s']
+    log = read_csv(path, columns)
+    assert_read(log, motion)
+    assert log.unused == ('day' if header else '1',)

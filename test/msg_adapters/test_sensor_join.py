@@ -15,6 +15,7 @@ from imu_calibration.preprocessing.sensor_join import (
     join_sensors,
 )
 from imu_calibration.use_cases.calibrate import calibrate_recordings
+from imu_calibration.use_cases.recordings import name_of
 from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv, read_logs
 
@@ -121,6 +122,17 @@ def test_every_verb_reads_a_folder_of_logs_directly(folder, tmp_path):
     # A folder without any log is no recording.
     with pytest.raises(InputError):
         open_recording(tmp_path, want_joints=False)
+
+
+def test_the_folder_may_be_the_working_directory(folder, tmp_path, monkeypatch):
+    (folder / 'inner').mkdir()
+    (tmp_path / 'link').symlink_to(folder)
+    for place, path in ((folder, '.'), (folder / 'inner', '..'), (tmp_path, 'link/')):
+        monkeypatch.chdir(place)
+        with open_recording(path, want_joints=False) as recording:
+            assert recording.message_counts[recording.imu_topic] > 1000
+    monkeypatch.chdir(folder / 'inner')
+    assert name_of('..') == folder.name
 
 
 def test_the_overflow_of_a_counter_in_two_logs_is_undone(streams, tmp_path):
