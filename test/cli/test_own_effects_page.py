@@ -50,7 +50,3 @@ def test_the_definition_on_the_page_is_that_of_the_example():
     example = yaml.safe_load((ROOT / 'config' / 'effects_example.yaml').read_text())
     ((name, shown),) = yaml.safe_load(text)['effects'].items()
     assert shown.items() <= example['effects'][name].items()
-
-
-def test_the_page_has_at_most_500_words():
-    assert len(PAGE.read_text().split()) <= 500

@@ -46,7 +46,6 @@ def test_the_commands_of_the_page_run_in_its_order(tmp_path, monkeypatch):
 def test_the_page_names_each_option_of_the_readings():
     options = ('accelerometer-unit', 'gyroscope-unit', 'increments', 'nominal', 'axes', 'where')
     text = PAGE.read_text()
-    assert len(text.split()) <= 600
     for option in (*options, 'exclude', 'gyroscope-topic', 'columns'):
         assert f'--{option}' in text
 
