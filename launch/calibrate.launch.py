@@ -80,12 +80,12 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'gravity',
                 default_value='',
-                description='gravity by hand or on an arm, m/s^2; empty: by latitude or params',
+                description='local gravity, m/s^2; empty: by latitude, table or params',
             ),
             DeclareLaunchArgument(
                 'latitude',
                 default_value='',
-                description='latitude by hand or on an arm, deg, for the gravity there',
+                description='latitude, deg, for the gravity there; as in table, if that states one',
             ),
             DeclareLaunchArgument(
                 'noise_file',

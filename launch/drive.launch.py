@@ -67,12 +67,12 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'gravity',
                 default_value='',
-                description='local gravity of an arm whose site states none, m/s^2',
+                description='local gravity, m/s^2, for the calibration; empty: that of table',
             ),
             DeclareLaunchArgument(
                 'latitude',
                 default_value='',
-                description='latitude of such an arm, deg, for the gravity there',
+                description='latitude, deg, for the gravity there; as in table, if that states one',
             ),
             DeclareLaunchArgument(
                 'noise_file',

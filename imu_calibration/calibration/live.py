@@ -158,13 +158,13 @@ class LiveSettings:
 
 @dataclass(frozen=True)
 class LiveByHandSettings:
-    """Local gravity, by hand and on an arm, and memory of a calibration by hand."""
+    """Local gravity, and memory of a calibration by hand."""
 
     gravity: float = setting(
         0.0,
         'm/s^2',
-        'local gravity, used without a table, and on an arm whose site states none; 0: the standard'
-        ' gravity, which may be off by 0.02',
+        'local gravity; a table_file must state none, or the same; 0: that of table_file, otherwise'
+        ' the standard gravity, which may be off by 0.02',
         (0.0, 30.0),
         'all three accelerometer scales are wrong together',
         live=True,

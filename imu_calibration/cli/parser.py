@@ -229,7 +229,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--gravity',
             type=float,
-            help='m/s^2, by hand or with --urdf; default 9.80665',
+            help='m/s^2; default that of TABLE, otherwise 9.80665',
         )
         self.common(
             '--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)'

@@ -94,9 +94,12 @@ def read_mapping(path: str | PathLike[str], what: str, checked: Callable | type 
         raise error.named(str(path)) from error
 
 
-def read_table(path: str | PathLike[str]) -> Table:
-    """Return the table that a YAML file describes."""
-    return Table.from_mapping(read_mapping(path, 'table description'))
+def read_table(
+    path: str | PathLike[str], *, gravity: float | None = None, gravity_sd: float = 0.0
+) -> Table:
+    """Return the table that a YAML file describes, with the gravity of `Table.at`."""
+    mapping = read_mapping(path, 'table description')
+    return Table.from_mapping(mapping, gravity=gravity, gravity_sd=gravity_sd)
 
 
 def read_tolerances(path: Path, catalogue: Catalogue = CATALOGUE) -> dict[str, dict[str, float]]:

@@ -96,6 +96,8 @@ def axis_error_directions(axis: np.ndarray) -> np.ndarray:
 
 
 _MOUNT_KEYS = ('rpy_deg', 'xyz')
+SAME_GRAVITY = 1e-5
+"""Difference of a gravity that is stated twice, m/s^2: digits that were rounded."""
 
 
 @dataclass(frozen=True)
@@ -165,9 +167,17 @@ class Table:
             )
 
     @classmethod
-    def from_mapping(cls, mapping: Mapping[str, Any]) -> 'Table':
+    def from_mapping(
+        cls, mapping: Mapping[str, Any], *, gravity: float | None = None, gravity_sd: float = 0.0
+    ) -> 'Table':
         """
         Return the table that a mapping, as read from the table's YAML, describes.
+
+        Parameters
+        ----------
+        mapping : mapping
+        gravity, gravity_sd : float, optional
+            As for `at`.
 
         Raises
         ------
@@ -175,10 +185,49 @@ class Table:
             When a key is unknown, a joint is missing or a value does not fit.
 
         """
-        return cls(
-            joints=tuple(joint_from_mapping(item) for item in joint_entries(mapping)),
-            **site_from_mapping(mapping),
-        )
+        joints = tuple(joint_from_mapping(item) for item in joint_entries(mapping))
+        return cls.at(gravity, gravity_sd, {'joints': joints, **site_from_mapping(mapping)})
+
+    @classmethod
+    def at(
+        cls, gravity: float | None, gravity_sd: float, description: Mapping[str, Any]
+    ) -> 'Table':
+        """
+        Return the table of a description, at a local gravity that is given apart from it.
+
+        A measured gravity replaces that of the latitude, which still gives the Earth's rate.
+
+        Parameters
+        ----------
+        gravity : float or None
+            Local gravity, m/s^2; None: that of the description.
+        gravity_sd : float
+            Its standard deviation, m/s^2: 0 if it was measured, larger if it follows from a
+            latitude.
+        description : mapping
+            Fields of the table.
+
+        Raises
+        ------
+        InputError
+            When the description states another gravity, or another place than that of the gravity.
+
+        """
+        if gravity is None:
+            return cls(**description)
+        stated = 'gravity' if gravity_sd == 0 else 'latitude'
+        if all(description.get(name) is None for name in ('gravity', stated)):
+            sd = description.get('gravity_sd') or gravity_sd or None
+            return cls(**{**description, 'gravity': gravity, 'gravity_sd': sd})
+        table = cls(**description)
+        if abs(table.gravity_value - gravity) > SAME_GRAVITY:
+            raise InputError(
+                'a gravity, or latitude and height, in addition to a table must agree with its'
+                f' gravity of {table.gravity_value:.5f} m/s^2, got {gravity:.5f} m/s^2; omit it, or'
+                ' correct the description',
+                code='gravity_twice',
+            )
+        return table
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the mapping that `from_mapping` turns into an equal table."""

@@ -192,8 +192,8 @@ def table_from_urdf(
         Entries of a table description except the joints (up, gravity, latitude, mount, ...); its
         joints may give limits, by name.
     gravity, gravity_sd : float, optional
-        Local gravity and its standard deviation, m/s^2, where the site states no gravity. Without
-        any gravity and latitude: the standard gravity, with the sd of an unknown site.
+        Local gravity and its standard deviation, m/s^2, as for `Table.at`. Without any gravity and
+        latitude: the standard gravity, with the sd of an unknown site.
 
     Raises
     ------
@@ -204,13 +204,8 @@ def table_from_urdf(
     """
     robot = _read(text)
     values = site_from_mapping(site or {})
-    if gravity is None and values.get('latitude') is None:
+    if gravity is None and values.keys().isdisjoint(('gravity', 'latitude')):
         gravity, gravity_sd = STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-    if gravity is not None and values.get('gravity') is None:
-        values |= {
-            'gravity': gravity,
-            'gravity_sd': values.get('gravity_sd') or gravity_sd or None,
-        }
     joints, rest = _chain(robot, link)
     xyz, rpy_deg = (
         several_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}')
@@ -218,9 +213,8 @@ def table_from_urdf(
     )
     mount = rest.then(np.array(xyz), rotation_from_rpy(np.radians(rpy_deg)))
     values |= {f'mount_{name}': value for name, value in mount.fields.items()}
-    return Table(
-        **JOINT_ERRORS | values | {'joints': _with_limits(joints, joint_entries(site or {}), link)}
-    )
+    joints = _with_limits(joints, joint_entries(site or {}), link)
+    return Table.at(gravity, gravity_sd, JOINT_ERRORS | values | {'joints': joints})
 
 
 def root_of(text: str | bytes) -> str:

@@ -167,7 +167,7 @@ def chain_of(
     frame_id : str
         Frame of the IMU's messages; '': that of the first one received.
     gravity, gravity_sd : float, optional
-        Local gravity and its standard deviation where the site of an arm gives none, m/s^2.
+        Local gravity and its standard deviation, m/s^2, as for `Table.at`.
 
     Raises
     ------
@@ -177,7 +177,9 @@ def chain_of(
     """
     place = None if table_file in NO_TABLE else files.user_path(table_file)
     if not robot.urdf_file:
-        return None if place is None else files.read_table(place)
+        if place is None:
+            return None
+        return files.read_table(place, gravity=gravity, gravity_sd=gravity_sd)
     site = {} if place is None else files.read_mapping(place, 'table description')
     text = (
         _topic_text(node)

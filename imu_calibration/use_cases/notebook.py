@@ -225,8 +225,13 @@ def inspect(
     block = arrays.or_given('inspect', recording)
     topics = topics_of(choices)
     chosen = [topics] if isinstance(block, SampleBlock) else imu_topics_of(block, topics)
-    stand = None if table is None else table_of(table, [block], chosen[0])
-    return _inspect(block, chosen, stand, options=calibration_options(choices))
+    options = calibration_options(choices)
+    stand = None
+    if table is not None:
+        stand = table_of(
+            table, [block], chosen[0], gravity=options.gravity, gravity_sd=options.gravity_sd
+        )
+    return _inspect(block, chosen, stand, options=options)
 
 
 @_for_notebooks

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from hashlib import sha256
 from os import PathLike
@@ -542,7 +542,7 @@ def table_of(
     topics : Topics
         Topics of the recordings.
     gravity, gravity_sd : float, optional
-        Local gravity and its standard deviation for a robot whose site does not give it, m/s^2.
+        Local gravity and its standard deviation, m/s^2, as for `Table.at`.
 
     Raises
     ------
@@ -551,10 +551,11 @@ def table_of(
 
     """
     if isinstance(stand, Table):
-        return stand
+        description = {each.name: getattr(stand, each.name) for each in fields(stand)}
+        return Table.at(gravity, gravity_sd, description)
     if not isinstance(stand, Arm):
         if Path(stand).suffix not in DESCRIPTIONS:
-            return files.read_table(stand)
+            return files.read_table(stand, gravity=gravity, gravity_sd=gravity_sd)
         stand = Arm(stand)
     site = (
         dict(stand.site or {})

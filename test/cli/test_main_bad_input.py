@@ -4,6 +4,7 @@ Bad input through the command line: one line that says what must hold, what came
 Exit code 1; nothing half written.
 """
 
+import json
 import os
 from dataclasses import replace
 
@@ -335,3 +336,18 @@ def test_what_was_there_survives_a_refusal(capsys, tmp_path, home):
     )
     assert [p.name for p in (tmp_path / 'out').iterdir()] == ['calibration.yaml']
     assert (tmp_path / 'out' / 'calibration.yaml').read_text() == 'the one before'
+
+
+@pytest.mark.parametrize('verb', ['calibrate', 'check', 'diagnose', 'inspect', 'plan'])
+def test_a_latitude_that_contradicts_the_table_is_refused(home, tmp_path, capsys, verb):
+    options = ['--table', str(home / 'table.yaml'), '--latitude', '0', '--json']
+    if verb == 'check':
+        options += ['--calibration', str(home / 'good')]
+    elif verb != 'inspect':
+        options += ['--output', str(tmp_path / 'out')]
+    recordings = [] if verb == 'plan' else [str(home / 'bag')]
+    assert main([verb, *recordings, *options]) == 1
+    error = json.loads(capsys.readouterr().out)['error']
+    # WGS 84 at 48.8 deg and at the equator
+    assert error['code'] == 'gravity_twice'
+    assert '9.80963' in error['error'] and '9.78033' in error['error']

@@ -391,3 +391,36 @@ def test_sd_of_gravity_is_that_of_the_formula_unless_gravity_is_given(given_valu
     assert Table.from_mapping(
         THREE_AXES | {'gravity': None} | given_values
     ).gravity_sd_value == pytest.approx(expected)
+
+
+MEASURED = (9.80123, 0.0)
+OF_LATITUDE = (normal_gravity(48.0), 1e-4 * normal_gravity(48.0))
+
+
+@pytest.mark.parametrize(
+    ('description', 'apart', 'expected'),
+    [
+        ({}, MEASURED, MEASURED),
+        ({}, OF_LATITUDE, OF_LATITUDE),
+        ({'gravity_sd': 1e-5}, MEASURED, (9.80123, 1e-5)),
+        # a measured gravity is closer than that of the latitude, which the Earth's rate still needs
+        ({'latitude': 13.0}, MEASURED, MEASURED),
+        # stated twice
+        ({'latitude': 48.0}, OF_LATITUDE, OF_LATITUDE),
+        ({'gravity': 9.80123, 'gravity_sd': 1e-5}, MEASURED, (9.80123, 1e-5)),
+        ({'latitude': 13.0}, OF_LATITUDE, None),
+        ({'gravity': 9.81}, MEASURED, None),
+        ({'gravity': 9.81}, OF_LATITUDE, None),
+        ({'gravity': 9.81, 'latitude': 48.0}, OF_LATITUDE, None),
+    ],
+)
+def test_a_gravity_given_apart_is_used_or_refused(description, apart, expected):
+    mapping = THREE_AXES | {'gravity': None} | description
+    gravity, spread = apart
+    if expected is None:
+        with refused(InputError, 'gravity_twice', f'{gravity:.5f}'):
+            Table.from_mapping(mapping, gravity=gravity, gravity_sd=spread)
+        return
+    table = Table.from_mapping(mapping, gravity=gravity, gravity_sd=spread)
+    assert (table.gravity_value, table.gravity_sd_value) == pytest.approx(expected)
+    assert table.latitude == description.get('latitude')

@@ -174,6 +174,17 @@ def test_the_stated_gravity_holds_for_an_arm_whose_site_states_none(
     assert node.set_parameters_atomically([Parameter('hand_samples', value=5000)]).successful
 
 
+def test_a_table_has_the_measured_gravity_and_no_other_latitude(bench, tmp_path):
+    (tmp_path / 'table.yaml').write_text(
+        yaml.safe_dump({'joints': [{'name': 'a', 'axis': [0, 0, 1]}], 'latitude': 48.0})
+    )
+    settings = {'table_file': str(tmp_path / 'table.yaml')}
+    with refused(ImuCalibrationError, 'gravity_twice', 9.80891, 9.78033):
+        bench.start(CalibrationNode, {**settings, 'latitude': 0.0})
+    node = bench.start(CalibrationNode, {**settings, 'gravity': 9.79})
+    assert (node.worker.live.table.gravity_value, node.worker.live.table.latitude) == (9.79, 48.0)
+
+
 def test_what_cannot_be_used_is_refused_by_name(bench, tmp_path):
     (tmp_path / 'arm.urdf').write_text(SIX_AXES)
     with refused(ImuCalibrationError, 'link_unknown', 'nowhere'):
