@@ -371,23 +371,34 @@ def test_the_groups_of_diagnostics_have_each_publishing_node_once():
     assert sorted(grouped) == publishing
 
 
-@pytest.mark.parametrize('layout', ['imu.plotjuggler.xml', 'coverage.foxglove.json'])
+IMU_FIELDS = {
+    f'{sensor}/{axis}' for sensor in ('linear_acceleration', 'angular_velocity') for axis in 'xyz'
+}
+SHOWN = {
+    'imu.plotjuggler.xml': {'/imu/data_raw', '/imu/data_corrected', '/imu/residual'},
+    'coverage.foxglove.json': {'/imu/coverage', '/diagnostics', '/imu/residual'},
+    'coverage.rviz': {'/imu/coverage'},
+}
+"""Layout -> the topics it shows."""
+
+
+@pytest.mark.parametrize('layout', SHOWN)
 def test_a_layout_shows_fields_of_topics_that_the_nodes_have(layout):
-    """Each path of a layout is a topic of type Imu and a field of its definition."""
-    topics = {DEFAULT_TOPICS[IMU_TYPE]}
+    """Each absolute name is a topic that a node publishes or reads; of an Imu each field."""
+    types = {DEFAULT_TOPICS[IMU_TYPE]: 'Imu'}
     for path in (ROOT / 'imu_calibration/nodes').glob('*.py'):
-        for topic in re.findall(r"create_publisher\(Imu, '([\w/]+)'", path.read_text()):
-            topics.add(f'/{topic}')
-    fields = set()
+        for kind, topic in re.findall(r"create_publisher\((\w+), '([\w/]+)'", path.read_text()):
+            types['/' + topic.lstrip('/')] = kind
     for sensor in ('linear_acceleration', 'angular_velocity'):
         assert f'geometry_msgs/Vector3 {sensor}' in standard_definition(IMU_TYPE).text
-        fields |= {f'{sensor}/{axis}' for axis in 'xyz'}
+    shown = {}
     text = (ROOT / 'config' / layout).read_text()
-    paths = re.findall(r'"(/imu/\w+[./]\w+[./][xyz])"', text)
-    assert len(paths) >= 6
-    for path in paths:
-        topic, field = re.fullmatch(r'(/imu/\w+)[./](.+)', path).groups()
-        assert topic in topics and field.replace('.', '/') in fields, path
+    for name in re.findall(r'(?:"|Value: )(/[\w/.]+)', text):
+        topic = next((topic for topic in types if re.match(rf'{topic}\b', name)), name)
+        shown.setdefault(topic, set()).add(name[len(topic) + 1 :].replace('.', '/'))
+    assert shown == {
+        topic: IMU_FIELDS if types[topic] == 'Imu' else {''} for topic in SHOWN[layout]
+    }
 
 
 def test_links_of_the_documents_lead_somewhere():
