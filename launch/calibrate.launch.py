@@ -19,6 +19,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+from imu_calibration.nodes.launch_arguments import given_parameters
 from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
@@ -125,9 +126,7 @@ def _nodes(context):
         'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
         'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
     }
-    for argument, (name, kind) in OPTIONAL_PARAMETERS.items():
-        if LaunchConfiguration(argument).perform(context):
-            parameters[name] = ParameterValue(LaunchConfiguration(argument), value_type=kind)
+    parameters |= given_parameters(context, OPTIONAL_PARAMETERS)
     return [
         Node(
             package='imu_calibration',

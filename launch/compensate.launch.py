@@ -20,6 +20,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+from imu_calibration.nodes.launch_arguments import given_parameters
 from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
@@ -144,10 +145,7 @@ def generate_launch_description():
 
 def _nodes(context):
     """Return the node; a parameter without an argument keeps its value in `params`."""
-    parameters = dict(USE_SIM_TIME)
-    for argument, (name, kind) in OPTIONAL_PARAMETERS.items():
-        if LaunchConfiguration(argument).perform(context):
-            parameters[name] = ParameterValue(LaunchConfiguration(argument), value_type=kind)
+    parameters = USE_SIM_TIME | given_parameters(context, OPTIONAL_PARAMETERS)
     return [
         Node(
             package='imu_calibration',

@@ -20,6 +20,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+from imu_calibration.nodes.launch_arguments import given_parameters
 from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
@@ -113,10 +114,7 @@ def _nodes(context):
         'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
         'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
     }
-    parameters = {}
-    for argument, (name, kind) in OPTIONAL_PARAMETERS.items():
-        if LaunchConfiguration(argument).perform(context):
-            parameters[name] = ParameterValue(LaunchConfiguration(argument), value_type=kind)
+    parameters = given_parameters(context, OPTIONAL_PARAMETERS)
     noise = {name: value for name, value in parameters.items() if name == 'noise_file'}
     return [_node('calibration_node', table, parameters), _node('planner_node', table, noise)]
 
