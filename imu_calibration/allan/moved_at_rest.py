@@ -4,9 +4,20 @@ import numpy as np
 
 LEAST_REST_CHUNKS = 80
 """Chunks of a rest, at least."""
+MEAN_SECONDS = 1.0
+"""
+Time over which directions are averaged where the rest is long enough, s: the noise of the
+accelerometer hides small tilts, and faster motions are found by their rates.
+"""
+SEGMENT_SECONDS = 100.0
+"""
+Time within which tilts are compared, s: over longer ones the sum of a gyroscope's noise exceeds
+small tilts.
+"""
 DRIFT_DEGREE = 4
 """
-Degree of the polynomial removed from both: warm-up, drift, and the bias in the sum of the rates.
+Degree of the polynomial removed from both in each segment: warm-up, drift, and the bias in the sum
+of the rates.
 """
 LEAST_TILT = 5e-4
 """Rms tilt from which on it is motion, rad."""
@@ -40,16 +51,24 @@ def tilt_at_rest(time: np.ndarray, mean: np.ndarray) -> float:
     rate = mean[:, 3:] - mean[:, 3:].mean(axis=0)
     predicted = np.cumsum(np.cross(direction, rate) * step, axis=0)
 
+    # Means over `MEAN_SECONDS`, at least `LEAST_REST_CHUNKS` per segment, shape (segment, mean, 3).
+    n_segments = max(1, int((time[-1] - time[0]) / SEGMENT_SECONDS))
+    n_chunks = len(time) // n_segments
+    size = max(1, min(int(MEAN_SECONDS / np.median(step[1:])), n_chunks // LEAST_REST_CHUNKS))
+    n_means = n_chunks // size
+    used = slice(0, n_segments * n_means * size)
+    predicted = predicted[used].reshape(n_segments, n_means, size, 3).mean(axis=2)
+    measured = direction[used].reshape(n_segments, n_means, size, 3).mean(axis=2)
+
     # Movement beyond a polynomial in time.
-    scaled_time = np.linspace(-1.0, 1.0, len(time))
-    basis, _ = np.linalg.qr(np.vander(scaled_time, DRIFT_DEGREE + 1))
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, n_means), DRIFT_DEGREE + 1))
     predicted = predicted - basis @ (basis.T @ predicted)
-    measured = direction - basis @ (basis.T @ direction)
+    measured = measured - basis @ (basis.T @ measured)
 
     # measured = factor predicted
     power = float(np.sum(predicted**2))
     total = float(np.sum(measured**2))
-    tilt = np.sqrt(total / len(time))
+    tilt = np.sqrt(total / (n_segments * n_means))
     if not power > 0.0 or tilt < LEAST_TILT:
         return 0.0
     factor = float(np.sum(predicted * measured)) / power

@@ -32,8 +32,11 @@ def means(time, values, size=12):
     return time[:n].reshape(-1, size).mean(axis=1), values[:n].reshape(-1, size, 6).mean(axis=1)
 
 
-def test_a_slow_tilt_is_measured():
-    assert tilt_at_rest(*means(*readings(200, 0.02))) == pytest.approx(0.02 / 2**0.5, rel=0.1)
+@pytest.mark.parametrize(('seconds', 'amplitude'), [(200, 0.02), (150, 0.0015), (900, 0.0015)])
+def test_a_slow_tilt_is_measured(seconds, amplitude):
+    """The small ones are below the noise of the accelerometer, and of the sum of the rates."""
+    found = tilt_at_rest(*means(*readings(seconds, amplitude)))
+    assert found == pytest.approx(amplitude / 2**0.5, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -139,6 +139,12 @@ def test_a_scale_far_from_one_is_questioned_and_applied_where_the_data_support_i
     halved = replace(session[0], force_s=0.52 * session[0].force_s, rate_s=2.2 * session[0].rate_s)
     options = CalibrationOptions(gravity=GRAVITY)
     result = calibrate_poses(read_by_hand([SampleBlock(halved)]), options)
+    _, matrix_f, _, matrix_w = unpack(session[2])
+    for sensor, wanted in (('accelerometer', 0.52 * matrix_f), ('gyroscope', 2.2 * matrix_w)):
+        part = result.calibration.model.slices[sensor, 'matrix']
+        found = result.calibration.values[part].reshape(3, 3)
+        # 5 sd of the rates' matrix: 2e-4 of the noise and 6e-4 of biases that change by the pose
+        assert found == pytest.approx(wanted, abs=5e-3 if sensor == 'gyroscope' else 1e-3)
     assert set(scale_questions(result.calibration)) == {'accelerometer', 'gyroscope'}
     assert not refused_sensors(result.calibration)
     unit = [f for f in looked_at(halved) if f.check in ('gravity', 'full_scale')]
