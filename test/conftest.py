@@ -1,15 +1,17 @@
 """Shared fixtures of the test suite."""
 
 import os
+import re
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 
 # Before numpy comes: threads that wait for each other take minutes on a busy machine.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import pytest  # noqa: E402
-from blank_canvas import BlankCanvas  # noqa: E402
-from hypothesis import HealthCheck, settings  # noqa: E402
+import pytest
+from blank_canvas import BlankCanvas
+from hypothesis import HealthCheck, settings
 
 # The same examples every time, and no failure because the machine is busy.
 settings.register_profile(
@@ -18,6 +20,25 @@ settings.register_profile(
 settings.load_profile('suite')
 
 pytest_plugins = ['lanes']
+MANIFEST = (Path(__file__).parents[1] / 'package.xml').read_text()
+
+
+class FileOfTests(pytest.Module):
+    """A file of tests, skipped if it imports packages of ROS where there is no ROS."""
+
+    def _getobj(self):
+        try:
+            return super()._getobj()
+        except self.CollectError as error:
+            package = (getattr(error.__cause__, 'name', None) or '').partition('.')[0]
+            if not re.search(f'<exec_depend>{package}<', MANIFEST) or find_spec('rclpy'):
+                raise
+            pytest.skip(f'{package} is missing: there is no ROS here', allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path, parent):
+    """Return a file of tests."""
+    return FileOfTests.from_parent(parent, path=module_path)
 
 
 @pytest.fixture(scope='session')

@@ -32,7 +32,6 @@ from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.solution import DETERMINED, HELD
 from imu_calibration.kinematics.table import Table
-from imu_calibration.nodes.adoption import CompensatorSettings, adopt
 from imu_calibration.references.options import CalibrationOptions
 from msg_adapters.imu import FIELDS
 from validation.imu_messages import parse_imu
@@ -267,6 +266,7 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
 
     To this is added how far the angular acceleration is off at this motion.
     """
+    adoption = pytest.importorskip('imu_calibration.nodes.adoption')
     twice, truth = tmp_path / 'twice.yaml', BAG / 'truth.yaml'
     twice.write_text(noise_to_text(noise_of({'white_noise': 4e-4}, {'white_noise': 2e-5})))
     text, of_bags, of_nodes = truth.read_text(), [], []
@@ -294,9 +294,8 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
                 FIELDS['force_cov']
             ][0]
         )
-        live = adopt(
-            text, 'here', CompensatorSettings(noise_file=str(file), anyway=True), frames=None
-        ).compensation
+        settings = adoption.CompensatorSettings(noise_file=str(file), anyway=True)
+        live = adoption.adopt(text, 'here', settings, frames=None).compensation
         for k in range(200):  # until the slope is known
             live.correct(10**18 + 5_000_000 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81)
         of_nodes.append(live.covariances(np.zeros((3, 3)), np.zeros((3, 3)))[0][0, 0])
@@ -304,11 +303,8 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
         0
     ] == pytest.approx(4.0, rel=0.02)
     with refused(InputError, 'file_unreadable', 'missing.yaml'):
-        adopt(
-            text,
-            'here',
-            CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True),
-            frames=None,
+        adoption.adopt(
+            text, 'here', replace(settings, noise_file=str(tmp_path / 'missing.yaml')), frames=None
         )
 
 

@@ -221,11 +221,9 @@ def test_a_table_with_one_joint_is_told_no_seconds_of_motions_that_it_cannot_do(
     assert np.isnan(shown.seconds) and shown.next.text and 'left' not in label_of(shown)[2]
 
 
-rclpy = pytest.importorskip('rclpy')
-
-
 def picture(coverage):
     """The markers by name."""
+    pytest.importorskip('rclpy')
     from builtin_interfaces.msg import Time
 
     from imu_calibration.nodes.calibration_status import markers_of

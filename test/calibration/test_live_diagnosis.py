@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusal import refused
 from test_live_calibration import assert_same, blocks
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
@@ -26,18 +27,13 @@ from imu_calibration.core.progress import LiveState, report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
+from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.references.options import CalibrationOptions
 
+from ros.threads import until
 from worlds import physics
 from worlds.candidates import FEW
 from worlds.misfit_worlds import make_pair
-
-pytest.importorskip('rclpy')
-from refusal import refused
-
-from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402
-
-from ros.threads import until  # noqa: E402
 
 OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW))
 QUICK = {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}

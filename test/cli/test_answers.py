@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / 'examples'))
 
-import answer_pictures  # noqa: E402
-import answers  # noqa: E402
+import answer_pictures
+import answers
 
 KEY = re.compile(r'[A-Za-z]\w*(?:[./]\w+)+|[A-Za-z]+_\w+')
 """Names of parameters, effects, files, topics and units."""

@@ -376,7 +376,7 @@ def test_pickles_and_saved_sessions_carry_it():
 def test_the_package_knows_nothing_of_what_others_added():
     assert not any(name in ADDED for _, name in CATALOGUE.effects())
     with refused(InputError, 'effect_unknown', 'gyro_anisoelasticity'):
-        SensorModel().with_effect('gyroscope', 'gyro_anisoelasticity').param_names  # noqa: B018
+        SensorModel().with_effect('gyroscope', 'gyro_anisoelasticity').param_names
 
 
 @pytest.mark.parametrize(

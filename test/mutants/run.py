@@ -20,8 +20,8 @@ from queue import Queue
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / 'test'))
 
-from mutants.declared import MUTANTS  # noqa: E402
-from mutants.mutation import NotFound, mutated, path_of_test  # noqa: E402
+from mutants.declared import MUTANTS
+from mutants.mutation import NotFound, mutated, path_of_test
 
 LONGEST = 120
 """

@@ -8,25 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu, JointState
 
 from imu_calibration.document.calibration_text import calibration_from_text
+from imu_calibration.nodes import calibration_node
+from imu_calibration.nodes.calibration_node import CalibrationNode
+from imu_calibration.nodes.calibration_status import advice_of
+from imu_calibration.nodes.lifecycle import unknown_parameters
+from imu_calibration.preprocessing.window import WindowSettings
 from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu, encode_joints
 
+from ros.live_station import TABLE
 from worlds.live_sessions import make_session
-
-pytest.importorskip('rclpy')
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
-from sensor_msgs.msg import Imu, JointState  # noqa: E402
-
-from imu_calibration.nodes import calibration_node  # noqa: E402
-from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
-from imu_calibration.nodes.calibration_status import advice_of  # noqa: E402
-from imu_calibration.nodes.lifecycle import unknown_parameters  # noqa: E402
-from imu_calibration.preprocessing.window import WindowSettings  # noqa: E402
-
-from ros.live_station import TABLE  # noqa: E402
 
 pytestmark = pytest.mark.live
 OK, WARN, ERROR = range(3)

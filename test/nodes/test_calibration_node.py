@@ -29,7 +29,7 @@ from worlds.live_sessions import OPTIONS, TABLE, assert_same, make_session
 pytest.importorskip('rclpy')
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 
-from ros.live_station import Station, taken  # noqa: E402
+from ros.live_station import Station, taken
 
 pytestmark = pytest.mark.live
 RATE = 20.0

@@ -9,7 +9,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from refusal import refused
+from sensor_msgs.msg import Imu, Temperature
+from std_msgs.msg import String
 
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import InputError
@@ -17,25 +22,16 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.effects.base import Role
+from imu_calibration.nodes import compensator_diagnostics, compensator_node, inputs
+from imu_calibration.nodes.adoption import CompensatorSettings
+from imu_calibration.nodes.compensator_node import CompensatorNode
+from imu_calibration.nodes.inputs import latched_qos
+from imu_calibration.nodes.lifecycle import unknown_parameters
 from imu_calibration.preprocessing.stamping import COUNTED, REGULAR, StampLine
 from msg_adapters.write import encode_imu
 
+from ros.live_station import Station
 from worlds.compensation_cases import random_calibration
-
-pytest.importorskip('rclpy')
-from rclpy.node import Node  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
-from sensor_msgs.msg import Imu, Temperature  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-
-from imu_calibration.nodes import compensator_diagnostics, compensator_node, inputs  # noqa: E402
-from imu_calibration.nodes.adoption import CompensatorSettings  # noqa: E402
-from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
-from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
-from imu_calibration.nodes.lifecycle import unknown_parameters  # noqa: E402
-
-from ros.live_station import Station  # noqa: E402
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)

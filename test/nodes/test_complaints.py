@@ -9,24 +9,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 
-pytest.importorskip('rclpy')
-from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-
-from imu_calibration.calibration.coverage import GroupState, group_states  # noqa: E402
-from imu_calibration.core.progress import LiveState  # noqa: E402
-from imu_calibration.document.calibration import Calibration  # noqa: E402
-from imu_calibration.effects.sensor_model import SensorModel  # noqa: E402
-from imu_calibration.nodes.calibration_status import (  # noqa: E402
+from imu_calibration.calibration.coverage import GroupState, group_states
+from imu_calibration.core.progress import LiveState
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.nodes.calibration_status import (
     MIN_ADVICE_SECONDS,
     CalibrationGuide,
-    WorkerState,  # noqa: E402
+    WorkerState,
     advice_of,
-    statuses_of,  # noqa: E402
+    statuses_of,
 )
-from imu_calibration.nodes.diagnostics import MOST_KINDS, REMINDER, Complaints  # noqa: E402
-from imu_calibration.preprocessing.stamping import COUNTED, REGULAR, StampLine  # noqa: E402
-from imu_calibration.preprocessing.stream_watch import StreamState  # noqa: E402
+from imu_calibration.nodes.diagnostics import MOST_KINDS, REMINDER, Complaints
+from imu_calibration.preprocessing.stamping import COUNTED, REGULAR, StampLine
+from imu_calibration.preprocessing.stream_watch import StreamState
 
 
 class Heard(list):

@@ -8,16 +8,13 @@ import time
 
 import numpy as np
 import pytest
+from sensor_msgs.msg import Imu
 
 from imu_calibration.document.calibration_text import calibration_to_text
 from msg_adapters.write import encode_imu
 
+from ros.live_station import Station
 from worlds.exact_motion import exact_motion
-
-pytest.importorskip('rclpy')
-from sensor_msgs.msg import Imu  # noqa: E402
-
-from ros.live_station import Station  # noqa: E402
 
 pytestmark = [pytest.mark.live, pytest.mark.slow]
 GAPS_S = (0.1, 0.3, 1.0)

@@ -5,19 +5,17 @@ A live one changes, any other one is rejected with the reason; the first line of
 """
 
 import pytest
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter, parameter_value_to_python
 
-pytest.importorskip('rclpy')
-from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically  # noqa: E402
-from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
+from imu_calibration.core.settings import describe
+from imu_calibration.nodes import NODE_NAMES
+from imu_calibration.nodes.lifecycle import settings_of
+from imu_calibration.planning.campaign import CampaignSettings
+from imu_calibration.planning.driver import DriverSettings
 
-from imu_calibration.core.settings import describe  # noqa: E402
-from imu_calibration.nodes import NODE_NAMES  # noqa: E402
-from imu_calibration.nodes.lifecycle import settings_of  # noqa: E402
-from imu_calibration.planning.campaign import CampaignSettings  # noqa: E402
-from imu_calibration.planning.driver import DriverSettings  # noqa: E402
-
-from ros.live_station import ROOT, TABLE, Station  # noqa: E402
-from ros.planner_bench import PlannerBench  # noqa: E402
+from ros.live_station import ROOT, TABLE, Station
+from ros.planner_bench import PlannerBench
 
 pytestmark = pytest.mark.live
 SAMPLE = ROOT / 'bags' / 'sample_session'

@@ -8,20 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Temperature
 
 from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.nodes.compensator_node import CompensatorNode
 from msg_adapters.imu_stream import ImuStream
 from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu
 
 from worlds.drives import drive, plain_calibration
-
-pytest.importorskip('rclpy')
-from rclpy.parameter import Parameter  # noqa: E402
-from sensor_msgs.msg import Temperature  # noqa: E402
-
-from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)

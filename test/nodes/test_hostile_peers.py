@@ -8,15 +8,13 @@ import os
 from types import SimpleNamespace
 
 import pytest
+from std_msgs.msg import String
+
+from imu_calibration.nodes.compensator_node import CompensatorNode
+from imu_calibration.nodes.diagnostics import Complaints
+from imu_calibration.nodes.inputs import latched_qos
 
 from worlds.small_bags import hostile_calibration
-
-pytest.importorskip('rclpy')
-from std_msgs.msg import String  # noqa: E402
-
-from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
-from imu_calibration.nodes.diagnostics import Complaints  # noqa: E402
-from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
 
 pytestmark = pytest.mark.live
 

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 pytest.importorskip('rclpy')
-from ros.live_station import free_domain  # noqa: E402
-from ros.workspace import ROOT  # noqa: E402
+from ros.live_station import free_domain
+from ros.workspace import ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
 

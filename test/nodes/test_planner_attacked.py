@@ -9,17 +9,14 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus, GoalStatusArray
+from rclpy.qos import qos_profile_action_status_default
+from trajectory_msgs.msg import JointTrajectory
 
+from imu_calibration.nodes.joint_commands import OtherDrivers
 from imu_calibration.planning.driver import DriveState
 
-pytest.importorskip('rclpy')
-from action_msgs.msg import GoalStatus, GoalStatusArray  # noqa: E402
-from rclpy.qos import qos_profile_action_status_default  # noqa: E402
-from trajectory_msgs.msg import JointTrajectory  # noqa: E402
-
-from imu_calibration.nodes.joint_commands import OtherDrivers  # noqa: E402
-
-from ros.planner_bench import PlannerBench  # noqa: E402
+from ros.planner_bench import PlannerBench
 
 pytestmark = pytest.mark.live
 

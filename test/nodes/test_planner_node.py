@@ -8,29 +8,26 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from refusal import refused
 
+from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import override
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
-
-pytest.importorskip('rclpy')
-from refusal import refused
-
-from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND  # noqa: E402
-from imu_calibration.nodes import joint_commands  # noqa: E402
-from imu_calibration.nodes.planner_node import MID_MOTION, PlannerNodeSettings  # noqa: E402
+from imu_calibration.nodes import joint_commands
+from imu_calibration.nodes.planner_node import MID_MOTION, PlannerNodeSettings
 from imu_calibration.nodes.planner_worker import (
     Activity,
     Peers,
     PlannerWorker,
     findings_from,
-)  # noqa: E402
-from imu_calibration.planning.campaign import Suspect  # noqa: E402
-from imu_calibration.planning.driver import DriverSettings, DriveState  # noqa: E402
+)
+from imu_calibration.planning.campaign import Suspect
+from imu_calibration.planning.driver import DriverSettings, DriveState
 
-from ros.live_station import ROOT, TABLE, Station  # noqa: E402
-from ros.one_process import OneProcess  # noqa: E402
-from ros.threads import until  # noqa: E402
+from ros.live_station import ROOT, TABLE, Station
+from ros.one_process import OneProcess
+from ros.threads import until
 
 NAMES = ('outer', 'inner')
 FEW_PARAMETERS = {'accelerometer_model': 'bias+matrix', 'gyroscope_model': 'bias+matrix'}

@@ -17,15 +17,12 @@ import yaml
 
 import imu_calibration as imu
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.nodes.adoption import CompensatorSettings
 from imu_calibration.nodes.lifecycle import UNKNOWN_PARAMETER
 
+from ros.live_station import STAY_LOCAL, TABLE, free_domain
+from ros.workspace import ROOT, sourced
 from worlds.compensation_cases import random_calibration
-
-pytest.importorskip('rclpy')
-from imu_calibration.nodes.adoption import CompensatorSettings  # noqa: E402
-
-from ros.live_station import STAY_LOCAL, TABLE, free_domain  # noqa: E402
-from ros.workspace import ROOT, sourced  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
 PATIENCE = 240.0

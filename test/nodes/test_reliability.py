@@ -17,8 +17,8 @@ from msg_adapters.write import write_session
 from worlds.live_sessions import assert_same, errors_in_sd, make_session, offline
 
 pytest.importorskip('rclpy')
-from ros.live_station import Publisher, Station  # noqa: E402
-from ros.soak import GROWTH_MB, soak  # noqa: E402
+from ros.live_station import Publisher, Station
+from ros.soak import GROWTH_MB, soak
 
 pytestmark = pytest.mark.live
 SIGMA = 5.0

@@ -10,29 +10,26 @@ import threading
 import numpy as np
 import pytest
 import yaml
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from refusal import refused
+from sensor_msgs.msg import Imu
+from std_msgs.msg import String
 
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.kinematics.urdf import StaticTransforms, table_from_urdf
+from imu_calibration.nodes import planner_node, robot_stand
+from imu_calibration.nodes.calibration_node import CalibrationNode
+from imu_calibration.nodes.inputs import latched_qos
+from imu_calibration.nodes.planner_node import PlannerNode
+from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 
-pytest.importorskip('rclpy')
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.qos import qos_profile_sensor_data  # noqa: E402
-from refusal import refused
-from sensor_msgs.msg import Imu  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-
-from imu_calibration.nodes import planner_node, robot_stand  # noqa: E402
-from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
-from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
-from imu_calibration.nodes.planner_node import PlannerNode  # noqa: E402
-from imu_calibration.nodes.robot_stand import RobotSettings, chain_of  # noqa: E402
-
-from ros.one_process import OneProcess  # noqa: E402
-from worlds.arms import SIX_AXES  # noqa: E402
+from ros.one_process import OneProcess
+from worlds.arms import SIX_AXES
 
 pytestmark = pytest.mark.live
 LINK = 'imu_link'

@@ -15,8 +15,8 @@ import pytest
 from imu_calibration.cli.parser import VERBS
 
 pytest.importorskip('rclpy')
-from ros.live_station import STAY_LOCAL, free_domain  # noqa: E402
-from ros.workspace import ROOT, sourced  # noqa: E402
+from ros.live_station import STAY_LOCAL, free_domain
+from ros.workspace import ROOT, sourced
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
 TABLE = ROOT / 'bags/sample_session/table.yaml'

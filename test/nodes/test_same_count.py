@@ -1,22 +1,18 @@
 """Every place that counts determined parameters has the count of the saved calibration."""
 
 import pytest
+from test_calibration_attacked import gathered, send
 
 from imu_calibration.calibration.result import summary
 from imu_calibration.document.files import read_calibration
 from imu_calibration.document.outcome import missing, parameter_count, shortcomings
+from imu_calibration.nodes.calibration_node import CalibrationNode
+from imu_calibration.nodes.compensator_node import CompensatorNode
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.use_cases.exporting import export_calibration
 
+from ros.live_station import TABLE
 from worlds.live_sessions import make_session
-
-pytest.importorskip('rclpy')
-from test_calibration_attacked import gathered, send  # noqa: E402
-
-from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
-from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
-
-from ros.live_station import TABLE  # noqa: E402
 
 pytestmark = pytest.mark.live
 STATUS = ('calibration_node: calibration', 'compensator_node: compensation')

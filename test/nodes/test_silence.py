@@ -4,11 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip('rclpy')
+from imu_calibration.nodes.inputs import MatchedInput
 
-from imu_calibration.nodes.inputs import MatchedInput  # noqa: E402
-
-from ros.live_station import Station  # noqa: E402
+from ros.live_station import Station
 
 IMU = 'sensor_msgs/msg/Imu'
 

@@ -29,9 +29,9 @@ from worlds.live_sessions import TABLE, make_session
 pytest.importorskip('rclpy')
 from refusal import refused
 
-from examples.processes import node_command  # noqa: E402
+from examples.processes import node_command
 
-from ros.live_station import Station, taken  # noqa: E402
+from ros.live_station import Station, taken
 
 START = 1_800_000_000
 

@@ -14,25 +14,21 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import TransformStamped
+from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
+from std_msgs.msg import String
 
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.nodes.compensator_node import CompensatorNode
+from imu_calibration.nodes.inputs import latched_qos
+from imu_calibration.nodes.robot_stand import TF_STATIC
 from msg_adapters.write import encode_imu
 
+from ros.message_package import make_package, why_not
+from ros.one_process import OneProcess
 from worlds.compensation_cases import random_calibration
-
-pytest.importorskip('rclpy')
-from geometry_msgs.msg import TransformStamped  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-
-from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
-from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
-from imu_calibration.nodes.robot_stand import TF_STATIC  # noqa: E402
-
-from ros.message_package import make_package, why_not  # noqa: E402
-from ros.one_process import OneProcess  # noqa: E402
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)

@@ -43,6 +43,24 @@ def test_a_core_test_that_uses_dds_fails():
     assert not context.ok()
 
 
+def test_a_file_of_tests_that_needs_ros_is_skipped_where_there_is_none(
+    tmp_path, monkeypatch, request
+):
+    monkeypatch.setattr(sys, 'path', list(sys.path))
+    for package, error in (
+        ('rclpy', pytest.skip.Exception),
+        ('absent', pytest.Collector.CollectError),
+    ):
+        monkeypatch.setitem(sys.modules, package, None)
+        file = tmp_path / f'test_with_{package}.py'
+        file.write_text(f'import {package}\n')
+        made = request.config.hook.pytest_pycollect_makemodule(
+            module_path=file, parent=request.session
+        )
+        with pytest.raises(error):
+            made.obj
+
+
 @pytest.mark.live
 def test_a_live_test_may_start_a_process():
     assert subprocess.run([sys.executable, '-c', ''], check=True).returncode == 0

@@ -14,9 +14,9 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2])]
 
-from examples.processes import NodeProcesses  # noqa: E402
+from examples.processes import NodeProcesses
 
-from ros.live_station import Station  # noqa: E402
+from ros.live_station import Station
 
 GROWTH_MB = 10.0
 LARGEST_MB = {'calibration_node': 250.0, 'compensator_node': 70.0}

@@ -19,11 +19,11 @@ from validation import (
     held_out,
     run,
     simulated_table,
-)  # noqa: E402
-from validation.hand_peers import _other_turns  # noqa: E402
-from validation.recordings import load, reference  # noqa: E402
-from validation.second_opinions import Forward, fit_norm  # noqa: E402
-from validation.section import Section  # noqa: E402
+)
+from validation.hand_peers import _other_turns
+from validation.recordings import load, reference
+from validation.second_opinions import Forward, fit_norm
+from validation.section import Section
 
 G = 9.81
 
