@@ -18,6 +18,8 @@ PAGES = {
     'SECURITY.md': 'SECURITY.md',
 }
 """Page of the site -> file of the repository."""
+STYLE = '.md-typeset pre > code { white-space: pre-wrap; overflow-wrap: anywhere; }'
+"""Long commands continue on the next line: none is cut off at the edge."""
 SKIPPED = {'__main__'}
 LOADED = re.compile(r'<(script|img|link|iframe)[^>]*\b(src|href)="?https?://')
 LINK = re.compile(r'(!?)\[([^\]]*)\]\(([^)#\s]+)(#[^)]*)?\)')
@@ -27,7 +29,7 @@ def on_files(files, config):
     """Add the generated pages."""
     for page, path in PAGES.items():
         files.append(File.generated(config, page, content=(ROOT / path).read_text()))
-    for page, content in interface().items():
+    for page, content in (interface() | {'commands.css': STYLE}).items():
         files.append(File.generated(config, page, content=content))
     return files
 
