@@ -68,6 +68,14 @@ def harmed(sensor, **changes):
     return replace(GOOD, proof=PROOF | {sensor: replace(PROOF[sensor], **HARMS)}, **changes)
 
 
+@pytest.mark.parametrize(
+    ('sensor', 'other'), (('accelerometer', 'gyroscope'), ('gyroscope', 'accelerometer'))
+)
+def test_the_proof_of_one_sensor_decides_on_it_alone(sensor, other):
+    decisions = harmed(sensor).decisions
+    assert decisions[sensor] is not HELPS and decisions[other] is HELPS
+
+
 def test_each_sensor_has_its_own_decision(yaw):
     """The accelerometer, whose errors are below what one attitude shows, is not helped."""
     calibration = yaw.calibration

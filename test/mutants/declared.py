@@ -1260,7 +1260,7 @@ BY_SENSOR = _of(
         '_decisions',
         '_1.proof.get(_2)',
         "_1.proof.get('gyroscope')",
-        'test_verdict_by_sensor.py::test_each_sensor_has_its_own_decision',
+        'test_verdict_by_sensor.py::test_the_proof_of_one_sensor_decides_on_it_alone',
     ),
     (
         'exports hold what compensation refuses',
