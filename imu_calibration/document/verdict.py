@@ -14,7 +14,6 @@ from imu_calibration.document.calibration import (
     HAND_AXES,
     SHOWN_NAMES,
     Calibration,
-    beyond_instruments,
     beyond_known,
     implausible,
     listed,
@@ -632,18 +631,11 @@ def _step_of(calibration: Calibration, sensor: str) -> tuple[str, str | None]:
 
 
 def _decisions(calibration: Calibration) -> dict[str, SensorDecision]:
-    """Return sensor -> decision; at best UNPROVEN for an uncertain clock or refused values."""
-    found = {}
-    for sensor in calibration.sensors:
-        word = decide(calibration.proof.get(sensor))
-        doubtful = (
-            _periodic(calibration, sensor)
-            or beyond_instruments(calibration, sensor)
-            or _undecided_motion(calibration, sensor)
-        )
-        if word is HELPS and doubtful:
-            word = UNPROVEN
-        found[sensor] = word
+    """Return sensor -> decision; at best UNPROVEN for an uncertain clock or motion."""
+    found = dict(calibration.decisions)
+    for sensor, decision in found.items():
+        if _periodic(calibration, sensor) or _undecided_motion(calibration, sensor):
+            found[sensor] = most_cautious([decision, UNPROVEN])
     if needs_accelerometer(calibration, found):
         found['gyroscope'] = most_cautious([found['gyroscope'], UNPROVEN])
     return found

@@ -1257,9 +1257,9 @@ BY_SENSOR = _of(
     ),
     (
         'both sensors have the proof of one',
-        '_decisions',
-        '_1.proof.get(_2)',
-        "_1.proof.get('gyroscope')",
+        'Calibration.decisions',
+        'decide(self.proof.get(_1))',
+        "decide(self.proof.get('gyroscope'))",
         'test_verdict_by_sensor.py::test_the_proof_of_one_sensor_decides_on_it_alone',
     ),
     (
