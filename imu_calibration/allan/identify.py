@@ -24,7 +24,7 @@ from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import reported
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.samples import LARGEST_STEP, SampleBlock
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
@@ -328,6 +328,12 @@ def read_rest(
     Arguments as for `identify_noise`.
     """
     found = survey(source(), nominal)
+    if found.period > LARGEST_STEP:
+        raise InputError(
+            f'the IMU must be read at least once in {LARGEST_STEP:g} s, the median step is'
+            f' {found.period:g} s; record at its full rate',
+            code='rate_too_low',
+        )
     pieces = [still_parts(chunks, found.period, found.resolution) for chunks in found.epochs]
     parts, left_out = (
         [part for part, _ in pieces],

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from imu_calibration.core.errors import InputError
+from imu_calibration.core.errors import InputError, shortened
 
 FIRST_NS = 1_000_000_000
 """
@@ -20,13 +20,40 @@ EPOCH = 1e8
 
 LEAST_NS_STEP = 1000
 """Integer times with this median step or more are nanoseconds: no IMU is read every 1000 s."""
+LEAST_STEP, LARGEST_STEP = 5e-5, 1.0
+"""Limits of the median step of the times of an IMU, s; beyond them the unit is another one."""
 
 
-def _are_nanoseconds(time: np.ndarray) -> bool:
-    """Return whether times are integers with the steps of nanoseconds."""
-    if time.ndim != 1 or not np.issubdtype(time.dtype, np.integer) or len(time) < 2:
-        return False
-    return bool(np.median(np.abs(np.diff(time.astype(np.int64)))) >= LEAST_NS_STEP)
+def _times_of(time: ArrayLike) -> np.ndarray:
+    """Return times as numbers: datetime64 as integer ns, objects with the type of their values."""
+    times = np.asarray(time)
+    if times.dtype == object:
+        times = np.asarray(times.tolist())
+    if times.dtype.kind == 'M':
+        missing = np.isnat(times)
+        times = times.astype('datetime64[ns]').astype(np.int64)
+        times = np.where(missing, np.nan, times) if missing.any() else times
+    return times
+
+
+def _stamps_of_any(time: np.ndarray) -> np.ndarray:
+    """Return stamps of times in s, or of integers with the steps of nanoseconds; ns, int64."""
+    whole = np.issubdtype(time.dtype, np.integer)
+    steps = np.diff(time.astype(np.int64) if whole else time)
+    step = float(np.median(np.abs(steps))) if len(steps) else LEAST_STEP
+    in_ns = whole and step >= LEAST_NS_STEP
+    seconds = step * 1e-9 if in_ns else step
+    if not LEAST_STEP <= seconds <= LARGEST_STEP:
+        raise InputError(
+            'times must be in s, or integers in ns, with a median step of'
+            f' {LEAST_STEP:g} to {LARGEST_STEP:g} s, got {seconds:g} s; convert them',
+            code='time_unit',
+        )
+    if not in_ns:
+        return stamps_of(time)
+    whole_ns = time.astype(np.int64)
+    start_ns = int(whole_ns[0]) if whole_ns[0] > EPOCH * 10**9 else FIRST_NS
+    return start_ns + (whole_ns - whole_ns[0])
 
 
 def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
@@ -220,8 +247,8 @@ class SampleBlock:
         Parameters
         ----------
         time : array_like
-            Seconds, from an epoch or relative, shape (n,); integers with steps of at least
-            `LEAST_NS_STEP` are nanoseconds.
+            Seconds, from an epoch or relative, shape (n,); integers with a median step of at least
+            `LEAST_NS_STEP` are nanoseconds. Or datetime64.
         force : array_like
             Specific force in the sensor frame, m/s^2; at rest, z up, +g about z; shape (n, 3).
         rate : array_like
@@ -234,43 +261,43 @@ class SampleBlock:
         Raises
         ------
         InputError
-            When shapes differ or a time is not finite.
+            When shapes differ, or times are not finite or in another unit.
 
         """
-        given_ns = np.asarray(time)
-        in_ns = _are_nanoseconds(given_ns)
-        time, force, rate = (np.asarray(values, float) for values in (time, force, rate))
-        angles = {name: np.asarray(values, float) for name, values in (joints or {}).items()}
-        heat = None if temperature_c is None else np.asarray(temperature_c, float)
-        n = len(time) if time.ndim == 1 else -1
-        given = {
-            'time': time,
-            'force': force,
-            'rate': rate,
-            **angles,
-            **({} if heat is None else {'temperature_c': heat}),
-        }
+        times = _times_of(time)
+        given = {'time': times, 'force': force, 'rate': rate}
+        for name, values in (joints or {}).items():
+            given[f"joint '{name}'"] = values
+        if temperature_c is not None:
+            given['temperature_c'] = temperature_c
+        arrays = {}
         for name, values in given.items():
-            wanted = (n, 3) if name in ('force', 'rate') else (n,)
-            if values.shape != wanted or n < 1:
+            try:
+                arrays[name] = np.asarray(values, float)
+            except (TypeError, ValueError) as error:
                 raise InputError(
-                    f'{name} must have shape {str(wanted).replace("-1", "n")} with at least one'
-                    f' row, got {values.shape}; correct the array',
+                    f'{name} must be numbers, got {shortened(str(error))}; convert the array',
+                    code='array_type',
+                ) from error
+            n = arrays['time'].size
+            shape = (n, 3) if name in ('force', 'rate') else (n,)
+            if arrays[name].shape != shape or not n:
+                raise InputError(
+                    f'{name} must have shape {shape} with at least one row, got'
+                    f' {arrays[name].shape}; correct the array',
                     code='array_shape',
                 )
-        if not np.isfinite(time).all():
+        n_missing = np.count_nonzero(~np.isfinite(arrays['time']))
+        if n_missing:
             raise InputError(
-                f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are'
-                ' not; remove these rows'
+                f'every time must be finite, got {n_missing} that are not; remove these rows',
+                code='time_not_finite',
             )
-        if in_ns:
-            whole_ns = given_ns.astype(np.int64)
-            start_ns = int(whole_ns[0]) if whole_ns[0] > EPOCH * 10**9 else FIRST_NS
-            stamp_ns = start_ns + (whole_ns - whole_ns[0])
-        else:
-            stamp_ns = stamps_of(time)
+        stamp_ns = _stamps_of_any(times)
+        angles = {name: arrays[f"joint '{name}'"] for name in joints or {}}
+        heat = arrays.get('temperature_c')
         return cls(
-            ImuSamples(stamp_ns, force, rate, 'imu_link'),
+            ImuSamples(stamp_ns, arrays['force'], arrays['rate'], 'imu_link'),
             JointSamples.of_angles(stamp_ns, angles) if angles else None,
             None if heat is None else TemperatureSamples(stamp_ns, heat),
         )

@@ -132,7 +132,7 @@ def force_error(
             value=unit,
         )
     gravity_ratio = length * per_second / STANDARD_GRAVITY
-    if stated.is_si and abs(gravity_ratio - 1.0) < INCREMENT_AGREEMENT:
+    if wrong and stated.is_si and abs(gravity_ratio - 1.0) < INCREMENT_AGREEMENT:
         return InputError(
             f'{said}increments per sample? Times {per_second:.4g} Hz it is'
             f' {length * per_second:.4g}; {remedy}',

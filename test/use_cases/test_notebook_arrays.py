@@ -1,6 +1,7 @@
 """Arrays in place of recordings, integer nanoseconds, and files that are not replaced silently."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -41,6 +42,49 @@ def test_integer_nanoseconds_are_exact(start):
     assert stamps[0] == start or start < 10
     seconds = SampleBlock.from_arrays(np.arange(5), zeros, zeros).imu.stamp_ns
     np.testing.assert_array_equal(np.diff(seconds), 10**9)
+
+
+@pytest.mark.parametrize('kind', ('uint64', 'datetime64[ns]', 'object'))
+def test_times_of_other_types_are_the_same(kind):
+    arrays = at_rest()
+    again = {**arrays, 'time': arrays['time'].astype(kind)}
+    stamps = [SampleBlock.from_arrays(**each).imu.stamp_ns for each in (arrays, again)]
+    np.testing.assert_array_equal(*stamps)
+
+
+@pytest.mark.parametrize(
+    ('scale', 'kind', 'step'),
+    [
+        (1.0, float, '1e+07'),
+        (1e-3, np.int64, '1e-05'),
+        (1e-6, np.int64, '10 s'),
+        (1e-6, float, '10 s'),
+    ],
+)
+def test_times_in_another_unit_are_refused(scale, kind, step):
+    """Nanoseconds as floats, microseconds, milliseconds."""
+    arrays = at_rest()
+    arrays['time'] = (arrays['time'] * scale).astype(kind)
+    with refused(InputError, 'time_unit', step):
+        imu.inspect(**arrays)
+    missing = np.append(np.datetime64('NaT', 'ns'), arrays['time'][1:].astype('datetime64[ns]'))
+    with refused(InputError, 'time_not_finite', 1):
+        imu.inspect(**{**arrays, 'time': missing})
+    with refused(InputError, 'array_type', 'rate'):
+        imu.inspect(**{**arrays, 'rate': np.full((COUNT, 3), 'fast')})
+
+
+def test_readings_at_one_hertz_are_no_increments():
+    arrays = at_rest()
+    (summary,) = imu.inspect(**{**arrays, 'time': 1.0 * np.arange(COUNT)})
+    assert not summary.refused
+
+
+def test_the_noise_of_slow_readings_is_refused():
+    block = SampleBlock.from_arrays(**at_rest())
+    slow = replace(block.imu, stamp_ns=1000 * block.imu.stamp_ns).select(slice(0, 2000))
+    with refused(InputError, 'rate_too_low', 10):
+        imu.noise(SampleBlock(slow))
 
 
 def test_noise_and_inspect_take_arrays():
