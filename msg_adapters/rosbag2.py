@@ -15,6 +15,7 @@ from typing import Any
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
+from imu_calibration.core.schema import Document, list_of, mapping, maybe, require, text, whole
 from msg_adapters.compression import decompress_file, decompress_message
 from msg_adapters.definitions import (
     STANDARD_TYPES,
@@ -66,6 +67,26 @@ def _name(key, value):
 
 
 COMPRESSED = ('.zstd', '.zst')
+_TOPIC = mapping({'name': text(), 'type': text()}, {'type_description_hash': maybe(text())})
+_INFORMATION = mapping(
+    {
+        'topics_with_message_count': list_of(
+            mapping({'topic_metadata': _TOPIC, 'message_count': whole()})
+        ),
+        'relative_file_paths': list_of(text()),
+    },
+    {
+        'duration': mapping({'nanoseconds': whole(-(2**63))}),
+        'compression_mode': maybe(text()),
+        'storage_identifier': maybe(text()),
+    },
+)
+METADATA = Document(
+    'metadata.yaml',
+    mapping({'rosbag2_bagfile_information': _INFORMATION}),
+    'delete it, the files have the same content',
+)
+"""Parts of metadata.yaml that are used; QoS profiles are of no consequence (`spelled_out`)."""
 
 
 class Rosbag2:
@@ -91,7 +112,7 @@ class Rosbag2:
         self.folder: str | None = None
         self.metadata = read_metadata(self.path) if self.path.is_dir() else {}
         self._lost, self.files = {}, []
-        by_message = str(self.metadata.get('compression_mode', '')).lower() == 'message'
+        by_message = (self.metadata.get('compression_mode') or '').lower() == 'message'
         try:
             errors = [
                 self._open(path, decompress_message if by_message else None)
@@ -114,7 +135,7 @@ class Rosbag2:
     def duration_ns(self) -> int:
         """Time between the first and the last message by the clock of the recorder."""
         if 'duration' in self.metadata:
-            return int(self.metadata['duration']['nanoseconds'])
+            return self.metadata['duration']['nanoseconds']
         ranges = [times for times in (file.time_range() for file in self.files) if times]
         return max(last for _, last in ranges) - min(first for first, _ in ranges) if ranges else 0
 
@@ -234,7 +255,7 @@ class Rosbag2:
 
     def _announced(self):
         return {
-            entry['topic_metadata']['name']: int(entry['message_count'])
+            entry['topic_metadata']['name']: entry['message_count']
             for entry in self.metadata.get('topics_with_message_count', ())
         }
 
@@ -251,27 +272,26 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     """
     try:
         with open_regular(folder / 'metadata.yaml') as file:
-            text = file.read(documents.MAX_DOCUMENT_CHARACTERS + 1).decode()
-        return _information(text)
-    except (OSError, InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError):
+            content = file.read(documents.MAX_DOCUMENT_CHARACTERS + 1).decode()
+        return _information(content)
+    except (OSError, InputError, UnicodeDecodeError):
         return {}
 
 
 @lru_cache(maxsize=1)
-def _information(text: str) -> dict[str, Any]:
+def _information(content: str) -> dict[str, Any]:
     """
     Return the checked content of metadata.yaml, which nothing changes.
 
     One verb opens a recording several times.
     """
-    document = documents.parsed(text, 'metadata', aliases=True)
-    information = document['rosbag2_bagfile_information']
+    document = documents.parsed(content, METADATA.name, aliases=True)
+    require(document, METADATA)
+    information: dict[str, Any] = document['rosbag2_bagfile_information']
     for entry in information['topics_with_message_count']:
-        topic, entry['message_count'] = entry['topic_metadata'], int(entry['message_count'])
-        topic['name'], topic['type'] = clean_name(topic['name']), clean_name(topic['type'])
-    information['relative_file_paths'] = [str(name) for name in information['relative_file_paths']]
-    if 'duration' in information:
-        int(information['duration']['nanoseconds'])
+        topic = entry['topic_metadata']
+        topic['name'] = clean_name(topic['name'])
+        topic['type'] = clean_name(topic['type'])
     return information
 
 

@@ -18,6 +18,7 @@ from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.compression import zstd
 from msg_adapters.definitions import standard_definition
+from msg_adapters.rosbag2 import read_metadata
 from msg_adapters.sqlite_file import PAGE_SIZE, STEP_IDS
 from msg_adapters.write import encode_imu, encode_joints, write_session
 
@@ -425,3 +426,25 @@ def test_another_definition_of_a_type_takes_the_general_path(tmp_path, session, 
     else:
         with refused(InputError, 'definition_damaged', 'sensor_msgs/msg/Imu'):
             read(tmp_path / 'bag')
+
+
+@pytest.mark.parametrize(
+    ('good', 'damaged'),
+    [
+        ("compression_mode: ''", 'compression_mode: [1]'),
+        ('message_count: 9000', 'message_count: 9000.5'),
+        ('nanoseconds: ', 'nanoseconds: x'),
+        ('type_description_hash: ', 'type_description_hash: 5 # '),
+        ('- sqlite3_0.db3', '- 7'),
+    ],
+)
+def test_metadata_with_a_part_of_another_type_count_as_none(bags, tmp_path, good, damaged):
+    folder = tmp_path / 'damaged'
+    shutil.copytree(bags / 'sqlite3', folder)
+    assert read_metadata(folder)
+    content = (folder / 'metadata.yaml').read_text()
+    assert good in content
+    (folder / 'metadata.yaml').write_text(content.replace(good, damaged))
+    assert read_metadata(folder) == {}
+    imu, _, lost = read(folder)
+    assert len(imu) == N and not lost
