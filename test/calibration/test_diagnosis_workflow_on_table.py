@@ -24,6 +24,7 @@ from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.residual_analysis import inquire
 
 from worlds.diagnosing import diagnose
+from worlds.hide_and_seek_worlds import components_of
 from worlds.hiding import Sizes, record
 
 FOLLOWING = 'accel_thermal_bias+accel_thermal_scale+accel_bias_drift+gyro_thermal_bias'
@@ -85,6 +86,13 @@ def test_hidden_effect_is_the_first_finding_with_honest_parameters(effect, sizes
             np.abs(values - true)
             < np.maximum(4 * np.array(sds), 0.01 * np.abs(true) * effect.endswith('saturation'))
         )
+
+
+def test_a_single_component_of_a_drift_keeps_its_time_constant(sizes):
+    hidden = sizes.hidden('gyro_bias_drift', SEED, 5.0, 1)
+    assert np.flatnonzero(hidden).tolist() == [1, 3]
+    assert hidden[3] == sizes.hidden('gyro_bias_drift', SEED, 5.0)[3]
+    assert components_of(['gyro_bias_drift']) == [('gyro_bias_drift', k) for k in range(3)]
 
 
 def test_cause_outside_the_catalogue_is_unexplained_and_not_named():

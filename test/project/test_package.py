@@ -254,6 +254,26 @@ def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
     assert {distribution(requirement) for requirement in installed['requires']} <= set(names)
 
 
+def test_pins_are_those_that_the_advisories_require():
+    """Except Fast DDS in security mode, which is named with the version that is needed."""
+    versions = {}
+    for line in pinned('pypi.txt'):
+        versions[distribution(line)] = re.search(r'==([\w.]+)', line).group(1)
+    rows = re.findall(
+        r'^\| (.+?) \| ([\d.]+) \| ([\d.]+)[^|]* \| [^|]*(?:CVE-\d{4}-\d+|GHSA-)',
+        (ROOT / 'SECURITY.md').read_text(),
+        re.MULTILINE,
+    )
+    assert len(rows) >= 7
+    too_old = []
+    for package, needed, stated in rows:
+        name = {'Fast DDS, security mode': 'ros-fastrtps'}.get(package, package)
+        assert stated == versions[distribution(name)], package
+        if [int(part) for part in stated.split('.')] < [int(part) for part in needed.split('.')]:
+            too_old.append(package)
+    assert too_old == ['Fast DDS, security mode']
+
+
 @pytest.mark.live
 def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
     oldest, newest = (

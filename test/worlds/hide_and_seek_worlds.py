@@ -261,7 +261,7 @@ def components_of(effects):
     cases = []
     for name in effects:
         count = _effect(name).n_amplitudes
-        if name not in NOT_SIZED and count > 1 and not _effect(name).time_constant:
+        if name not in NOT_SIZED and count > 1:
             cases += [(name, component) for component in range(count)]
     return cases
 

@@ -172,8 +172,10 @@ class Sizes:
             return factor * LEAST_CLIPPED_SHARE
         value = pattern(effect, seed)
         if component is not None:
+            # A time constant behind the amplitudes stays as it is.
             number = np.arange(value.size).reshape(value.shape)
-            value = np.where(number == component, value, 0.0)
+            amplitudes = self._question(effect, value)[0].effect.n_amplitudes
+            value = np.where((number == component) | (number >= amplitudes), value, 0.0)
         direction, n_parameters = self._direction(effect, value)
         strength = direction @ self.information @ direction
         seen = np.sqrt(
