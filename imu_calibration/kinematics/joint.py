@@ -8,6 +8,18 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.schema import (
+    Document,
+    Requirement,
+    Unmet,
+    flag,
+    list_of,
+    mapping,
+    maybe,
+    number,
+    require,
+    text,
+)
 from imu_calibration.kinematics.rotations import rotation_from_rpy
 
 MAX_TABLE_NUMBER = 1e6
@@ -16,77 +28,65 @@ Largest number of a table (axis, place, angle, speed); products of larger number
 """
 
 
-def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
-    """Refuse values that are not a mapping, and keys that are not `known`."""
-    if not isinstance(mapping, Mapping):
-        raise InputError(
-            f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the'
-            ' table description',
-            code='not_a_mapping',
-        )
-    for key in mapping:
-        if key not in known:
-            raise InputError(
-                f"{what}: key '{key}' is unknown; the keys here are {', '.join(known)}",
-                code='key_unknown',
-            )
+def table_number(
+    low: float = -MAX_TABLE_NUMBER, high: float = MAX_TABLE_NUMBER, *, above: bool = False
+) -> Requirement:
+    """Require a number as `schema.number` does, or its text: YAML 1.1 reads 1e-5 as text."""
+    within = number(low, high, above=above)
+
+    def check(value: Any, place: str) -> None:
+        if isinstance(value, str):
+            try:
+                value = float(value)
+            except ValueError:
+                pass
+        within(value, place)
+
+    return check
 
 
-def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
-    """
-    Return the direction of three numbers as a unit vector; a unit vector is returned unchanged.
-    """
-    vector = np.array(several_numbers(value, what))
+THREE_NUMBERS = list_of(table_number(), 3)
+
+
+def direction(value: Any, place: str) -> None:
+    """Require three numbers that are not all zero."""
+    THREE_NUMBERS(value, place)
+    if np.linalg.norm(np.array(value, float)) < 1e-9:
+        raise Unmet('range', place, 'not be zero', received=list(value), code='zero_vector')
+
+
+def table_document(parts: Requirement, name: str = 'table') -> Document:
+    """Return the declaration of a table or of a part of it."""
+    return Document(
+        name,
+        parts,
+        'correct the description (m, m/s^2; angles in the unit of their name, latitude in degrees)',
+        {'type': 'not_finite', 'range': 'out_of_range', 'length': 'three_numbers'},
+        InputError,
+    )
+
+
+def three_numbers(value: Any, what: str) -> tuple[float, ...]:
+    """Return three finite numbers, required of a value that is not a part of a document."""
+    require({what: value}, table_document(mapping(each=THREE_NUMBERS)))
+    return tuple(float(item) for item in value)
+
+
+def unit_vector(value: Any) -> tuple[float, float, float]:
+    """Return a `direction` as a unit vector; a unit vector is returned unchanged."""
+    vector = np.array(value, float)
     norm = np.linalg.norm(vector)
-    if norm < 1e-9:
-        raise InputError(
-            f'table: {what} must not be zero, got {list(value)}; give a direction of three numbers',
-            code='zero_vector',
-        )
     # Idempotent, so that a table written and read again is equal.
     return tuple((vector / norm if abs(norm - 1) > 4e-16 else vector).tolist())
 
 
-def several_numbers(value: Any, what: str, count: int = 3) -> tuple[float, ...]:
-    """Return `count` finite numbers."""
-    words = {2: 'two', 3: 'three'}[count]
-    if isinstance(value, (str, bytes)) or not hasattr(value, '__len__') or len(value) != count:
-        raise InputError(
-            f'table: {what} must be {words} numbers, got {value!r}; correct it',
-            code='three_numbers',
-        )
-    return tuple(finite_number(item, what, advice=f'give {words} numbers') for item in value)
-
-
-def finite_number(
-    value: Any,
-    what: str,
-    *,
-    low: float = -MAX_TABLE_NUMBER,
-    high: float = MAX_TABLE_NUMBER,
-    advice: str = 'give a number',
-) -> float:
-    """
-    Return one finite number within [low, high], by default the limits of any number of a table.
-    """
-    # YAML 1.1 reads 1e-5, without a point, as text.
-    try:
-        number = float('nan') if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = float('nan')
-    if not np.isfinite(number):
-        raise InputError(
-            f'table: {what} must be a finite number, got {value!r}; {advice}', code='not_finite'
-        )
-    if not low <= number <= high:
-        raise InputError(
-            f'table: {what} must lie in [{low:g}, {high:g}], got {value!r}; {advice}',
-            code='out_of_range',
-        )
-    return number
-
-
 TYPES = ('revolute', 'prismatic')
+_PLACE = {
+    'axis': direction,
+    'xyz': THREE_NUMBERS,
+    'rpy_deg': THREE_NUMBERS,
+    'type': text(*TYPES),
+}
 
 
 @dataclass(frozen=True)
@@ -163,16 +163,11 @@ class Joint:
     """
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'axis', unit_vector(self.axis, f"axis of joint '{self.name}'"))
-        object.__setattr__(self, 'xyz', several_numbers(self.xyz, f"xyz of joint '{self.name}'"))
-        object.__setattr__(
-            self, 'rpy_deg', several_numbers(self.rpy_deg, f"rpy_deg of joint '{self.name}'")
-        )
-        if self.type not in TYPES:
-            raise InputError(
-                f"table: the type of joint '{self.name}' must be {' or '.join(TYPES)}, got"
-                f' {self.type!r}; correct it'
-            )
+        fields_of_place = {name: getattr(self, name) for name in _PLACE}
+        require(fields_of_place, table_document(mapping(_PLACE), f"table: joint '{self.name}'"))
+        object.__setattr__(self, 'axis', unit_vector(self.axis))
+        object.__setattr__(self, 'xyz', tuple(float(number) for number in self.xyz))
+        object.__setattr__(self, 'rpy_deg', tuple(float(number) for number in self.rpy_deg))
         _require_limits(self.limits, f"joint '{self.name}'")
 
     @property
@@ -283,51 +278,69 @@ def place_names(turning: Sequence[str]) -> tuple[str, ...]:
     return tuple(f'{name}_{letter}' for name, letter in product(turning[1:], 'uv'))
 
 
-LIMIT_KEYS = {
-    'revolute': ('range_deg', 'speed_deg_s', 'acceleration_deg_s2', 'endless'),
-    'prismatic': ('range_m', 'speed_m_s', 'acceleration_m_s2'),
+_RANGE = maybe(list_of(table_number(), 2))
+_LARGEST = maybe(table_number(0.0, above=True))
+LIMITS: dict[str, dict[str, Requirement]] = {
+    'revolute': {
+        'range_deg': _RANGE,
+        'speed_deg_s': _LARGEST,
+        'acceleration_deg_s2': _LARGEST,
+        'endless': maybe(flag('not_true_or_false')),
+    },
+    'prismatic': {'range_m': _RANGE, 'speed_m_s': _LARGEST, 'acceleration_m_s2': _LARGEST},
 }
-"""Keys of the limits in a table description, by type."""
-_KEYS = ('name', 'axis', 'xyz', 'rpy_deg', 'type', 'mimic')
+"""Type -> requirements of the limits in a table description."""
+_MIMIC = mapping(
+    {'joint': text()},
+    {'multiplier': maybe(table_number()), 'offset': maybe(table_number())},
+    closed=True,
+)
 
 
-def joint_from_mapping(item: Any) -> Joint:
-    """Return the joint that an entry of a table description describes."""
-    kind = item.get('type') or 'revolute' if isinstance(item, Mapping) else 'revolute'
-    require_keys(item, (*_KEYS, *LIMIT_KEYS.get(kind, ())), 'table joint')
-    for key in ('name', 'axis'):
-        if item.get(key) is None:
-            raise InputError(
-                f'table: every joint must have name and axis, got {item!r}; add {key}',
-                code='keys_missing',
-            )
-    values = {key: item[key] for key in _KEYS if item.get(key) is not None}
-    if 'mimic' in values:
-        values['mimic'] = _mimic(values['mimic'], item['name'])
-    return Joint(**values, limits=limits_from_mapping(item, kind))
+def joint_entry(value: Any, place: str) -> None:
+    """Require an entry of the joints in a table description."""
+    kind = None
+    if isinstance(value, Mapping):
+        place, kind = f'{place} ({value.get("name")})', value.get('type')
+    mapping(
+        {'name': text(), 'axis': direction},
+        {
+            **{name: maybe(_PLACE[name]) for name in ('xyz', 'rpy_deg', 'type')},
+            'mimic': maybe(_MIMIC),
+            **(LIMITS['prismatic'] if kind == 'prismatic' else LIMITS['revolute']),
+        },
+        closed=True,
+    )(value, place)
 
 
-def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
-    """Return the limits in an entry of a table description."""
-    what = f"of joint '{item.get('name')}'"
-    range_key, *others = LIMIT_KEYS.get(kind, LIMIT_KEYS['revolute'])[:3]
-    unit = np.radians(1.0) if range_key.endswith('_deg') else 1.0
-    lower, upper = (
-        (None, None)
-        if item.get(range_key) is None
-        else (unit * end for end in several_numbers(item[range_key], f'{range_key} {what}', 2))
+def joint_from_mapping(item: Mapping[str, Any]) -> Joint:
+    """Return the joint that a valid `joint_entry` describes."""
+    values = {key: item[key] for key in ('name', *_PLACE) if item.get(key) is not None}
+    mimic = item.get('mimic')
+    if mimic is not None:
+        numbers = {
+            key: float(mimic[key]) for key in ('multiplier', 'offset') if mimic.get(key) is not None
+        }
+        values['mimic'] = Mimic(mimic['joint'], **numbers)
+    return Joint(**values, limits=limits_from_mapping(item, values.get('type', 'revolute')))
+
+
+def limits_from_mapping(item: Mapping[str, Any], kind: str) -> JointLimits:
+    """Return the limits in a valid entry of a table description."""
+    unit = np.radians(1.0) if kind == 'revolute' else 1.0
+    range_key, speed_key, acceleration_key = list(LIMITS[kind])[:3]
+
+    def in_si(value: Any) -> float | None:
+        return None if value is None else unit * float(value)
+
+    lower, upper = item.get(range_key) or (None, None)
+    return JointLimits(
+        in_si(lower),
+        in_si(upper),
+        in_si(item.get(speed_key)),
+        in_si(item.get(acceleration_key)),
+        endless=bool(item.get('endless')),
     )
-    endless = item.get('endless') or False
-    if not isinstance(endless, bool):
-        raise InputError(
-            f'table: endless {what} must be true or false, got {endless!r}; correct it',
-            code='not_true_or_false',
-        )
-    speed, acceleration = (
-        None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}')
-        for key in others
-    )
-    return JointLimits(lower, upper, speed, acceleration, endless)
 
 
 def _require_limits(limits: JointLimits, what: str) -> None:
@@ -353,21 +366,6 @@ def _require_limits(limits: JointLimits, what: str) -> None:
             )
 
 
-def _mimic(item: Any, name: str) -> Mimic:
-    require_keys(item, ('joint', 'multiplier', 'offset'), f"mimic of joint '{name}'")
-    numbers = {
-        key: finite_number(item[key], f"mimic {key} of joint '{name}'")
-        for key in ('multiplier', 'offset')
-        if item.get(key) is not None
-    }
-    if not isinstance(item.get('joint'), str):
-        raise InputError(
-            f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add"
-            ' joint: NAME'
-        )
-    return Mimic(item['joint'], **numbers)
-
-
 def joint_to_mapping(joint: Joint) -> dict[str, Any]:
     """
     Return the entry that `joint_from_mapping` turns into an equal joint.
@@ -390,7 +388,7 @@ def joint_to_mapping(joint: Joint) -> dict[str, Any]:
     if limits.endless:
         item['endless'] = True
     for key, value in zip(
-        LIMIT_KEYS[joint.type][:3], (ends, limits.speed, limits.acceleration), strict=True
+        list(LIMITS[joint.type])[:3], (ends, limits.speed, limits.acceleration), strict=True
     ):
         if value is not None:
             # Twelve decimals of a degree, so that values survive reading and writing.

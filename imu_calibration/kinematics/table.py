@@ -10,15 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.schema import anything, list_of, mapping, maybe, require
 from imu_calibration.kinematics.joint import (
+    THREE_NUMBERS,
     Joint,
     JointNames,
-    finite_number,
+    direction,
+    joint_entry,
     joint_from_mapping,
     joint_to_mapping,
     place_names,
-    require_keys,
-    several_numbers,
+    table_document,
+    table_number,
     unit_vector,
 )
 from imu_calibration.kinematics.rotations import (
@@ -95,9 +98,32 @@ def axis_error_directions(axis: np.ndarray) -> np.ndarray:
     return np.array([first, np.cross(axis, first)])
 
 
-_MOUNT_KEYS = ('rpy_deg', 'xyz')
 SAME_GRAVITY = 1e-5
 """Difference of a gravity that is stated twice, m/s^2: digits that were rounded."""
+_NUMBERS = {
+    'gravity': maybe(table_number(1.5, 30.0)),
+    'gravity_sd': maybe(table_number(0.0, 1.0)),
+    'latitude': maybe(table_number(-90.0, 90.0)),
+    'height': maybe(table_number(-12000.0, 1e5)),
+    'azimuth_deg': maybe(table_number(-720.0, 720.0)),
+    'joint_noise_rad': maybe(table_number(0.0, 0.1)),
+    'joint_error_rad': maybe(table_number(0.0, 0.1)),
+    'joint_error_m': maybe(table_number(0.0, 0.1)),
+}
+_MOUNT = {'rpy_deg': maybe(THREE_NUMBERS), 'xyz': maybe(THREE_NUMBERS)}
+_SITE = {
+    'up': maybe(direction),
+    **_NUMBERS,
+    'mount': maybe(mapping(optional=_MOUNT, closed=True)),
+}
+TABLE = table_document(
+    mapping({'joints': list_of(joint_entry, code='no_joint')}, _SITE, closed=True)
+)
+"""A table description."""
+SITE = table_document(
+    mapping(optional={**_SITE, 'joints': maybe(list_of(anything))}, closed=True), 'site'
+)
+"""A table description without joints, beside a robot description; its joints are limits by name."""
 
 
 @dataclass(frozen=True)
@@ -143,20 +169,19 @@ class Table:
     def __post_init__(self) -> None:
         joints = tuple(self.joints)
         _require_joints(joints)
-        checked: dict[str, Any] = {
-            'joints': joints,
-            'up': unit_vector(self.up, 'up'),
-            'mount_rpy_deg': several_numbers(self.mount_rpy_deg, 'mount rpy_deg'),
-        }
-        if self.mount_xyz is not None:
-            checked['mount_xyz'] = several_numbers(self.mount_xyz, 'mount xyz')
-        for name, (low, high, advice) in _NUMBERS.items():
-            value = getattr(self, name)
-            checked[name] = (
-                None
-                if value is None
-                else finite_number(value, name, low=low, high=high, advice=advice)
-            )
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        mount = {f'mount_{name}': requirement for name, requirement in _MOUNT.items()}
+        require(
+            values,
+            TABLE,
+            mapping({'up': direction, 'mount_rpy_deg': THREE_NUMBERS}, {**_NUMBERS, **mount}),
+        )
+        checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up)}
+        for name in _NUMBERS:
+            checked[name] = None if values[name] is None else float(values[name])
+        for name in mount:
+            numbers = values[name]
+            checked[name] = None if numbers is None else tuple(float(item) for item in numbers)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.gravity is None and self.latitude is None:
@@ -185,7 +210,8 @@ class Table:
             When a key is unknown, a joint is missing or a value does not fit.
 
         """
-        joints = tuple(joint_from_mapping(item) for item in joint_entries(mapping))
+        require(mapping, TABLE)
+        joints = tuple(joint_from_mapping(item) for item in mapping['joints'])
         return cls.at(gravity, gravity_sd, {'joints': joints, **site_from_mapping(mapping)})
 
     @classmethod
@@ -306,38 +332,14 @@ class Table:
         )
 
 
-_NUMBERS = {
-    'gravity': (1.5, 30.0, 'give it in m/s^2, about 9.8'),
-    'gravity_sd': (0.0, 1.0, 'give it in m/s^2'),
-    'latitude': (-90.0, 90.0, 'give it in degrees'),
-    'height': (-12000.0, 1e5, 'give it in m'),
-    'azimuth_deg': (-720.0, 720.0, 'give it in degrees clockwise from true north'),
-    'joint_noise_rad': (0.0, 0.1, 'give it in rad'),
-    'joint_error_rad': (0.0, 0.1, 'give it in rad'),
-    'joint_error_m': (0.0, 0.1, 'give it in m'),
-}
-
-
-def joint_entries(mapping: Any) -> tuple:
-    """Return the entries of the joints in a table description, none when it has no list of them."""
-    joints = mapping.get('joints') if isinstance(mapping, Mapping) else None
-    return tuple(joints) if isinstance(joints, (list, tuple)) else ()
-
-
-def site_from_mapping(mapping: Any) -> dict[str, Any]:
-    """Return the entries of a table description except the joints, as arguments of `Table`."""
-    require_keys(
-        mapping,
-        [f.name for f in fields(Table) if not f.name.startswith('mount_')] + ['mount'],
-        'table',
-    )
+def site_from_mapping(site: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a valid description except the joints, as arguments of `Table`."""
     values = {
         name: value
-        for name, value in mapping.items()
+        for name, value in site.items()
         if value is not None and name not in ('mount', 'joints')
     }
-    mount = mapping.get('mount') or {}
-    require_keys(mount, _MOUNT_KEYS, 'table mount')
+    mount = site.get('mount') or {}
     return values | {f'mount_{name}': value for name, value in mount.items() if value is not None}
 
 

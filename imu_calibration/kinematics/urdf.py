@@ -15,22 +15,22 @@ import numpy as np
 
 from imu_calibration.core.documents import MAX_DOCUMENT_CHARACTERS
 from imu_calibration.core.errors import InputError, printable, shortened
+from imu_calibration.core.schema import mapping, require, text
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.kinematics.joint import (
-    LIMIT_KEYS,
+    LIMITS,
     Joint,
     JointLimits,
     Mimic,
     limits_from_mapping,
-    require_keys,
-    several_numbers,
+    three_numbers,
 )
 from imu_calibration.kinematics.rotations import (
     rotation_from_rpy,
     rotations_from_quaternions,
     rpy_from_rotation,
 )
-from imu_calibration.kinematics.table import Table, joint_entries, site_from_mapping
+from imu_calibration.kinematics.table import SITE, Table, site_from_mapping
 
 NAMED = 6
 """Largest number of frames in one line."""
@@ -203,17 +203,17 @@ def table_from_urdf(
 
     """
     robot = _read(text)
-    values = site_from_mapping(site or {})
+    site = site or {}
+    require(site, SITE)
+    values = site_from_mapping(site)
     if gravity is None and values.keys().isdisjoint(('gravity', 'latitude')):
         gravity, gravity_sd = STANDARD_GRAVITY, STANDARD_GRAVITY_SD
     joints, rest = _chain(robot, link)
-    xyz, rpy_deg = (
-        several_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}')
-        for name in ('xyz', 'rpy_deg')
-    )
-    mount = rest.then(np.array(xyz), rotation_from_rpy(np.radians(rpy_deg)))
+    xyz = np.array(values.get('mount_xyz', (0.0, 0.0, 0.0)), float)
+    rpy_deg = np.array(values.get('mount_rpy_deg', (0.0, 0.0, 0.0)), float)
+    mount = rest.then(xyz, rotation_from_rpy(np.radians(rpy_deg)))
     values |= {f'mount_{name}': value for name, value in mount.fields.items()}
-    joints = _with_limits(joints, joint_entries(site or {}), link)
+    joints = _with_limits(joints, site.get('joints') or (), link)
     return Table.at(gravity, gravity_sd, JOINT_ERRORS | values | {'joints': joints})
 
 
@@ -338,7 +338,7 @@ def _chain(robot, link):
 
 def _origin(joint):
     xyz, rpy = (
-        several_numbers(
+        three_numbers(
             (joint.origin and getattr(joint.origin, name)) or (0, 0, 0),
             f'origin {name} of joint {joint.name}',
         )
@@ -402,7 +402,8 @@ def _with_limits(joints, entries, link):
                 code='joint_unknown',
             )
         known = by_name[name]
-        require_keys(entry, ('name', *LIMIT_KEYS[known.type]), f"limits of joint '{name}'")
+        limits = mapping({'name': text()}, LIMITS[known.type], closed=True)
+        require(entry, replace(SITE, name=f"limits of joint '{name}'"), limits)
         given = limits_from_mapping(entry, known.type)
         better = {
             key: value

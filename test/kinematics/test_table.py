@@ -329,8 +329,16 @@ mount: {rpy_deg: [0, 0, 90], xyz: null}
         ({'joints': None}, 'no_joint', ['joints']),
         ({'joints': []}, 'no_joint', ['joints']),
         ({'joints': [{'name': 'a'}]}, 'keys_missing', ["{'name': 'a'}", 'axis']),
-        ({'joints': [{'name': 'a', 'axis': [0, 0, 0]}]}, 'zero_vector', ["'a'", '[0, 0, 0]']),
-        ({'joints': [{'name': 'a', 'axis': [0, 1]}]}, 'three_numbers', ["'a'", '[0, 1]']),
+        (
+            {'joints': [{'name': 'a', 'axis': [0, 0, 0]}]},
+            'zero_vector',
+            ['joints[0] (a).axis', '[0, 0, 0]'],
+        ),
+        (
+            {'joints': [{'name': 'a', 'axis': [0, 1]}]},
+            'three_numbers',
+            ['joints[0] (a).axis', '[0, 1]'],
+        ),
         (
             {'joints': [{'name': 'a', 'axis': [0, 0, 1], 'angle': 3}]},
             'key_unknown',

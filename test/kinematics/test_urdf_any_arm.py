@@ -235,14 +235,14 @@ def test_a_site_may_only_name_joints_on_the_way():
 @pytest.mark.parametrize(
     'changes, values',
     [
-        ({'type': 'planar'}, ["'a'", "'planar'"]),
+        ({'type': 'planar'}, ['(a).type', "'planar'"]),
         ({'range_deg': [10, -10]}, ["'a'", 0.1745, -0.1745]),
-        ({'range_deg': 10}, ["'a'", 'range_deg', 10]),
-        ({'speed_deg_s': 0}, ["'a'", 'got 0']),
+        ({'range_deg': 10}, ['(a).range_deg', 10]),
+        ({'speed_deg_s': 0}, ['(a).speed_deg_s', 'got 0']),
         ({'type': 'prismatic', 'range_deg': [0, 1]}, ["'range_deg'", 'range_m']),
         ({'mimic': {'joint': 'b'}}, ["'a'", "'b'"]),
-        ({'mimic': 'b'}, ['mimic', "'a'", "'b'"]),
-        ({'mimic': {'multiplier': 2}}, ['mimic', "'a'", 'None']),
+        ({'mimic': 'b'}, ['(a).mimic', "'b'"]),
+        ({'mimic': {'multiplier': 2}}, ['(a).mimic', "{'multiplier': 2}"]),
     ],
 )
 def test_joints_that_cannot_be_are_refused(changes, values):
