@@ -5,7 +5,7 @@ Biases after a shock, exchanged axes, a displaced mount, a belt that slipped, a 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -67,16 +67,21 @@ class Onset:
     """Parameter -> unit."""
     share: float
     """Share of the excess over noise that the second state removes."""
-    axes: tuple[str, ...] = ()
+    sensor_axes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """
-    Axes of which the biases or rows of the matrices change, the largest change first; empty for an
-    effect of the reference.
+    Sensor -> its axes of which the bias or the row of the matrix changes, the largest change first;
+    empty for an effect of the reference.
     """
     temperature_c: float | None = None
     """
     Temperature of which all windows before the moment are on one side and all later ones on the
     other, so that a step where it is passed is not separable; None without one.
     """
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Axes of any sensor that change."""
+        return tuple(dict.fromkeys(axis for own in self.sensor_axes.values() for axis in own))
 
     def to_mapping(self) -> dict:
         """Return the onset as plain data."""
@@ -86,6 +91,7 @@ class Onset:
             'what': self.what,
             'share': self.share,
             'axes': list(self.axes),
+            'sensor_axes': {sensor: list(axes) for sensor, axes in self.sensor_axes.items()},
             'temperature_c': self.temperature_c,
             'parameters': {
                 name: {
@@ -344,14 +350,17 @@ def _onset_of(
         for k, label in enumerate(effect.param_names()):
             units[label] = effect.unit_of(k)
     before, after = (dict(zip(names, state[group.parameters].tolist())) for state in states)
-    axes = ()
+    sensor_axes = {}
     if group.role is not None:
         # Of each sensor of the group three biases, or the nine elements of a matrix row by row.
         per_row = 1 if group.role is Role.OFFSET else 3
         # Biases of the two sensors have different units: they are compared in standard deviations.
         unit = sd if group.role is Role.OFFSET else 1.0
         squares = np.maximum((change / unit) ** 2 - (sd / unit) ** 2, 0.0)
-        axes = largest_axes(squares.reshape(-1, 3, per_row).sum(axis=(0, 2)))
+        squares = squares.reshape(-1, 3, per_row).sum(axis=2)
+        sensors = dict.fromkeys(name.partition('.')[0] for name in names)
+        for sensor, own in zip(sensors, squares, strict=True):
+            sensor_axes[sensor] = largest_axes(own, most=squares.max())
     return Onset(
         moment,
         moment_sd,
@@ -361,7 +370,7 @@ def _onset_of(
         dict(zip(names, sd.tolist())),
         {label: units[label] for label in names},
         candidate.share,
-        axes,
+        sensor_axes,
         candidate.temperature_c,
     )
 

@@ -206,35 +206,72 @@ def _rest(
         )
     if rms == 0:  # less than biases may wander, and more than neighbours may differ
         rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
-    name, share = correlate(_explanations(recording), residual / noise_sd)
+    # The fit has absorbed a part of the cause, as far as the columns of the model resemble it.
+    fitted = []
+    for axis in range(3):
+        used = np.flatnonzero(values[space.places(sensor, axis)[:-1]])
+        fitted.append(space.mean[sensor][axis][:, used])
+    name, share = correlate(_explanations(recording), residual, noise_sd, fitted=fitted)
     return Unexplained(True, rms, float(sigma), name, share, residual, noise_sd)
 
 
-def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None, float]:
+def correlate(
+    explanations: Iterator,
+    residual: np.ndarray,
+    noise_sd: np.ndarray,
+    *,
+    fitted: Sequence[np.ndarray] | None = None,
+) -> tuple[str | None, float]:
     """
     Return (name, adjusted share of the variance) of the best variable, or (None, 0).
 
-    The best variable is the one with the largest correlation.
+    The best variable is the one with the largest correlation, beside the columns of the fit whose
+    residual this is::
 
-    `explanations` are (name, columns (k, m), mask of the windows where they are known).
+        residual_i = bias_i + fitted_i @ a_i + columns @ b_i + noise_i
+
+    Parameters
+    ----------
+    explanations : iterator
+        (name, columns (k, m), mask of the windows where they are known).
+    residual : ndarray, shape (k, n)
+        Of n axes.
+    noise_sd : ndarray, shape (k, n)
+        Its expected sd from noise.
+    fitted : list of ndarray, shape (k, q_i)
+        Columns of the fit of each axis beside its bias; default: none.
+
     """
     best = (None, 0.0)
+    if fitted is None:
+        fitted = [np.zeros((len(residual), 0))] * residual.shape[1]
+    bias = np.ones((len(residual), 1))
     for name, columns, rows in explanations:
         if rows.sum() < 3 * columns.shape[1] + 6:
             continue
-        design = np.column_stack([np.ones(rows.sum()), columns[rows]])
-        left = residual[rows]
-        fitted = design @ np.linalg.lstsq(design, left, rcond=1e-9)[0]
-        total, rest = ((left - left.mean(axis=0)) ** 2).sum(), ((left - fitted) ** 2).sum()
-        k, n = columns.shape[1], rows.sum()
-        share = 1 - (rest / (n - k - 1)) / (total / (n - 1))
-        layers = residual.shape[1]
-        p_value = f_sf(
-            (total - rest) / k / max(rest / (n - k - 1), 1e-300), layers * k, layers * (n - k - 1)
-        )
+        total, total_dof, rest, rest_dof = 0.0, 0, 0.0, 0
+        for axis, own in enumerate(fitted):
+            weight = 1 / noise_sd[rows, axis, None]
+            design = weight * np.column_stack([bias, own, columns])[rows]
+            values = weight[:, 0] * residual[rows, axis]
+            misfit, dof = _misfit(design[:, : 1 + own.shape[1]], values)
+            total, total_dof = total + misfit, total_dof + dof
+            misfit, dof = _misfit(design, values)
+            rest, rest_dof = rest + misfit, rest_dof + dof
+        gained = total_dof - rest_dof
+        if min(gained, rest_dof) <= 0:
+            continue
+        share = 1 - (rest / rest_dof) / (total / total_dof)
+        p_value = f_sf((total - rest) / gained / max(rest / rest_dof, 1e-300), gained, rest_dof)
         if p_value < ALPHA and share > max(best[1], 0.15):
             best = (name, float(share))
     return best
+
+
+def _misfit(design: np.ndarray, values: np.ndarray) -> tuple[float, int]:
+    """Return the sum of squares that a fit leaves, and its degrees of freedom."""
+    solution, _, rank, _ = np.linalg.lstsq(design, values, rcond=1e-9)
+    return float(((values - design @ solution) ** 2).sum()), len(values) - int(rank)
 
 
 def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:

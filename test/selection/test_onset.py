@@ -98,8 +98,10 @@ def test_a_step_of_the_biases_is_found_with_both_states(shock, what, axes):
     recording, found = investigated(Moment('shock', shock=shock))
     onset = found.onset
     assert onset.what == f'bias of {what}' and onset.share > 0.95 and set(onset.axes) == set(axes)
-    assert abs(onset.time - moment_of(recording, 0.55)) < 1.5 and onset.time_sd < 1.5
     truth = dict(zip(('accelerometer', 'gyroscope'), shock))
+    for sensor, changed in onset.sensor_axes.items():
+        assert sorted(changed) == ['xyz'[k] for k in range(3) if truth[sensor][k]], sensor
+    assert abs(onset.time - moment_of(recording, 0.55)) < 1.5 and onset.time_sd < 1.5
     for name, before in onset.before.items():
         sensor, axis = name.split('.')[0], 'xyz'.index(name[-1])
         change = onset.after[name] - before
@@ -107,6 +109,8 @@ def test_a_step_of_the_biases_is_found_with_both_states(shock, what, axes):
     assert not found.named
     printed = ' '.join(diagnosis_lines(build_diagnosis(recording.table, found)))
     assert all(f'{name} ' in printed for name in onset.before)
+    for sensor, changed in onset.sensor_axes.items():
+        assert not changed or f'{sensor} {" and ".join(changed)}' in printed
 
 
 def test_a_wandering_bias_is_no_onset():

@@ -963,11 +963,11 @@ def test_noise_goes_with_nothing():
     """Twenty curves, none of which the residual follows."""
     rng = np.random.default_rng(6)
     curves = [(f'curve {k}', rng.normal(size=(60, 2)), np.ones(60, bool)) for k in range(20)]
-    assert rests.correlate(iter(curves), rng.normal(size=(60, 3))) == (None, 0.0)
-    assert (
-        rests.correlate(iter(curves), rng.normal(size=(60, 3)) + 1.5 * curves[3][1][:, :1])[0]
-        == 'curve 3'
-    )
+    noise, noise_sd = rng.normal(size=(60, 3)), np.ones((60, 3))
+    assert rests.correlate(iter(curves), noise, noise_sd) == (None, 0.0)
+    noise = rng.normal(size=(60, 3))
+    followed = noise + 1.5 * curves[3][1][:, :1]
+    assert rests.correlate(iter(curves), followed, noise_sd)[0] == 'curve 3'
 
 
 @pytest.mark.parametrize('lag', [0, 45, 90])
@@ -982,11 +982,12 @@ def test_a_bias_that_follows_the_temperature_late_is_named(lag):
     late = np.outer(temperature(time - lag) - 25, [1.0, -0.5, 0.2])
     measured = temperature(time) + rng.normal(0, 0.02, len(time))
     residual = late + rng.normal(0, 0.3, late.shape)
-    name, share = rests.correlate(rests.slow_explanations(time, measured), residual)
+    noise_sd = np.ones(residual.shape)
+    name, share = rests.correlate(rests.slow_explanations(time, measured), residual, noise_sd)
     assert name == (f'the temperature {lag} s earlier' if lag else 'temperature') and share > 0.8
     # With the temperature itself in the model, its rate is left.
     beside = residual - np.outer(measured - 25, [1.0, -0.5, 0.2])
-    name, share = rests.correlate(rests.slow_explanations(time, measured), beside)
+    name, share = rests.correlate(rests.slow_explanations(time, measured), beside, noise_sd)
     assert {0: None, 45: 'temperature rate'}.get(lag, name) == name
 
 
@@ -1001,8 +1002,34 @@ def test_a_temperature_behind_a_thermal_mass_is_named_with_its_lag():
     residual = np.outer(np.interp(time, fine, mass) - 25, [1.0, -0.5, 0.2])
     residual += rng.normal(0, 0.1, residual.shape)
     measured = np.interp(time, fine, warm) + rng.normal(0, 0.02, len(time))
-    name, share = rests.correlate(rests.slow_explanations(time, measured), residual)
+    noise_sd = np.ones(residual.shape)
+    name, share = rests.correlate(rests.slow_explanations(time, measured), residual, noise_sd)
     assert name == 'the temperature with a lag of 45 s' and share > 0.9
+
+
+def test_the_lag_of_a_temperature_is_named_where_the_fit_has_absorbed_a_part_of_it():
+    """
+    Six minutes with one warm-up: a curve in time follows it nearly as well.
+
+    Windows differ in length, and a matrix takes the part that the attitudes resemble.
+    """
+    rng = np.random.default_rng(10052)
+    time = np.sort(rng.uniform(0, 360, 72))
+    fine = np.arange(0.0, 360.0, 0.1)
+    warm = 8 * (1 - np.exp(-fine / 144)) + 0.5 * np.sin(2 * np.pi * fine / 252)
+    mass = warm.copy()
+    for k in range(1, len(fine)):
+        mass[k] = mass[k - 1] + 0.1 / 45.0 * (warm[k - 1] - mass[k - 1])
+    noise_sd = np.repeat(rng.uniform(0.5, 2.0, (72, 1)), 3, axis=1)
+    output = rng.normal(0.0, noise_sd)
+    output[:, 0] += 25 * np.interp(time, fine, mass)
+    fitted = np.column_stack([np.ones(72), rng.normal(size=(72, 3))])
+    weighed = fitted / noise_sd[:, :1]
+    residual = output - fitted @ np.linalg.lstsq(weighed, output / noise_sd, rcond=None)[0]
+    measured = np.interp(time, fine, warm) + rng.normal(0, 0.002, 72)
+    slow = rests.slow_explanations(time, measured)
+    name, share = rests.correlate(slow, residual, noise_sd, fitted=[fitted] * 3)
+    assert name == 'the temperature with a lag of 45 s' and share > 0.99
 
 
 @pytest.mark.parametrize(('first', 'passed'), [((20.0, 24.0), 25.0), ((20.0, 27.0), None)])

@@ -62,4 +62,7 @@ def test_a_joint_goes_by_its_name():
         model=SimpleNamespace(joint_names=('pan', 'tilt')),
     )
     rest = np.random.default_rng(3).normal(size=(n, 3)) + 4 * np.cos(describe['angle1'])[:, None]
-    assert unexplained.correlate(unexplained._explanations(recording), rest)[0] == 'angle of tilt'
+    assert (
+        unexplained.correlate(unexplained._explanations(recording), rest, np.ones(rest.shape))[0]
+        == 'angle of tilt'
+    )

@@ -487,7 +487,10 @@ def _onset_lines(onset: Onset | None) -> list[str]:
         after = in_words(onset.after[name], onset.what, onset.units[name]).removesuffix(' 1')
         changes.append(f'{name} {before} before, {after} after')
     values = '; '.join(changes)
-    axes = f' (axis {", ".join(onset.axes)})' if onset.axes else ''
+    of_sensors = [
+        f'{sensor} {" and ".join(own)}' for sensor, own in onset.sensor_axes.items() if own
+    ]
+    axes = f' ({", ".join(of_sensors)})' if of_sensors else ''
     separable = []
     if onset.temperature_c is not None:
         separable.append(

@@ -80,7 +80,7 @@ def unexplained_by_hand(
     unit = None if chosen is None or chosen.duration is None else TURN_RESIDUAL_UNIT
     if not significant:
         return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, layers, noise_sd, unit)
-    name, share = correlate(_explanations(hand), layers / noise_sd)
+    name, share = correlate(_explanations(hand), layers, noise_sd)
     if chosen is not None and chosen.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
     heldout = evidence.heldout_residuals(used)[first]
