@@ -350,7 +350,7 @@ def _onset_of(
         for k, label in enumerate(effect.param_names()):
             units[label] = effect.unit_of(k)
     before, after = (dict(zip(names, state[group.parameters].tolist())) for state in states)
-    sensor_axes = {}
+    sensor_axes: dict[str, tuple[str, ...]] = {}
     if group.role is not None:
         # Of each sensor of the group three biases, or the nine elements of a matrix row by row.
         per_row = 1 if group.role is Role.OFFSET else 3
