@@ -360,7 +360,7 @@ def _onset_of(
         squares = squares.reshape(-1, 3, per_row).sum(axis=2)
         sensors = dict.fromkeys(name.partition('.')[0] for name in names)
         for sensor, own in zip(sensors, squares, strict=True):
-            sensor_axes[sensor] = largest_axes(own, most=squares.max())
+            sensor_axes[sensor] = largest_axes(own)
     return Onset(
         moment,
         moment_sd,

@@ -422,16 +422,13 @@ ABOVE_NOISE = 3.0
 """Least excess of this axis over noise, standard deviations."""
 
 
-def largest_axes(
-    squares: np.ndarray, least: float = LEAST_OF_AXIS, *, most: float | None = None
-) -> tuple[str, ...]:
+def largest_axes(squares: np.ndarray, least: float = LEAST_OF_AXIS) -> tuple[str, ...]:
     """
-    Return the axes whose squares exceed the share `least` of `most`, the largest first.
+    Return the axes whose squares.
 
-    Squares have the shape (3,); the default of `most` is the largest of them.
+    Shape (3,), exceed the share `least` of the largest, the largest first.
     """
-    limit = least * (squares.max() if most is None else most)
-    return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > limit)
+    return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > least * squares.max())
 
 
 @dataclass(frozen=True, eq=False)
