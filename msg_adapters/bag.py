@@ -14,7 +14,14 @@ from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.compression import LARGEST_CHUNK, decompress
-from msg_adapters.csv_log import SUFFIXES, CsvBag, is_log_folder, is_text_log, require_no_rows
+from msg_adapters.csv_log import (
+    SUFFIXES,
+    CsvBag,
+    LogOptions,
+    is_log_folder,
+    is_text_log,
+    require_no_rows,
+)
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard, rosbags_missing
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
@@ -146,8 +153,7 @@ def open_recording(
     want_joints: bool | str = True,
     want_temperature: bool | str = True,
     frame_id: str | None = None,
-    raw: Sequence[str] = (),
-    where: Sequence[str] = (),
+    log: LogOptions = LogOptions(),
 ) -> 'Recording':
     """
     Open a bag and choose its topics.
@@ -169,10 +175,8 @@ def open_recording(
         topic is ambiguous.
     frame_id : str, optional
         Frame of the Imu messages that are read; needed for a topic with messages of several frames.
-    raw : sequence of str
-        Quantities of a text log ('force', 'rate') that are not converted to SI.
-    where : sequence of str
-        Conditions on the rows of a text log, see `msg_adapters.csv_log.read_csv`.
+    log : LogOptions
+        Columns, rows and units of a text log.
 
     Returns
     -------
@@ -185,7 +189,7 @@ def open_recording(
 
     """
     path = Path(path)
-    source = _open_source(path, tuple(raw), tuple(where))
+    source = _open_source(path, log)
     try:
         topics = _listed(source)
         imu = _choose(path, topics, IMU_TYPE, imu_topic, required=True)
@@ -382,7 +386,7 @@ def _block(parts, decoders):
     )
 
 
-def _open_source(path, raw=(), where=()):
+def _open_source(path, log=LogOptions()):
     if not path.exists():
         raise InputError(
             f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file,'
@@ -395,8 +399,8 @@ def _open_source(path, raw=(), where=()):
         )
     try:
         if is_text_log(path) or is_log_folder(path):
-            return CsvBag(path, raw, where)
-        require_no_rows(where, path)
+            return CsvBag(path, log)
+        require_no_rows(log, path)
         if path.suffix == '.bag':
             return Ros1File(path)
         by_ros = RosReader.needed(path) and RosReader.installed()
@@ -412,15 +416,13 @@ def _open_source(path, raw=(), where=()):
         ) from error
 
 
-def list_topics(
-    path: str | PathLike[str], where: Sequence[str] = (), raw: Sequence[str] = ()
-) -> tuple[Topic, ...]:
+def list_topics(path: str | PathLike[str], log: LogOptions = LogOptions()) -> tuple[Topic, ...]:
     """
     Return the topics of a recording in order of name.
 
-    `where`, `raw` and errors: `open_recording`.
+    `log` and errors: `open_recording`.
     """
-    source = _open_source(Path(path), tuple(raw), where=tuple(where))
+    source = _open_source(Path(path), log)
     try:
         return _listed(source)
     finally:

@@ -3,7 +3,7 @@ A copy of a recording with an additional corrected Imu topic; all other data are
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
 
@@ -13,6 +13,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.preprocessing.sensor_join import OtherSensor
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
+from msg_adapters.csv_log import LogOptions
 from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
@@ -31,8 +32,7 @@ def copy_with_corrected(
     mat_ts: np.ndarray | None = None,
     late_ns: int = 0,
     source_frame_id: str | None = None,
-    raw: Sequence[str] = (),
-    where: Sequence[str] = (),
+    log: LogOptions = LogOptions(),
     check: Callable[[], None] | None = None,
     keep: Callable[[np.ndarray], np.ndarray] | None = None,
     other: OtherSensor | None = None,
@@ -66,7 +66,7 @@ def copy_with_corrected(
         Subtracted from the stamps of the corrected messages.
     source_frame_id : str, optional
         Frame of the messages that are corrected; see `msg_adapters.bag.open_recording`.
-    raw, where : sequence of str
+    log : LogOptions
         As for `msg_adapters.bag.open_recording`.
     check : callable, optional
         Called after the last block; an error that it raises removes the bag.
@@ -89,7 +89,7 @@ def copy_with_corrected(
 
     """
     with open_recording(
-        source, imu_topic, want_joints=False, want_temperature=False, raw=raw, where=where
+        source, imu_topic, want_joints=False, want_temperature=False, log=log
     ) as recording:
         bag = recording.source
         _check(recording, corrected_topic)

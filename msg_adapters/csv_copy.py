@@ -26,7 +26,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
     path : path-like
         File to make; it appears when it is complete.
     log : CsvLog
-        The log that was corrected, in one file.
+        The log that was corrected; of one log per sensor the rows are those of the slower one.
     corrected : ImuSamples
         One for each sample of the log, in SI.
 
@@ -52,7 +52,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
 
     # The header states the unit of each column that was read.
     names = list(text.names)
-    for columns in log.columns:
+    for columns in text.columns:
         if columns.quantity == 'time' and len(columns.names) == 2:
             continue  # seconds and nanoseconds
         for place in text.places.get(columns.quantity, ()):
@@ -70,6 +70,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
     comma = text.decimal_comma and delimiter != ','
     for k, row in enumerate(text.row_of_sample.tolist()):
         cells = split_cells(text.lines[row], text.delimiter, text.path)
+        cells += [''] * (len(names) - len(cells))
         for quantity, values in readings.items():
             for place, value in zip(text.places[quantity], values[k].tolist(), strict=True):
                 cells[place] = _number(value, comma)

@@ -160,9 +160,21 @@ OWN_RATE_BAND = 1.25
 TRIED_PERIODS = (0.01, 0.04, 0.0025, 6e-4)
 """Periods with which the turns of gravity are searched, s."""
 REMEDY = (
-    'convert it with the columns stated: time=NAME:UNIT force=X,Y,Z:UNIT rate=X,Y,Z:UNIT'
-    ' [temperature=NAME:C] [joint.JOINT=NAME:UNIT]'
+    'state the columns: time=NAME:UNIT force=X,Y,Z:UNIT rate=X,Y,Z:UNIT [temperature=NAME:C]'
+    ' [joint.JOINT=NAME:UNIT]'
 )
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """What the user states about a text log; see `read_csv`."""
+
+    columns: tuple[str, ...] = ()
+    """Assignments QUANTITY=NAMES:UNIT that replace the guess."""
+    where: tuple[str, ...] = ()
+    """Conditions COLUMN=VALUE on the rows that are read."""
+    raw: tuple[str, ...] = ()
+    """Quantities that are read without conversion to SI: 'force', 'rate'."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +203,9 @@ class LogText:
 
     path: Path
     names: tuple[str, ...]
-    """Names of all columns, from the header."""
+    """Names of all columns, from the header; the last ones may have no cells in the rows."""
+    columns: tuple[Columns, ...]
+    """Columns that were read, without those of joints."""
     places: dict[str, tuple[int, ...]]
     """Quantity -> indexes of its columns."""
     lines: tuple[str, ...]
@@ -227,7 +241,7 @@ class CsvLog:
     joined: JoinedSensors | None = None
     """How accelerometer and gyroscope were joined, where they have stamps of their own."""
     text: LogText | None = None
-    """The rows, of a log in one file."""
+    """The rows; of two logs those of the slower sensor."""
 
 
 # Readings that are not finite are counted where samples are used.
@@ -270,10 +284,7 @@ def read_csv(
     stated = {each.quantity for each in found}
     guessed = _guess(table, stated)
     found += [each for each in guessed if (each.quantity, each.joint) not in given]
-    found = [
-        replace(each, unit=RAW_UNIT, origin='given') if each.quantity in raw else each
-        for each in found
-    ]
+    found = [_as_raw(each) if each.quantity in raw else each for each in found]
     by_quantity = {each.quantity: each for each in found}
     if lacking := _lacking(table, by_quantity, stated=bool(columns)):
         raise InputError(
@@ -313,13 +324,22 @@ def read_csv(
     )
 
 
+def _as_raw(columns):
+    """Return Columns that are read without conversion, by the unit of an option."""
+    if columns.unit is not None and columns.origin == 'given':
+        raise InputError(
+            f'the unit of {columns.quantity} must be stated once, got {columns.unit} for its'
+            ' columns and the unit of the readings; omit one of them',
+            key='columns',
+            code='unit_twice',
+        )
+    return replace(columns, unit=RAW_UNIT, origin='given')
+
+
 def _text_of(table, used, stamp_ns, joined):
     """Return the `LogText` of a table; each sample is one of its rows."""
-    places = {
-        each.quantity: tuple(table.column(name) for name in each.names)
-        for each in used
-        if each.quantity != 'joint'
-    }
+    used = tuple(each for each in used if each.quantity != 'joint')
+    places = {each.quantity: tuple(map(table.column, each.names)) for each in used}
     rows = np.arange(len(stamp_ns))
     if joined is not None:
         # Samples have the stamps of the slower sensor: find its first row with each stamp.
@@ -331,6 +351,7 @@ def _text_of(table, used, stamp_ns, joined):
     return LogText(
         table.path,
         tuple(table.names),
+        used,
         places,
         tuple(table.lines),
         rows,
@@ -481,7 +502,7 @@ def read_logs(
             found[log.columns.quantity].append(log)
     for quantity, logs in found.items():
         if len(logs) != 1:
-            names = ', '.join(log.path.name for log in logs)
+            names = ', '.join(log.table.path.name for log in logs)
             if not logs:
                 names = f'none among {shortened(", ".join(path.name for path in files), 200)}'
             raise InputError(
@@ -490,18 +511,34 @@ def read_logs(
                 code='several_logs',
             )
     force, rate = found['force'][0], found['rate'][0]
-    readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.path)
-    used = (force.time, readings.columns[0], rate.time, readings.columns[1])
+    readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.table.path)
+    of_force, of_rate = readings.columns
     return CsvLog(
-        used,
+        (force.time, of_force, rate.time, of_rate),
         readings.imu,
         joints=None,
         temperature=None,
         unused=(),
-        n_dropped=force.n_dropped + rate.n_dropped,
+        n_dropped=force.table.n_dropped + rate.table.n_dropped,
         n_overflows=force.counted.n_overflows + rate.counted.n_overflows,
         counter_size_ns=max(force.counted.size_ns, rate.counted.size_ns),
         joined=readings.joined,
+        text=_text_of_two(force, rate, readings.joined),
+    )
+
+
+def _text_of_two(force, rate, joined):
+    """Return the `LogText` of two logs: the rows of the slower one, with columns of the other."""
+    slow, other = force, rate
+    if joined.slower == 'gyroscope':
+        slow, other = rate, force
+    text = _text_of(slow.table, (slow.time, slow.columns), slow.counted.stamp_ns, joined)
+    sensor, width = SENSOR_OF[other.columns.quantity], len(text.names)
+    return replace(
+        text,
+        names=(*text.names, *(f'{sensor}_{axis}' for axis in 'xyz')),
+        columns=(*text.columns, other.columns),
+        places={**text.places, other.columns.quantity: tuple(range(width, width + 3))},
     )
 
 
@@ -509,13 +546,12 @@ def read_logs(
 class _SensorLog:
     """A log of one sensor."""
 
-    path: Path
+    table: '_Table'
     time: Columns
     columns: Columns
     """Of force, with its unit, or of rate."""
     stream: SensorStream
     """Force in SI; rates as in the log."""
-    n_dropped: int
     counted: CounterStamps
 
 
@@ -534,7 +570,7 @@ def _sensor_log(path, where):
         columns = _with_unit(columns, lambda: _force_unit(values), path)
         values = values * _size_of(columns)
     stream = finite_stream(counted.stamp_ns, values)
-    return _SensorLog(path, time, columns, stream, table.n_dropped, counted)
+    return _SensorLog(table, time, columns, stream, counted)
 
 
 GAP_PERIODS = 5
@@ -1393,31 +1429,32 @@ def is_log_folder(path: str | PathLike[str]) -> bool:
     return any(map(is_text_log, inner)) and not of_bag
 
 
-def require_no_rows(where: Sequence[str], path: str | PathLike[str]) -> None:
-    """Refuse conditions on rows for a recording without rows."""
-    if where:
-        raise InputError(
-            f'conditions select rows of a text log ({", ".join(SUFFIXES)}), got'
-            f' {shortened(" ".join(where), 100)} for {path}; omit them',
-            code='where',
-        )
+def require_no_rows(options: LogOptions, path: str | PathLike[str]) -> None:
+    """Refuse columns and conditions on rows for a recording that is no text log."""
+    for code, stated in (('where', options.where), ('columns', options.columns)):
+        if stated:
+            raise InputError(
+                f'columns and rows are those of a text log ({", ".join(SUFFIXES)}), got'
+                f' {shortened(" ".join(stated), 100)} for {path}; omit them',
+                code=code,
+            )
 
 
-def read_directly(path: Path, raw: Sequence[str] = (), where: Sequence[str] = ()) -> CsvLog:
+def read_directly(path: Path, options: LogOptions) -> CsvLog:
     """
     Read a text log or a folder of them without `convert`, and report how it is read.
 
     See `read_csv` and `read_logs`.
     """
     if not path.is_dir():
-        log = read_csv(path, where=where, raw=raw)
-    elif raw:
+        log = read_csv(path, options.columns, options.where, raw=options.raw)
+    elif options.raw:
         raise InputError(
             f'units are stated for one text log, got the folder {path}; convert it first',
             code='several_logs',
         )
     else:
-        log = read_logs([path], where=where)
+        log = read_logs([path], options.columns, options.where)
     name = name_of_path(path)
     remark(f'{name} is read as {"; ".join(map(str, log.columns))}')
     if log.joined is not None:
@@ -1444,12 +1481,12 @@ class CsvBag(Rosbag2):
 
     """
 
-    def __init__(self, path: Path, raw: tuple[str, ...] = (), where: tuple[str, ...] = ()):
+    def __init__(self, path: Path, options: LogOptions):
         logs = filter(is_text_log, path.iterdir()) if path.is_dir() else [path]
         status = [log.stat() for log in logs]
         modified_ns = max(each.st_mtime_ns for each in status)
         size = sum(each.st_size for each in status)
-        self.converted = _converted(path, modified_ns, size, raw, where)
+        self.converted = _converted(path, modified_ns, size, options)
         super().__init__(self.converted.bag)
         self.path = path
 
@@ -1459,18 +1496,18 @@ class ConvertedLog:
     The temporary bag of a text log; its folder is removed with the last reference, or at exit.
     """
 
-    def __init__(self, path: Path, raw: tuple[str, ...] = (), where: tuple[str, ...] = ()):
-        log, folder = read_directly(path, raw, where), mkdtemp(prefix='imu_calibration_')
+    def __init__(self, path: Path, options: LogOptions):
+        log, folder = read_directly(path, options), mkdtemp(prefix='imu_calibration_')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.bag = Path(folder, 'log')
         write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')
 
 
 @lru_cache(maxsize=1)
-def _converted(path, _modified_ns, _size, raw, where):
+def _converted(path, _modified_ns, _size, options):
     """
     Return the ConvertedLog.
 
     A verb opens a recording several times, and converts an unchanged file once.
     """
-    return ConvertedLog(path, raw, where)
+    return ConvertedLog(path, options)

@@ -38,7 +38,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.show import warn
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, visible_findings
-    from imu_calibration.use_cases.choices import raw_columns, readings_of
+    from imu_calibration.use_cases.choices import log_options, readings_of
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of, sources_without
 
     if len(options.imu_topic) != 2:
@@ -54,10 +54,9 @@ def run(options: Options) -> VerbResult:
         )
     choices = options.choices()
     readings = readings_of(choices)
-    raw = raw_columns(readings, choices)
+    log = log_options(readings, choices)
     topics = [
-        Topics(imu=topic, frame=frame, raw=raw, where=tuple(options.where))
-        for topic, frame in zip(options.imu_topic, frames)
+        Topics(imu=topic, frame=frame, log=log) for topic, frame in zip(options.imu_topic, frames)
     ]
     if len({(topic.lstrip('/'), frame) for topic, frame in zip(options.imu_topic, frames)}) == 1:
         raise InputError(

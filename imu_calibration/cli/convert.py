@@ -30,18 +30,6 @@ def add_arguments(parser: OneLineParser) -> None:
         ),
     )
     parser.common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
-    parser.common(
-        '--columns',
-        metavar='QUANTITY=NAMES:UNIT',
-        nargs='+',
-        default=[],
-        help=(
-            'replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C'
-            ' joint.JOINT=NAME:deg; a name may be a column number, a leading minus reverses the'
-            ' sign; units: s ms us ns, m/s^2 g mg counts:16384/g, rad/s deg/s mdeg/s'
-            ' mrad/s urad/s counts:16.4/(deg/s), rad deg'
-        ),
-    )
     parser.add_rows()
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 

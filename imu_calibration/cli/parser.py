@@ -159,7 +159,18 @@ class OneLineParser(argparse.ArgumentParser):
         self.common('--exclude', metavar='A:B,...', help=f'unused times, {text}')
 
     def add_rows(self) -> None:
-        """Add the option of the rows of a text log."""
+        """Add the options of columns and rows of a text log."""
+        self.common(
+            '--columns',
+            metavar='QUANTITY=NAMES:UNIT',
+            nargs='+',
+            default=[],
+            help=(
+                'of a text log: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C'
+                ' joint.JOINT=NAME:deg; a name may be a column number, a leading minus reverses'
+                ' the sign'
+            ),
+        )
         self.common(
             '--where',
             metavar='COLUMN=VALUE',

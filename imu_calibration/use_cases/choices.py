@@ -43,7 +43,7 @@ from imu_calibration.use_cases.recordings import (
     table_of,
 )
 from imu_calibration.use_cases.resources import config_file
-from msg_adapters.csv_log import SENSOR_OF
+from msg_adapters.csv_log import SENSOR_OF, LogOptions
 
 
 class Choices(TypedDict, total=False):
@@ -64,6 +64,8 @@ class Choices(TypedDict, total=False):
     Times that are not used, 'A:B,...' in s since the first stamp of the IMU; with several
     recordings 'NAME=A:B,...'.
     """
+    columns: Sequence[str]
+    """Columns of a text log, 'QUANTITY=NAMES:UNIT', where they are not those of the guess."""
     where: Sequence[str]
     """Conditions 'COLUMN=VALUE': only these rows of a text log are read."""
     accelerometer_model: str | None
@@ -192,9 +194,8 @@ def topics_of(choices: Mapping[str, Any]) -> Topics:
         choices.get('joint_topic'),
         choices.get('temperature_topic'),
         choices.get('frame_id'),
-        raw_columns(readings_of(choices), choices),
         choices.get('gyroscope_topic'),
-        tuple(choices.get('where') or ()),
+        log_options(readings_of(choices), choices),
     )
 
 
@@ -309,20 +310,20 @@ def _stated(choices):
     return {name: choices.get(name) for name in (*STATED_KEYS, AXES_KEY)}
 
 
-def raw_columns(readings: RawReadings | None, choices: Mapping[str, Any]) -> tuple[str, ...]:
+def log_options(readings: RawReadings | None, choices: Mapping[str, Any]) -> LogOptions:
     """
-    Return the quantities of a text log that are read without conversion.
+    Return the columns and rows of a text log that were chosen.
 
-    These are the ones with a stated unit: the description of the readings converts them.
+    Quantities with a stated unit are read without conversion: the description of the readings
+    converts them.
     """
-    if readings is None:
-        return ()
-    quantities = []
+    raw = []
     for quantity, sensor in SENSOR_OF.items():
         stated = choices.get(UNIT_KEYS[sensor])
-        if stated or not getattr(readings, sensor).is_si:
-            quantities.append(quantity)
-    return tuple(quantities)
+        if readings is not None and (stated or not getattr(readings, sensor).is_si):
+            raw.append(quantity)
+    columns, where = choices.get('columns') or (), choices.get('where') or ()
+    return LogOptions(tuple(columns), tuple(where), tuple(raw))
 
 
 MAX_SHOWN_COLUMNS = 3

@@ -29,7 +29,7 @@ from imu_calibration.preprocessing.recording_evidence import EvidenceGatherer
 from imu_calibration.preprocessing.scan import FrozenSearch
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from imu_calibration.preprocessing.value_checks import rate_unit, refuse_units
-from imu_calibration.use_cases.choices import noise_of, raw_columns, readings_for
+from imu_calibration.use_cases.choices import log_options, noise_of, readings_for
 from imu_calibration.use_cases.recordings import (
     Topics,
     existing,
@@ -37,7 +37,12 @@ from imu_calibration.use_cases.recordings import (
     read_split,
     temperatures,
 )
-from msg_adapters.csv_log import has_corrected_readings, is_text_log, read_directly
+from msg_adapters.csv_log import (
+    has_corrected_readings,
+    is_log_folder,
+    is_text_log,
+    read_directly,
+)
 
 CORRECTED_TOPIC = '/imu/data_corrected'
 UNIT_READINGS = 20000
@@ -115,6 +120,7 @@ def compensate_recording(
     accelerometer_unit: str | None = None,
     gyroscope_unit: str | None = None,
     increments: float | None = None,
+    columns: Sequence[str] = (),
     where: Sequence[str] = (),
     exclude: str | None = None,
 ) -> Compensated:
@@ -127,8 +133,8 @@ def compensate_recording(
         A bag, or samples in memory (a block may bring temperatures).
     calibration : Calibration or path-like
     output : path-like, optional
-        A rosbag2 folder to make: all topics of the recording, and the corrected one. For a text log
-        also a text log to make (.csv): its columns, with corrected readings. Without it the
+        A rosbag2 folder to make: all topics of the recording, and the corrected one. For text logs
+        also a text log to make (.csv): their columns, with corrected readings. Without it the
         corrected samples are returned.
     corrected_topic : str
         Name of the topic to add.
@@ -150,8 +156,8 @@ def compensate_recording(
         frame_id of the Imu messages; required if the topic has messages of several.
     nominal, accelerometer_unit, gyroscope_unit, increments : optional
         Units of these readings where they differ from those of the calibration, see `Choices`.
-    where : sequence of str
-        Conditions 'COLUMN=VALUE': only these rows of a text log are read.
+    columns, where : sequence of str
+        Columns and rows of a text log, see `Choices`.
     exclude : str, optional
         Times without corrected readings, 'A:B,...' in s since the first stamp of the IMU.
 
@@ -185,10 +191,8 @@ def compensate_recording(
             f'the output {output} must not exist yet; choose another name or remove it',
             code='exists_already',
         )
-    raw = raw_columns(readings, units)
-    topics = Topics(
-        imu_topic, None, temperature_topic, frame_id, raw, gyroscope_topic, tuple(where)
-    )
+    log = log_options(readings, units | {'columns': columns, 'where': where})
+    topics = Topics(imu_topic, None, temperature_topic, frame_id, gyroscope_topic, log)
     if output is not None and is_text_log(output):
         return _into_text_log(
             recording,
@@ -278,8 +282,7 @@ def compensate_recording(
             mat_ts=None if transfer is None else transfer.mat_ts,
             late_ns=late,
             source_frame_id=topics.frame,
-            raw=raw,
-            where=topics.where,
+            log=log,
             check=check,
             keep=keep if exclude or other is not None else None,
             other=other,
@@ -291,7 +294,7 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
     """Correct a text log into another one with the same columns."""
     from msg_adapters.csv_copy import write_corrected_log
 
-    if not is_text_log(recording):
+    if not is_text_log(recording) and not is_log_folder(recording):
         raise InputError(
             f'a text log is made from a text log, got the recording {recording} and the output'
             f' {output}; name a folder for a bag',
@@ -304,7 +307,7 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
             code='output_kind',
         )
     _refuse_corrected_log(recording)
-    log = read_directly(existing(recording), topics.raw, topics.where)
+    log = read_directly(existing(recording), topics.log)
     block = SampleBlock(log.imu, None, log.temperature)
     found = _in_memory(
         block, calibration, transfer, late=0, used=used, readings=readings, mask=mask

@@ -18,7 +18,7 @@ from imu_calibration.document.exports.loss import (
     recorded_motion,
 )
 from imu_calibration.preprocessing.window_finder import session_truth
-from imu_calibration.use_cases.choices import raw_columns
+from imu_calibration.use_cases.choices import log_options
 from imu_calibration.use_cases.recordings import (
     Stand,
     Topics,
@@ -88,7 +88,8 @@ def export_calibration(
     figures = None if noise is None else files.read_noise(noise)
     motion = None
     if bag is not None:
-        topics = topics._replace(raw=raw_columns(known.readings, {}))
+        raw = log_options(known.readings, {}).raw
+        topics = topics._replace(log=replace(topics.log, raw=raw))
         motion = _motion(known, bag, stand, topics=topics, exclude=exclude)
     found = export(known, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
     if output is not None:

@@ -122,7 +122,7 @@ def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     if topics.imu is not None or topics.gyroscope is not None:
         names = [topics.imu]
     else:
-        listed = list_topics(bag, topics.where, topics.raw)
+        listed = list_topics(bag, topics.log)
         names = [topic.name for topic in listed if topic.type == IMU_TYPE]
     _limit_imus(bag, len(names))
     found = []

@@ -1,7 +1,7 @@
 """From a recording at rest to the figures of its noise."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from os import PathLike
 
@@ -20,7 +20,7 @@ from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import visible_findings
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import raw_columns, readings_of, require_same_inputs
+from imu_calibration.use_cases.choices import log_options, readings_of, require_same_inputs
 from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of, sources_without
 
 
@@ -106,6 +106,7 @@ def identify_recording(
     increments: float | None = None,
     horizon: float = HORIZON,
     exclude: str | None = None,
+    columns: Sequence[str] = (),
     where: Sequence[str] = (),
 ) -> IdentifiedNoise:
     """
@@ -126,8 +127,8 @@ def identify_recording(
         Averaging time at which a random walk approximates the slow noise, s.
     exclude : str, optional
         Times that are not used, 'A:B,...' in s since the first stamp of the IMU.
-    where : sequence of str
-        Conditions 'COLUMN=VALUE': only these rows of a text log are read.
+    columns, where : sequence of str
+        Columns and rows of a text log, see `Choices`.
 
     Raises
     ------
@@ -142,13 +143,12 @@ def identify_recording(
         'increments': increments,
     }
     readings = readings_of(units)
-    raw = raw_columns(readings, units)
-    topics = Topics(
-        imu_topic, None, temperature_topic, frame_id, raw, gyroscope_topic, tuple(where)
-    )
+    log = log_options(readings, units | {'columns': columns, 'where': where})
+    topics = Topics(imu_topic, None, temperature_topic, frame_id, gyroscope_topic, log)
     (source,) = sources_without([source_of(recording, topics)], [recording], exclude)
     result = identify_noise(source, readings)
     chosen = topics.chosen() | {'gyroscope_topic': gyroscope_topic, 'exclude': exclude}
+    chosen |= asdict(chosen.pop('log'))
     options = {name: value for name, value in chosen.items() if value}
     if readings is not None:
         options['readings'] = readings.to_mapping()

@@ -38,6 +38,7 @@ from imu_calibration.preprocessing.sensor_join import (
     join_sensors,
 )
 from msg_adapters.bag import Recording, description_in, frame_of, open_recording, static_transforms
+from msg_adapters.csv_log import LogOptions
 from msg_adapters.storage import read_ahead
 
 Source = Callable[[], Iterator[SampleBlock]]
@@ -55,12 +56,10 @@ class Topics(NamedTuple):
     """sensor_msgs/Temperature, default /imu/temperature."""
     frame: str | None = None
     """frame_id of the Imu messages; None: that of all."""
-    raw: tuple[str, ...] = ()
-    """Quantities of a text log that are read without conversion to SI: 'force', 'rate'."""
     gyroscope: str | None = None
     """sensor_msgs/Imu topic of the rates, where they have one of their own; None: as `imu`."""
-    where: tuple[str, ...] = ()
-    """Conditions COLUMN=VALUE on the rows of a text log."""
+    log: LogOptions = LogOptions()
+    """Columns, rows and units of a text log."""
 
     def chosen(self) -> dict[str, Any]:
         """Return them as arguments of `msg_adapters.bag.open_recording`."""
@@ -69,8 +68,7 @@ class Topics(NamedTuple):
             'joint_topic': self.joints,
             'temperature_topic': self.temperature,
             'frame_id': self.frame,
-            'raw': self.raw,
-            'where': self.where,
+            'log': self.log,
         }
 
 

@@ -12,7 +12,7 @@ from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
-from msg_adapters.csv_log import read_csv
+from msg_adapters.csv_log import read_csv, read_logs
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration
@@ -118,6 +118,52 @@ def test_a_text_log_gives_a_text_log(name, calibration, tmp_path, monkeypatch, c
     np.testing.assert_allclose(read.imu.rate_s, expected.rate_s, atol=1e-8)
     assert np.abs(read.imu.force_s - read_csv(log).imu.force_s).max() > 0.01
     assert main([*verb, '--output', 'bag']) == code
+
+
+def test_columns_by_number_give_the_same_columns(calibration, tmp_path, monkeypatch):
+    """A log without a header, with a date and a time of day."""
+    monkeypatch.chdir(tmp_path)
+    time, force, rate = readings()
+    stamps = clock(time)
+    numbers = np.column_stack([force / STANDARD_GRAVITY * 1e3, rate / DEG]).tolist()
+    rows = [f'03/04/2025,{t},' + ','.join(map(str, v)) for t, v in zip(stamps, numbers)]
+    (tmp_path / 'log.csv').write_text('logger on\n' + '\n'.join(rows))
+    stated = ['--columns', 'time=1,2', 'force=3,4,5:mg', 'rate=6,7,8:deg/s']
+    verb = ['compensate', 'log.csv', '--calibration', 'calibration.yaml', '--output', 'out.csv']
+    assert main([*verb, *stated]) == 0
+    expected = compensate_recording(read_csv('log.csv', stated[1:]).imu, calibration).imu
+    written = [line.split(',') for line in (tmp_path / 'out.csv').read_text().splitlines()[1:]]
+    assert [row[1] for row in written] == stamps
+    np.testing.assert_allclose(np.array(written)[:, 2:5].astype(float), expected.force_s, atol=1e-7)
+    np.testing.assert_allclose(np.array(written)[:, 5:8].astype(float), expected.rate_s, atol=1e-8)
+    # The unit of the force is stated once; a bag has no columns.
+    with refused(InputError, 'unit_twice', 'mg'):
+        compensate_recording(
+            'log.csv', calibration, columns=stated[1:], accelerometer_unit='g', output='other.csv'
+        )
+    write_session('bag', read_csv('log.csv', stated[1:]).imu)
+    with refused(InputError, 'columns', 'time=1,2'):
+        compensate_recording('bag', calibration, columns=stated[1:])
+
+
+@pytest.mark.parametrize('fast', ['accelerometer', 'gyroscope'])
+def test_a_folder_of_logs_gives_one_log(fast, calibration, tmp_path, monkeypatch):
+    """The rows are those of the slower sensor; the output may be in the folder."""
+    monkeypatch.chdir(tmp_path)
+    time, force, rate = readings()
+    for name, values in (('Accelerometer', force), ('Gyroscope', rate)):
+        step = 1 if name.lower() == fast else 2
+        columns = np.column_stack([1e3 * time, values[:, ::-1]])[::step]
+        np.savetxt(f'{name}.csv', columns, delimiter=',', header='t_ms,z,y,x', comments='')
+    expected = compensate_recording(read_logs(['.']).imu, calibration).imu
+    verb = ['compensate', '.', '--calibration', 'calibration.yaml', '--output', 'corrected.csv']
+    assert main(verb) == 0
+    read = read_csv('corrected.csv').imu
+    assert len(read) == len(time) // 2
+    np.testing.assert_array_equal(np.diff(read.stamp_ns), np.diff(expected.stamp_ns))
+    np.testing.assert_allclose(read.force_s, expected.force_s, atol=1e-7)
+    np.testing.assert_allclose(read.rate_s, expected.rate_s, atol=1e-8)
+    assert len(read_logs(['.']).imu) == len(read)
 
 
 def test_readings_in_the_unit_of_the_calibration_become_si(tmp_path, monkeypatch):

@@ -288,11 +288,13 @@ def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_us
     monkeypatch.setattr(
         csv_log,
         'read_csv',
-        lambda path, **named: reads.append(path) or read_csv(path, **named),
+        lambda path, *given, **named: reads.append(path) or read_csv(path, *given, **named),
     )
     imu_calibration.calibrate(path, gravity=STANDARD_GRAVITY)
     assert len(reads) == 1
-    bag = csv_log._converted(path, path.stat().st_mtime_ns, path.stat().st_size, (), ()).bag
+    bag = csv_log._converted(
+        path, path.stat().st_mtime_ns, path.stat().st_size, csv_log.LogOptions()
+    ).bag
     assert bag.exists()
     csv_log._converted.cache_clear()
     assert not bag.exists()

@@ -13,6 +13,7 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.choices import inputs_of
 from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import list_topics, open_recording
+from msg_adapters.csv_log import LogOptions
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration
@@ -112,4 +113,4 @@ def test_compensate_refuses_two_imus_of_a_topic(log):
 def test_a_bag_has_no_rows(log):
     write_session('bag', still(1))
     with refused(InputError, 'where', 'I=1'):
-        list_topics('bag', where=['I=1'])
+        list_topics('bag', LogOptions(where=('I=1',)))

@@ -15,6 +15,7 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings, check_reco
 from imu_calibration.use_cases.compensate import compensate_recording
 from imu_calibration.use_cases.inspect import imu_topics_of
 from imu_calibration.use_cases.recordings import Topics
+from msg_adapters.csv_log import LogOptions
 
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 
@@ -114,7 +115,7 @@ def test_a_log_of_increments_names_the_option(tmp_path, session, header):
     with pytest.raises(InputError) as caught:
         calibrate_recordings(log, gravity=GRAVITY)
     assert (caught.value.code, caught.value.key) == ('increments', 'increments')
-    assert len(imu_topics_of(log, Topics(raw=('force', 'rate')))) == 1
+    assert len(imu_topics_of(log, Topics(log=LogOptions(raw=('force', 'rate'))))) == 1
     found = calibrate_recordings(log, gravity=GRAVITY, increments=per_second).calibration
     np.testing.assert_allclose(
         parameters(found, 'accelerometer', 'bias'), unpack(values)[0], atol=5e-3
