@@ -5,12 +5,15 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic
 
 from imu_calibration.calibration.from_solution import Estimate, ModelExtension, document
+from imu_calibration.calibration.held_out_data import PlainFit
 from imu_calibration.calibration.plain_fit import (
-    PlainFit,
+    better_plain_fits,
     changes_with,
     plain_entries,
+    with_fits,
     with_plain_fits,
 )
+from imu_calibration.calibration.proof import prove
 from imu_calibration.calibration.result import CalibrationResult, Observations
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.effects.sensor_model import SensorModel
@@ -80,10 +83,10 @@ def conclude(
     proof: Proof = {}
     if is_judged:
         held_out = data.held_out(solution)
-        fits = held_out.better_plain_fits(
-            under_test={*changes.unexplained, *under_test}, as_asked=options.as_asked
+        fits = better_plain_fits(
+            held_out, under_test={*changes.unexplained, *under_test}, as_asked=options.as_asked
         )
-        proof = held_out.proof(fits)
+        proof = prove(with_fits(held_out, fits))
     applied = with_plain_fits(solution, fits)
 
     # Parameters that are not determined, each with the motion or knowledge that determines it.

@@ -1,21 +1,20 @@
 """Poses and turns of a calibration by hand, with the errors that they have before and after."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from imu_calibration.calibration.advice import missing_motion
-from imu_calibration.calibration.hand_proof import (
+from imu_calibration.calibration.hand_recording import HandRecording
+from imu_calibration.calibration.held_out_poses import (
+    TURNS_LEAST,
+    HeldOutPoses,
     folds_by_hand,
-    prove_by_hand,
     uncorrected_by_hand,
     values_without,
 )
-from imu_calibration.calibration.hand_recording import HandRecording
-from imu_calibration.calibration.plain_fit import PlainFit
-from imu_calibration.calibration.plain_fit_by_hand import better_plain_fits_by_hand
 from imu_calibration.calibration.result import (
     GRAVITY_SD,
     CalibrationResult,
@@ -23,14 +22,12 @@ from imu_calibration.calibration.result import (
     Needs,
     WindowErrors,
 )
-from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
-from imu_calibration.references.gravity.equations import TurnData
 from imu_calibration.references.gravity.hand_calibration import (
     GAUGE,
     HandCalibration,
@@ -130,10 +127,11 @@ class PoseObservations:
         """Return the solution, which contains the uncertainty of gravity already."""
         return solution
 
-    def held_out(self, solution: HandCalibration) -> 'HeldOutTurns':
+    def held_out(self, solution: HandCalibration) -> HeldOutPoses:
         """Return the poses and turns to hold out in turn."""
         turns = solution.used_turns if self.data.turns else ()
-        return HeldOutTurns(solution, turns)
+        folds = folds_by_hand(solution.poses)
+        return HeldOutPoses.of(solution, turns, folds, least_turns=TURNS_LEAST)
 
     def uncorrected(self, solution: HandCalibration) -> Uncorrected:
         """Return the errors that compensation leaves uncorrected."""
@@ -226,28 +224,6 @@ class PoseObservations:
                 'gravity': f'gravity {known} to {relative * result.gravity:.2g} m/s²',
             },
         )
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOutTurns:
-    """Poses and turns that are held out in turn."""
-
-    solution: HandCalibration
-    """The solution of all poses."""
-    turns: Sequence[TurnData]
-    """Turns of the estimate."""
-
-    def better_plain_fits(
-        self, *, under_test: Collection[str], as_asked: bool
-    ) -> tuple[PlainFit, ...]:
-        """Return the plain fits to apply (`plain_fit_by_hand.better_plain_fits_by_hand`)."""
-        return better_plain_fits_by_hand(
-            self.solution, self.turns, under_test=under_test, as_asked=as_asked
-        )
-
-    def proof(self, fits: Sequence[PlainFit]) -> Proof:
-        """Return the errors before and after the solution with plain fits."""
-        return prove_by_hand(self.solution, self.turns, fits)
 
 
 def _statistics(

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.calibration.check import ReadingErrors, require_sensor
-from imu_calibration.calibration.hand_proof import (
+from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.held_out_poses import (
     TURN_ANGLE_UNIT,
     TURNS_LEAST,
-    entry_of,
     turn_error,
 )
-from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.proof import entry_of
 from imu_calibration.compensation.stream import compensate_samples
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
@@ -118,10 +118,10 @@ def prove_hand_readings(
             np.linalg.norm(mean, axis=1, keepdims=True) - gravity
             for mean in (raw.force, corrected.force)
         ]
-        rest = entry_of(lengths, UNITS['accelerometer'], seconds=seconds)
+        rest = entry_of(UNITS['accelerometer'], *lengths, seconds=seconds)
         proof['accelerometer'] = replace(rest, regimes={'rest': rest})
     if 'gyroscope' not in absent:
-        rest = entry_of((raw.rate, corrected.rate), UNITS['gyroscope'], seconds=seconds)
+        rest = entry_of(UNITS['gyroscope'], raw.rate, corrected.rate, seconds=seconds)
         proof['gyroscope'] = replace(rest, regimes={'rest': rest})
 
     # The directions at both ends of a turn are those of the corrected accelerometer.
@@ -130,7 +130,7 @@ def prove_hand_readings(
         up = unit_rows(corrected.force)
         angles = [_turn_errors(imu, poses, turns, up) for imu in (before, after)]
         turning = float(sum(turn.time[-1] - turn.time[0] for turn in turns))
-        entry = entry_of(angles, TURN_ANGLE_UNIT, seconds=turning)
+        entry = entry_of(TURN_ANGLE_UNIT, *angles, seconds=turning)
         regimes = {**proof['gyroscope'].regimes, 'turns': entry}
         proof['gyroscope'] = replace(entry, regimes=regimes)
     return proof

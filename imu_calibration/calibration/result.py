@@ -5,17 +5,16 @@ A reference contributes the data that it gathered (`Observations`) and predictio
 (`HeldOutData`); what follows from a solution is concluded once, in `calibrate.conclude`.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol
 
 import numpy as np
 
 from imu_calibration.calibration.from_solution import Estimate
-from imu_calibration.calibration.plain_fit import PlainFit
+from imu_calibration.calibration.held_out_data import HeldOutData, PlainFit
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import Verdict
-from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected, usage
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
@@ -85,23 +84,6 @@ class Needs:
     """Entries of the document: parameters with their sds in tolerances, and the need."""
 
 
-class HeldOutData(Protocol):
-    """Data in folds, with the parameters of a solution without each fold."""
-
-    def better_plain_fits(
-        self, *, under_test: Collection[str], as_asked: bool
-    ) -> tuple[PlainFit, ...]:
-        """
-        Return the fits of bias and matrix that predict held-out data better than the solution.
-
-        The effects of the sensors `under_test` have to predict better than a plain fit; in a model
-        that was stated (`as_asked`) only these.
-        """
-
-    def proof(self, fits: Sequence[PlainFit]) -> Proof:
-        """Return the errors before and after the solution with plain fits."""
-
-
 class Observations(Protocol[Estimate]):
     """What a reference gathered in recordings of one IMU, and what it knows of its own errors."""
 
@@ -162,7 +144,7 @@ class Observations(Protocol[Estimate]):
     def with_reference_errors(self, solution: Estimate) -> Estimate:
         """Return the solution with errors of the reference in its covariance."""
 
-    def held_out(self, solution: Estimate) -> HeldOutData:
+    def held_out(self, solution: Estimate) -> HeldOutData[Estimate]:
         """Return the data in folds, with the parameters of a solution without each fold."""
 
     def uncorrected(self, solution: Estimate) -> Uncorrected:

@@ -7,7 +7,7 @@ Noise gives the covariance of the solution; a wrong reference that changes the p
 not level and independent when an encoder is read in every pose.
 """
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -22,12 +22,7 @@ from imu_calibration.calibration.from_solution import (
     weak_on_table,
     with_gravity_uncertainty,
 )
-from imu_calibration.calibration.plain_fit import (
-    PlainFit,
-    better_plain_fits,
-    with_plain_fits,
-)
-from imu_calibration.calibration.proof import applied_folds, nominal_values, prove_solution
+from imu_calibration.calibration.held_out_windows import HeldOutWindows, nominal_values
 from imu_calibration.calibration.result import (
     GRAVITY_SD,
     CalibrationResult,
@@ -37,11 +32,9 @@ from imu_calibration.calibration.result import (
 )
 from imu_calibration.calibration.window_search import search_windows
 from imu_calibration.core.units import ARCMIN
-from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected, latest_settling, uncorrected_on_table
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import (
-    Centre,
     References,
     coefficient_jacobian,
     coefficients,
@@ -382,12 +375,10 @@ class WindowObservations:
         """Yield the search of effects in each recording with enough windows."""
         return search_windows(self.gathered, self.table, solution.model, options=options)
 
-    def held_out(self, solution: Solution) -> 'HeldOutWindows':
+    def held_out(self, solution: Solution) -> HeldOutWindows:
         """Return the windows in folds, with the parameters of a solution without each fold."""
-        held_out = self.gathered.held_out.restricted(self.model, solution.model)
-        centre = self.uncorrected(solution).centre
-        folds = applied_folds(held_out, solution, centre=centre)
-        return HeldOutWindows(solution, held_out, folds, centre)
+        windows = self.gathered.held_out.restricted(self.model, solution.model)
+        return HeldOutWindows.of(windows, solution, self.uncorrected(solution).centre)
 
     def uncorrected(self, solution: Solution) -> Uncorrected:
         """Return the errors that compensation leaves uncorrected."""
@@ -480,37 +471,3 @@ class WindowObservations:
     def error_budget(self, result: TableResult) -> ErrorBudget:
         """Return the contributions of the noise and of the table."""
         return error_budget(self, result.solution)
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOutWindows:
-    """Windows in folds, with the parameters of a solution without each fold."""
-
-    solution: Solution
-    """The solution of all windows."""
-    held_out: HeldOut
-    """The windows in folds, with the columns of its model."""
-    folds: list[np.ndarray]
-    """Parameters without each fold, as compensation applies them, each shape (n_params,)."""
-    centre: Centre
-    """Operating point at which effects that compensation cannot undo are applied."""
-
-    def better_plain_fits(
-        self, *, under_test: Collection[str], as_asked: bool
-    ) -> tuple[PlainFit, ...]:
-        """Return the plain fits to apply (`plain_fit.better_plain_fits`)."""
-        return better_plain_fits(
-            self.held_out,
-            self.solution,
-            self.folds,
-            under_test=under_test,
-            centre=self.centre,
-            as_asked=as_asked,
-        )
-
-    def proof(self, fits: Sequence[PlainFit]) -> Proof:
-        """Return the errors before and after the solution with plain fits."""
-        folds = self.folds
-        for fit in fits:
-            folds = fit.merged(folds)
-        return prove_solution(self.held_out, with_plain_fits(self.solution, fits), folds)

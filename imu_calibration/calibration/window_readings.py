@@ -8,7 +8,11 @@ import numpy as np
 
 from imu_calibration.calibration.check import ReadingErrors, require_sensor
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.proof import prove_readings, reference_model, reference_values
+from imu_calibration.calibration.held_out_windows import (
+    prove_readings,
+    reference_model,
+    reference_values,
+)
 from imu_calibration.compensation.compensate import invertible
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.readings import RawReadings

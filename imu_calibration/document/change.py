@@ -12,7 +12,7 @@ QUANTILE = 1.96
 SMALLEST_SHARE = 1e-3
 """Smallest lower end of an interval as a share of its upper end: its logarithm is finite."""
 KIND_BY_HAND = {'accelerometer': 'rest', 'gyroscope': 'turns'}
-"""Sensor -> the only kind of motion of its held-out error by hand (`hand_proof.prove_by_hand`)."""
+"""Sensor -> the only kind of motion of its held-out error by hand (`HeldOutPoses`)."""
 
 
 @dataclass(frozen=True)

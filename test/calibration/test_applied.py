@@ -12,8 +12,8 @@ import pytest
 
 import imu_calibration as imu
 from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.held_out_windows import HeldOutWindows
 from imu_calibration.calibration.pose_readings import prove_hand_readings
-from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
@@ -128,7 +128,7 @@ def test_the_proof_from_window_statistics_differs_by_the_square_of_the_errors():
         applied_values(result.solution.model, result.solution.values),
     )
     dealt = result.gathered.held_out.restricted(result.data.model, model)
-    found = prove(model, before=(dealt, ([nominal_values(model)],)), after=(dealt, ([values],)))
+    found = prove(HeldOutWindows(result.solution, [values], dealt, {}))
     checked = imu.check(session.samples, result.calibration, session.table)
     for sensor, entry in checked.proof.items():
         assert found[sensor].after == pytest.approx(entry.after, rel=0.02)

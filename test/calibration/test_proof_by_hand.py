@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.hand_proof import HAND_PROOF_FOLDS, prove_by_hand, values_without
+from imu_calibration.calibration.held_out_poses import (
+    HAND_PROOF_FOLDS,
+    HeldOutPoses,
+    folds_by_hand,
+    values_without,
+)
+from imu_calibration.calibration.proof import prove
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS, decide
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
@@ -23,9 +29,13 @@ def session():
     return gather_by_hand(imu, ranges)
 
 
+def proof_of(hand, turns):
+    return prove(HeldOutPoses.of(hand, turns, folds_by_hand(hand.poses)))
+
+
 def test_a_good_calibration_is_proven_on_poses_and_turns(session):
     hand = solve_by_hand(session, OPTIONS)
-    proof = prove_by_hand(hand, session.turns)
+    proof = proof_of(hand, session.turns)
     assert (
         proof['accelerometer'].windows == 20
         and proof['gyroscope'].unit == 'rad per turn'
@@ -68,6 +78,6 @@ def test_few_attitudes_are_left_out_one_by_one_and_six_are_too_few():
     for poses, windows in ((6, None), (8, 8), (9, 9), (20, 20)):
         imu, ranges, _ = simulate(4, n_poses=poses)
         data = gather_by_hand(imu, ranges)
-        found = prove_by_hand(solve_by_hand(data, OPTIONS), data.turns)
+        found = proof_of(solve_by_hand(data, OPTIONS), data.turns)
         assert getattr(found.get('accelerometer'), 'windows', None) == windows
         assert not found or found['accelerometer'].ci95[1] < 1.0

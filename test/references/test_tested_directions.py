@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.hand_proof import prove_by_hand
+from imu_calibration.calibration.held_out_poses import HeldOutPoses, folds_by_hand
+from imu_calibration.calibration.proof import prove
 from imu_calibration.document.decision import HELPS, UNPROVEN, decide
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
@@ -77,7 +78,8 @@ def board(seed, *, placements, rests, shared, cross=0.0, turns=False):
 def calibrated(imu, ranges):
     found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     at = [found.param_names.index(name) for name in CROSS_TERMS]
-    return found.values[at], found.sd[at], prove_by_hand(found, found.used_turns)
+    held_out = HeldOutPoses.of(found, found.used_turns, folds_by_hand(found.poses))
+    return found.values[at], found.sd[at], prove(held_out)
 
 
 @pytest.mark.parametrize('seed', [0, 3, 5])

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from imu_calibration.calibration.calibrate import Solved, conclude
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
-from imu_calibration.calibration.hand_proof import entry_of
+from imu_calibration.calibration.held_out_data import HeldOutData, JudgedData, errors_of_rows
 from imu_calibration.calibration.result import Needs
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.effects.base import Role
@@ -114,7 +114,7 @@ class PoseBlocks:
         return Needs({}, ())
 
     def held_out(self, solution):
-        return HeldOutBlocks(self, solution)
+        return HeldOutBlocks.of(self, solution)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,32 +219,46 @@ def solve(data, model, left_out=None):
     return solution, found.state
 
 
-def errors_of(data, solution, state):
-    """Return the rotations that a solution misses, rad, shape (n_blocks, 3)."""
-    return PoseRows(data, solution.model).linearise(state).residual.reshape(-1, 3)
-
-
 @dataclass(frozen=True, eq=False)
-class HeldOutBlocks:
+class HeldOutBlocks(HeldOutData):
     """Blocks in folds, each predicted without it."""
 
     data: PoseBlocks
-    solution: Solution
+    lags: list[float]
+    """Delay of the poses, estimated without each fold, s."""
 
-    def better_plain_fits(self, *, under_test, as_asked):
-        return ()
-
-    def proof(self, fits):
-        number = np.arange(len(self.data.blocks))
-        model = self.solution.model
-        nominal = PoseState(PoseRows(self.data, model).nominal)
-        before = errors_of(self.data, self.solution, nominal)
-        after = np.zeros_like(before)
+    @classmethod
+    def of(cls, data, solution):
+        number = np.arange(len(data.blocks))
+        folds, lags = [], []
         for fold in range(FOLDS):
-            out = number % FOLDS == fold
-            solution, state = solve(self.data, model, out)
-            after[out] = errors_of(self.data, solution, state)[out]
-        return {'gyroscope': entry_of((before, after), 'rad', seconds=BLOCK * len(number))}
+            without, state = solve(data, solution.model, number % FOLDS == fold)
+            folds.append(without.values)
+            lags.append(state.lag)
+        return cls(solution, folds, data, lags)
+
+    @property
+    def judged(self):
+        n = len(self.data.blocks)
+        return {'gyroscope': JudgedData(np.ones((n, 1)), 'rad', n, 3, piece_time=BLOCK)}
+
+    def errors(self, sensor, folds):
+        """Return the rotations that are missed."""
+        rows = PoseRows(self.data, self.solution.model)
+        errors = np.zeros((len(self.data.blocks), 3))
+        for fold, (values, lag) in enumerate(zip(folds, self.lags)):
+            missed = rows.linearise(PoseState(values, lag)).residual.reshape(-1, 3)
+            errors[fold::FOLDS] = missed[fold::FOLDS]
+        return errors_of_rows(errors)
+
+    def nominal(self, sensor, folds):
+        return [PoseRows(self.data, self.solution.model).nominal] * FOLDS
+
+    def plain_estimates(self, sensor, applied):
+        raise NotImplementedError
+
+    def fits_elsewhere(self, sensor, estimate, applied):
+        raise NotImplementedError
 
 
 def select(data, solution, state):

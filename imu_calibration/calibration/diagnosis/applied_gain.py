@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.traces import DistanceSums
-from imu_calibration.calibration.hand_proof import corrected_with, end_by_hand, turn_errors
-from imu_calibration.calibration.proof import nominal_values, with_reference
+from imu_calibration.calibration.held_out_poses import corrected_with, end_by_hand, turn_errors
+from imu_calibration.calibration.held_out_windows import nominal_values, with_reference
 from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import (
@@ -165,7 +165,7 @@ def _locked_errors(
     """
     Return the sums over the locked windows of the errors of corrected readings, or of the model.
 
-    The windows are those of `hand_proof` and the documents: after effects have settled.
+    The windows are those of `HeldOutData` and the documents: after effects have settled.
     """
     problem, sums = found.problem, DistanceSums()
     start = max(judged_from_of(side.latest, problem.duration) for side in sides)
@@ -245,7 +245,7 @@ def gain_by_hand(
 
     The gain is that on the held-out poses and turns.
 
-    The errors are those of `hand_proof.prove_by_hand` and, at rest, the corrected rate less that of
+    The errors are those of `HeldOutPoses` and, at rest, the corrected rate less that of
     the Earth about the vertical. Choice and estimate of each side exclude the poses; if no
     additional finding can be compensated, the residual is that of the model.
     """
@@ -290,9 +290,7 @@ def _pose_errors(
     """
     poses = found.baseline.poses
     if block.duration is not None:
-        missed = turn_errors(
-            model, values, poses, turns=[found.turns[row] for row in rows], gyroscope=values
-        )
+        missed = turn_errors(model, values, poses, [found.turns[row] for row in rows])
         return (missed / block.duration[rows])[:, None]
     warm = None if poses.temperature_c is None else poses.temperature_c[rows]
     corrected = corrected_with(

@@ -1,0 +1,399 @@
+"""
+Held-out poses and turns of a calibration by hand: errors against gravity, and plain fits of them.
+
+A plain fit has equal weights for lengths at rest, mean rates and turns, each sensor by itself, and
+no further effect.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.calibration.held_out_data import (
+    HeldOutData,
+    HeldOutErrors,
+    JudgedData,
+    PlainEstimate,
+    PlainFit,
+    errors_of_rows,
+)
+from imu_calibration.calibration.plain_fit import PARTS_OF_TIME, compared_fit, plan_of
+from imu_calibration.compensation.compensate import Corrected, compensated_samples
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.trust import (
+    Uncorrected,
+    judged_from_of,
+    latest_settling,
+    uncorrected_in_time,
+)
+from imu_calibration.effects.base import UNITS
+from imu_calibration.effects.forward_equations import applied_values
+from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
+from imu_calibration.estimation.solution import HELD
+from imu_calibration.kinematics.rotations import unit_rows
+from imu_calibration.kinematics.strapdown import total_rotation
+from imu_calibration.references.gravity.equations import (
+    COMPONENTS,
+    GravityRows,
+    Poses,
+    State,
+    TurnData,
+    between_middles,
+)
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.gravity.poses import distinct_attitudes
+
+HAND_PROOF_FOLDS = 8
+"""Number of held-out parts."""
+ATTITUDES_LEAST = 10
+"""
+Fewest remaining attitudes when a part is held out: nine parameters of the accelerometer need one
+equation each.
+"""
+FEW_ATTITUDES = 6
+"""
+Fewest remaining attitudes when one pose is held out: biases and scale factors of the accelerometer
+need one equation each.
+"""
+TURNS_LEAST = 6
+"""Fewest remaining turns, and fewest held-out turns in total."""
+TURN_ANGLE_UNIT = 'rad per turn'
+"""Unit of the angle between rotated and observed gravity."""
+STEPS = 5
+"""Gauss-Newton steps: each reduces the error by that of bias and matrix, some per cent."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutPart:
+    """Poses that are held out together, with the turns that begin or end there."""
+
+    judged: np.ndarray
+    """
+    True for the poses that are evaluated: held out, effects that settle have settled; shape
+    (n_poses,).
+    """
+    turns: list[TurnData]
+    """Turns against gravity that are held out and evaluated."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutPoses(HeldOutData[HandCalibration]):
+    """
+    Poses that are held out in turn, each with the turns that begin or end there.
+
+    The error of the accelerometer is the length of its corrected reading in a pose less gravity;
+    that of the gyroscope the angle between gravity rotated by its rates and gravity in the pose at
+    the end of a turn. Readings are corrected as by compensation; with effects that have settled the
+    last third of the poses is evaluated.
+    """
+
+    turns: Sequence[TurnData]
+    """Turns of the estimate."""
+    masks: Sequence[np.ndarray]
+    """True for the poses of a part that is held out, each shape (n_poses,)."""
+    least_turns: int = 0
+    """Fewest remaining turns when those of a part are evaluated."""
+
+    @classmethod
+    def of(
+        cls,
+        hand: HandCalibration,
+        turns: Sequence[TurnData],
+        masks: Sequence[np.ndarray],
+        least_turns: int = 0,
+    ) -> 'HeldOutPoses':
+        """Return the poses with the parameters of a solution without each part."""
+        centre = uncorrected_by_hand(hand).centre
+        folds = []
+        for values in values_without(hand, turns, masks):
+            folds.append(applied_values(hand.model, values, centre))
+        return cls(hand, folds, turns, masks, least_turns)
+
+    @cached_property
+    def parts(self) -> list[HeldOutPart]:
+        """The poses and turns that are evaluated, of each mask."""
+        hand = self.solution
+        latest = latest_settling(hand.model, hand.values, hand.sd)
+        is_late = hand.poses.time >= judged_from_of(latest, end_by_hand(hand.poses))
+        parts = []
+        for out in self.masks:
+            turns = []
+            for turn in self.turns:
+                is_held_out = out[turn.first] or out[turn.last]
+                if turn.rotation is None and is_held_out and is_late[turn.first]:
+                    turns.append(turn)
+            if len(self.turns) - len(turns) < self.least_turns:
+                turns = []
+            parts.append(HeldOutPart(out & is_late, turns))
+        return parts
+
+    @cached_property
+    def judged(self) -> dict[str, JudgedData]:
+        """Sensor -> its poses or turns, each a block."""
+        found = {}
+        n_poses = sum(int(part.judged.sum()) for part in self.parts)
+        if n_poses:
+            found['accelerometer'] = JudgedData(
+                np.ones((n_poses, 1)),
+                UNITS['accelerometer'],
+                n_poses,
+                1,
+                # Rests near the axes of the sensor: held-out rests have the directions of the
+                # other rests.
+                few_directions=bool(self.solution.hand_model.untested),
+            )
+        n_turns = sum(len(part.turns) for part in self.parts)
+        if n_turns >= TURNS_LEAST:
+            found['gyroscope'] = JudgedData(np.ones((n_turns, 1)), TURN_ANGLE_UNIT, n_turns, 1)
+        return found
+
+    def errors(self, sensor: str, folds: Sequence[np.ndarray]) -> HeldOutErrors:
+        """Return the errors of lengths, or of turns with the directions of the accelerometer."""
+        errors = []
+        for part, values in zip(self.parts, folds, strict=True):
+            if sensor == 'accelerometer':
+                errors.append(norm_errors(self.solution, values, part.judged))
+            else:
+                errors.append(
+                    turn_errors(self.solution.hand_model, values, self.solution.poses, part.turns)
+                )
+        return errors_of_rows(np.concatenate(errors)[:, None])
+
+    def nominal(self, sensor: str, folds: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return parameters of folds with those of the data sheet for a sensor."""
+        nominal = replace(self.solution.hand_model, gyro_factor=1.0).nominal
+        of_sensor = np.char.startswith(self.solution.param_names, sensor)
+        return [np.where(of_sensor, nominal, values) for values in folds]
+
+    def plain_estimates(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEstimate]:
+        """Yield the plain fit of a sensor, and one step from it without the poses of each mask."""
+        hand = self.solution
+        plan = plan_of(hand, sensor, hand.prior_mean)
+        fitted = plan.fitted & ~hand.hand_model.fixed
+        estimator: _Lengths | _Turns = _Lengths(hand)
+        if sensor == 'gyroscope':
+            estimator = _Turns(hand, self.turns, applied)
+        everything = np.ones(len(hand.poses.time), bool)
+        values = plan.values
+        for _ in range(STEPS):
+            values = estimator.moved(values, fitted, everything)
+        folds = [estimator.moved(values, fitted, ~out) for out in self.masks]
+        yield replace(plan, fitted=fitted, values=values, folds=folds)
+
+    def fits_elsewhere(
+        self, sensor: str, estimate: PlainEstimate, applied: np.ndarray
+    ) -> Iterator[PlainFit]:
+        """
+        Yield the errors on parts of the session.
+
+        Its first and last part are predicted as another session is: no part of the same drift lies
+        on their other side.
+        """
+        parts = HeldOutPoses.of(self.solution, self.turns, _parts_of_time(self.solution))
+        if sensor in parts.judged:
+            yield compared_fit(parts, sensor, applied)
+
+
+def norm_errors(hand: HandCalibration, values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return ``|corrected force| - gravity`` of the poses of a mask, m/s^2."""
+    poses = _selected(hand.poses, mask)
+    corrected = corrected_with(
+        hand.hand_model, values, poses.force, temperature_c=poses.temperature_c
+    )
+    return np.linalg.norm(corrected.force, axis=1) - hand.gravity
+
+
+def values_without(
+    hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """
+    Return the parameters without the poses of each mask and the turns that begin or end there.
+
+    One Gauss-Newton step.
+    """
+    model = hand.hand_model
+    system = GravityRows(model, hand.used_poses, turns).linearise(
+        replace(hand.state, values=hand.values)
+    )
+    scatter = np.array([*(hand.statistics[f'{name}_scatter_sd'] ** 2 for name in COMPONENTS), 0.0])
+    free = ~hand.held & ~model.fixed
+    rows = np.column_stack([system.nuisance, system.main[:, free], system.residual])
+    rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
+    prior = np.column_stack(
+        [np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors]
+    )[free][:, np.append(free, True)]
+    found, last = [], slice(system.nuisance.shape[1], None)
+    for out in folds:
+        kept = np.concatenate(
+            [
+                triangular_of_band(rows[~np.append(out, False)[system.group].any(axis=1)])[
+                    last, last
+                ],
+                prior,
+            ]
+        )
+        moved = hand.values.copy()
+        moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])
+        found.append(moved)
+    return found
+
+
+def folds_by_hand(poses: Poses) -> list[np.ndarray]:
+    """
+    Return masks of the poses to hold out in turn.
+
+    An eighth of them, or with few attitudes one pose; none with too few.
+    """
+    number = np.arange(len(poses.start))
+    for count, least in ((HAND_PROOF_FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
+        folds = [number % count == fold for fold in range(count)]
+        if all(distinct_attitudes(poses.force[~out]) >= least for out in folds):
+            return folds
+    return []
+
+
+def end_by_hand(poses: Poses) -> float:
+    """Return the end of the last pose, s since the first sample."""
+    return float(poses.time[-1] + 0.5 * (poses.stop[-1] - poses.start[-1]) * poses.period)
+
+
+def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
+    """Return the effects in time that compensation replaces by a constant."""
+    return uncorrected_in_time(
+        hand.model.at(hand.values),
+        hand.values,
+        hand.poses.time,
+        end=end_by_hand(hand.poses),
+        latest=latest_settling(hand.model, hand.values, hand.sd),
+    )
+
+
+def _selected(poses: Poses, mask: np.ndarray) -> Poses:
+    """Return some of the poses."""
+    parts = {f.name: getattr(poses, f.name) for f in fields(poses)}
+    return replace(
+        poses, **{name: part[mask] for name, part in parts.items() if isinstance(part, np.ndarray)}
+    )
+
+
+def corrected_with(
+    model: HandModel,
+    values: np.ndarray,
+    force: np.ndarray,
+    *,
+    rate: np.ndarray | None = None,
+    temperature_c: np.ndarray | None = None,
+) -> Corrected:
+    """
+    Return readings corrected as by compensation with the parameters `values` of `model`.
+
+    Shape (n, 3); without `rate` at rest.
+    """
+    rate = np.zeros_like(force) if rate is None else rate
+    known = Calibration(
+        model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size
+    )
+    return compensated_samples(
+        known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c
+    )
+
+
+def turn_errors(
+    model: HandModel, values: np.ndarray, poses: Poses, turns: Sequence[TurnData]
+) -> np.ndarray:
+    """Return the angle errors of turns, rad."""
+    true = corrected_with(model, values, poses.force, temperature_c=poses.temperature_c).force
+    up = unit_rows(true)
+    errors = []
+    for turn in turns:
+        corrected = corrected_with(
+            model, values, turn.force, rate=turn.rate, temperature_c=turn.temperature_c
+        )
+        errors.append(turn_error(poses, turn, corrected.rate, up=up))
+    return np.array(errors)
+
+
+def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarray) -> float:
+    """
+    Return the angle between gravity after a turn and rotated gravity before it, rad.
+
+    The direction of gravity before the turn is rotated by corrected rates.
+
+    Parameters
+    ----------
+    poses : Poses
+    turn : TurnData
+    rates : array, shape (n, 3)
+        Corrected rates during the turn, rad/s; samples that are not finite are omitted.
+    up : array, shape (n_poses, 3)
+        Unit vector of gravity in each pose.
+
+    """
+    known = np.isfinite(rates).all(axis=1)
+    rotated, last = (
+        between_middles(poses, turn, total_rotation(turn.time[known], rates[known]))
+        @ up[turn.first],
+        up[turn.last],
+    )
+    return float(np.arctan2(np.linalg.norm(np.cross(rotated, last)), rotated @ last))
+
+
+def _parts_of_time(hand: HandCalibration) -> list[np.ndarray]:
+    """Return masks of the poses of each part of a session; none with too few attitudes."""
+    number = np.arange(len(hand.poses.time))
+    masks = [np.isin(number, part) for part in np.array_split(number, PARTS_OF_TIME)]
+    for out in masks:
+        if distinct_attitudes(hand.poses.force[~out]) < ATTITUDES_LEAST:
+            return []
+    return masks
+
+
+@dataclass(frozen=True, eq=False)
+class _Lengths:
+    """Equations ``|true force| = gravity`` of the poses."""
+
+    hand: HandCalibration
+
+    def moved(self, values: np.ndarray, fitted: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Return the parameters after a step with some of the poses."""
+        poses = self.hand.poses
+        # the rows are minus the derivative of the errors
+        errors, rows = self.hand.hand_model.norm_rows(values, poses.force, **poses.conditions)
+        moved = values.copy()
+        moved[fitted] += scaled_lstsq(rows[kept][:, fitted], errors[kept])
+        return moved
+
+
+@dataclass(frozen=True, eq=False)
+class _Turns:
+    """Equations of a gyroscope: the mean rate at rest is its bias, turns determine its matrix."""
+
+    hand: HandCalibration
+    turns: Sequence[TurnData]
+    reference: np.ndarray
+    """Parameters of which those of the accelerometer determine the directions, shape (n,)."""
+
+    def moved(self, values: np.ndarray, fitted: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Return the parameters after a step with some of the poses, and the turns between them."""
+        hand, model = self.hand, self.hand.hand_model
+        bias = np.zeros(len(values), bool)
+        bias[model.gyro_bias] = True
+        moved = values.copy()
+        moved[bias & fitted] = hand.poses.rate[kept].mean(axis=0)[fitted[model.gyro_bias]]
+
+        force = corrected_with(
+            model, self.reference, hand.poses.force, temperature_c=hand.poses.temperature_c
+        ).force
+        state = State(moved, unit_rows(force), np.zeros_like(hand.poses.rate))
+        used = []
+        for turn in self.turns:
+            if turn.rotation is None and kept[turn.first] and kept[turn.last]:
+                used.append(turn)
+        rows = GravityRows(model, hand.poses, used).linearise(state)
+        of_turns = rows.component == COMPONENTS.index('turn')
+        matrix = fitted & ~bias
+        moved[matrix] += scaled_lstsq(rows.main[of_turns][:, matrix], rows.residual[of_turns])
+        return moved
