@@ -13,13 +13,11 @@ unexplained residual: by the change of a bias that it may cause.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
-from imu_calibration.calibration.calibrate import Solved, conclude
 from imu_calibration.calibration.from_solution import Estimate, ModelChanges, ModelExtension
-from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.solved import ModelSource, Solved
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import Role
@@ -34,45 +32,6 @@ from imu_calibration.selection.parameter_space import ParameterSpace
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.saturation import Saturation
 from imu_calibration.selection.search import FAMILY_WISE, SelectedEffects, SelectionSettings
-
-
-class ModelSource(Protocol[Estimate]):
-    """Recordings of one IMU with a reference, or a live session."""
-
-    def solved(self, options: CalibrationOptions) -> Solved[Estimate]:
-        """Return the solution of the model that options request, at a valid linearisation."""
-
-
-def calibrate_by_evidence(
-    source: ModelSource[Estimate],
-    options: CalibrationOptions = CalibrationOptions(),
-    *,
-    provenance: dict | None = None,
-) -> CalibrationResult[Estimate]:
-    """
-    Calibrate from recordings of one IMU with any reference.
-
-    Effects that they support are added to the requested model.
-
-    Parameters
-    ----------
-    source : ModelSource
-        `TableRecordings`, or `PoseRecording` by hand.
-    options : CalibrationOptions
-        Of the requested model.
-    provenance : dict, optional
-        Names of recordings, hashes and options for the document.
-
-    Raises
-    ------
-    InputError
-        When a recording cannot be used, or a requested effect needs a table that is not there.
-    NotObservableError
-        When no parameter is determined.
-
-    """
-    selected = solve_by_evidence(source, options)
-    return conclude(selected, selected.extension.options(options), provenance=provenance)
 
 
 def solve_by_evidence(
@@ -93,47 +52,82 @@ def solve_by_evidence(
     searches = list(first.data.searches(first.solution, options))
     if not searches:
         return first
-    found, *others = searches
-    from_others = _named_elsewhere(found, others)
-    requested = first.model
 
-    # An effect of the requested model is judged with the added effects in the solution: the misfit
-    # of a missing delay or encoder zero widens every standard deviation.
-    while True:
-        beyond = _beyond((*found.adopted, *from_others), requested)
-        if not beyond:
-            added: tuple[tuple[str, str], ...] = ()
-            point: dict[str, np.ndarray] = {}
-            solved = first
-            found = _without_faint(found, solved.solution, requested)
-            break
+    # Add the effects that remain significant in the common solution.
+    solved, searches = _with_significant(source, options, first, searches)
 
-        # Solve again with the added effects, linearised at their estimates.
-        point = {}
-        for each in (*others, found):
-            point |= each.point_of_adopted
-        added = tuple(question.effect.key for question in beyond)
-        solved = source.solved(replace(options, added=added, point=point))
-        solution = solved.solution
-
-        # Possible rivals of the effects found in the largest recording are removed first.
-        significant = [
-            question
-            for question in from_others
-            if not _is_faint(solution, question, found.settings)
-        ]
-        if len(significant) < len(from_others):
-            from_others = significant
-            continue
-        found = _without_faint(found, solution, requested)
-        if len(_beyond((*found.adopted, *from_others), requested)) == len(beyond):
-            break
-    extension = ModelExtension(
-        added, point, _changes([found, *others], added), _moves(found), _clipped(found)
+    # The other choices of effects, and a limit of a sensor, change the covariance.
+    found = searches[0]
+    extension = replace(
+        solved.extension,
+        changes=_changes(searches, solved.extension.added),
+        moves=_moves(found),
+        clipped=_clipped(found),
     )
     return replace(
         solved, solution=extension.applied(solved.solution), extension=extension, found=found
     )
+
+
+def _with_significant(
+    source: ModelSource[Estimate],
+    options: CalibrationOptions,
+    first: Solved[Estimate],
+    searches: Sequence[SelectedEffects],
+) -> tuple[Solved[Estimate], list[SelectedEffects]]:
+    """
+    Return the solution with the effects that are significant in it, and the searches with these.
+
+    Backward elimination: solve with all effects, remove the insignificant ones, solve again.
+
+    Parameters
+    ----------
+    source : ModelSource
+    options : CalibrationOptions
+        Options of the requested model.
+    first : Solved
+        Of the requested model.
+    searches : sequence of SelectedEffects
+        Of each recording, the largest one first.
+
+    """
+    found, *others = searches
+    rivals = _named_elsewhere(found, others)
+    while True:
+        # An effect of the requested model is judged with the added effects in the solution: the
+        # misfit of a missing delay or encoder zero widens every standard deviation.
+        added = _beyond((*found.adopted, *rivals), first.model)
+        solved = _solved_with(source, options, first, added, (*others, found))
+
+        # Possible rivals of the effects found in the largest recording are removed first.
+        is_faint = [_is_faint(solved.solution, rival, found.settings) for rival in rivals]
+        if any(is_faint):
+            rivals = [rival for rival, faint in zip(rivals, is_faint, strict=True) if not faint]
+            continue
+        found = _without_faint(found, solved.solution, first.model)
+        if len(_beyond((*found.adopted, *rivals), first.model)) == len(added):
+            return solved, [found, *others]
+
+
+def _solved_with(
+    source: ModelSource[Estimate],
+    options: CalibrationOptions,
+    first: Solved[Estimate],
+    added: Sequence[Question],
+    searches: Sequence[SelectedEffects],
+) -> Solved[Estimate]:
+    """
+    Return the solution with added effects, linearised at their estimates.
+
+    The estimates of the last search have priority. `first`: the solution without these effects.
+    """
+    if not added:
+        return first
+    point: dict[str, np.ndarray] = {}
+    for search in searches:
+        point |= search.point_of_adopted
+    extension = ModelExtension(tuple(question.effect.key for question in added), point)
+    return replace(source.solved(extension.options(options)), extension=extension)
 
 
 def ask_kept(

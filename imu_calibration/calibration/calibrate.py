@@ -1,10 +1,16 @@
-"""From a solution to the calibration that is written, for any reference."""
+"""
+A calibration from top to bottom, for any reference: gather, solve, select, prove, document.
+
+A reference gathers and solves (`ModelSource`), and states what it knows of its data
+(`Observations`); the search for effects is in `by_evidence`, the proof in `proof`.
+"""
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
-from typing import Any, Generic
+from dataclasses import replace
+from typing import Any
 
-from imu_calibration.calibration.from_solution import Estimate, ModelExtension, document
+from imu_calibration.calibration.by_evidence import solve_by_evidence
+from imu_calibration.calibration.from_solution import Estimate, document
 from imu_calibration.calibration.held_out_data import PlainFit
 from imu_calibration.calibration.plain_fit import (
     better_plain_fits,
@@ -14,30 +20,46 @@ from imu_calibration.calibration.plain_fit import (
     with_plain_fits,
 )
 from imu_calibration.calibration.proof import prove
-from imu_calibration.calibration.result import CalibrationResult, Observations
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.solved import ModelSource, Solved
 from imu_calibration.document.proof_entry import Proof
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import tolerances_of, with_weak_replaced
 from imu_calibration.references.options import CalibrationOptions
 
 
-@dataclass(frozen=True, eq=False)
-class Solved(Generic[Estimate]):
-    """A solution with the data that it was solved from, and the search that chose its model."""
+def calibrate_by_evidence(
+    source: ModelSource[Estimate],
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    provenance: dict | None = None,
+) -> CalibrationResult[Estimate]:
+    """
+    Calibrate from recordings of one IMU with any reference.
 
-    solution: Estimate
-    """Estimate of all parameters."""
-    data: Observations[Estimate]
-    """What the reference gathered."""
-    extension: ModelExtension = ModelExtension()
-    """Effects that the search added; nothing without a search."""
-    found: Any = None
-    """Result of the search; None without one, or with too few data."""
+    Effects that they support are added to the requested model.
 
-    @property
-    def model(self) -> SensorModel:
-        """The model of the data, of which the solved one may be a part."""
-        return self.solution.model
+    Parameters
+    ----------
+    source : ModelSource
+        `TableRecordings`, or `PoseRecording` by hand.
+    options : CalibrationOptions
+        Of the requested model.
+    provenance : dict, optional
+        Names of recordings, hashes and options for the document.
+
+    Raises
+    ------
+    InputError
+        When a recording cannot be used, or a requested effect needs a table that is not there.
+    NotObservableError
+        When no parameter is determined.
+
+    """
+    # Gather and solve; select the effects that the data support, and solve again with them.
+    selected = solve_by_evidence(source, options)
+
+    # Prove on held-out data, and document.
+    return conclude(selected, selected.extension.options(options), provenance=provenance)
 
 
 def conclude(

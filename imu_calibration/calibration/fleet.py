@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.by_evidence import calibrate_by_evidence
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.core.errors import ImuCalibrationError, InputError

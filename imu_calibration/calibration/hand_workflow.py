@@ -3,10 +3,10 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.calibrate import Solved
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.hand_recording import HandRecording, read_by_hand
 from imu_calibration.calibration.pose_observations import HandResult, PoseObservations
+from imu_calibration.calibration.solved import Solved
 from imu_calibration.core.errors import InputError
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, solve_by_hand

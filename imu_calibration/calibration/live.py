@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import ask_kept, solve_by_evidence
-from imu_calibration.calibration.calibrate import Solved, conclude
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.collector import (
     LiveCollector,
     copied,
@@ -27,6 +27,7 @@ from imu_calibration.calibration.coverage import (
     waiting_groups,
 )
 from imu_calibration.calibration.from_solution import ModelExtension
+from imu_calibration.calibration.solved import Solved
 from imu_calibration.calibration.table_calibration import (
     SolvedWindows,
     solve_in_passes,

@@ -7,8 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from imu_calibration.calibration.calibrate import Solved, conclude
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.collector import GatherStep, from_bytes
+from imu_calibration.calibration.solved import Solved
 from imu_calibration.calibration.window_observations import TableResult, WindowObservations
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.progress import report

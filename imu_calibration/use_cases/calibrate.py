@@ -12,7 +12,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from imu_calibration.calibration.by_evidence import calibrate_by_evidence
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.check import check_errors
 from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.hand_workflow import calibrate_without_table

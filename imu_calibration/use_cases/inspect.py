@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from imu_calibration.calibration.calibrate import Solved, conclude
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.calibration.pose_observations import PoseObservations
 from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.calibration.solved import Solved
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock

@@ -12,7 +12,7 @@ import pytest
 from refusal import refused
 from test_live_calibration import assert_same, blocks
 
-from imu_calibration.calibration.by_evidence import calibrate_by_evidence
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.live_diagnosis import (
     Answer,

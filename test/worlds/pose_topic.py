@@ -13,10 +13,11 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from imu_calibration.calibration.calibrate import Solved, conclude
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.calibration.held_out_data import HeldOutData, JudgedData, errors_of_rows
 from imu_calibration.calibration.result import Needs
+from imu_calibration.calibration.solved import Solved
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import output_of_effects

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.calibrate import conclude
+from imu_calibration.calibration.calibrate import calibrate_by_evidence, conclude
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
