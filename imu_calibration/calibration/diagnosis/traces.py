@@ -4,10 +4,8 @@ Measurement against the simulation of two models.
 Residuals over short blocks, segments, residual power and dead reckoning.
 """
 
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -245,7 +243,7 @@ class OverlaySegment:
 
 
 @dataclass(frozen=True, eq=False)
-class Traces:
+class ResidualBlocks:
     """Residuals averaged over short blocks, before and after, with the variables of their plots."""
 
     time: np.ndarray
@@ -266,6 +264,12 @@ class Traces:
     """Sensor -> measured minus predicted by the extended model, shape (n, 3)."""
     samples: np.ndarray
     """Samples in each block, shape (n,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Traces(ResidualBlocks):
+    """The residuals of a recording with what follows from them for people."""
+
     dead_reckoning: dict | None
     """
     {'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after',
@@ -305,58 +309,82 @@ def residual_traces(
     sensors = tuple(before.noise)
     sums = DistanceSums()
     spans: list[tuple[float, float]] = []
-    # Key -> values at each block, a part per chunk of windows.
-    parts: dict[Any, list[np.ndarray]] = defaultdict(list)
+    parts: list[ResidualBlocks] = []
     for group in chunks(_used(windows, spans)):
         of_models = [residuals(group, table, each.model, values=each.values) for each in models]
         old, new = of_models[0], of_models[-1]
-        lengths = [len(window) for window in group]
-        ends = np.cumsum(lengths)
-        for window, stop in zip(group, ends):
+        for window, stop in zip(group, np.cumsum([len(window) for window in group])):
             rows = slice(stop - len(window), stop)
             old_rows = {sensor: residual[rows] for sensor, residual in old.items()}
             new_rows = {sensor: residual[rows] for sensor, residual in new.items()}
             sums.add(window, [old_rows, new_rows], before.noise)
+        parts.append(_blocks_of(group, table, before, old, new))
 
-        starts = _starts(group)
-        position, force_s, rate_s, temperature_c = _variables(group, table, before)
-        parts['time'].append(block_means(np.concatenate([w.time for w in group]), starts))
-        parts['position'].append(block_means(position, starts))
-        parts['force_s'].append(block_means(force_s, starts))
-        parts['rate_s'].append(block_means(rate_s, starts))
-        if temperature_c is not None:
-            parts['temperature_c'].append(block_means(temperature_c, starts))
-        for sensor in sensors:
-            parts['before', sensor].append(block_means(old[sensor], starts))
-            parts['after', sensor].append(block_means(new[sensor], starts))
-        parts['samples'].append(np.diff(starts, append=ends[-1]))
-        parts['kind'].append(np.repeat([str(w.kind) for w in group], lengths)[starts])
-
-    blocks = {key: np.concatenate(arrays) for key, arrays in parts.items()}
-    time = blocks['time']
-    # Known only if every chunk has temperatures.
-    temperature = blocks.get('temperature_c', np.zeros(0))
+    blocks = _joined(parts)
     segments = {}
     for sensor in sensors:
         segments[sensor] = []
         for axis in range(3):
-            start, stop = _largest(time, blocks['before', sensor][:, axis])
+            start, stop = _largest(blocks.time, blocks.before[sensor][:, axis])
             segments[sensor].append(
                 _segment(windows, spans, table, models, sensor, axis, start, stop)
             )
+    with_both = len(sensors) == len(SENSORS)
     return Traces(
-        time,
-        blocks['kind'],
-        blocks['position'],
-        blocks['force_s'],
-        blocks['rate_s'],
-        temperature if len(temperature) == len(time) else None,
-        {sensor: blocks['before', sensor] for sensor in sensors},
-        {sensor: blocks['after', sensor] for sensor in sensors},
-        blocks['samples'],
-        _dead_reckoning(windows, spans, table, models) if len(sensors) == len(SENSORS) else None,
-        segments,
-        sums.distances(),
+        **vars(blocks),
+        dead_reckoning=_dead_reckoning(windows, spans, table, models) if with_both else None,
+        segments=segments,
+        distances=sums.distances(),
+    )
+
+
+def _blocks_of(
+    windows: Sequence[Window],
+    table: Table,
+    model: Solution,
+    before: Mapping[str, np.ndarray],
+    after: Mapping[str, np.ndarray],
+) -> ResidualBlocks:
+    """
+    Return the means over the blocks of windows.
+
+    The reference is at the values of a model; `before`, `after`: sensor -> residuals at all
+    samples, shape (n, 3).
+    """
+    starts = _starts(windows)
+    lengths = [len(window) for window in windows]
+    motion, temperature, rows = all_samples(windows)
+    reference = _references(model, table, motion, temperature)
+    temperature_c = None
+    if temperature is not None:
+        temperature_c = block_means(temperature[rows], starts)
+    return ResidualBlocks(
+        time=block_means(np.concatenate([window.time for window in windows]), starts),
+        kind=np.repeat([str(window.kind) for window in windows], lengths)[starts],
+        position=block_means(motion.position[rows], starts),
+        force_s=block_means(reference['accelerometer'].force_s[rows], starts),
+        rate_s=block_means(reference['gyroscope'].rate_s[rows], starts),
+        temperature_c=temperature_c,
+        before={sensor: block_means(before[sensor], starts) for sensor in model.noise},
+        after={sensor: block_means(after[sensor], starts) for sensor in model.noise},
+        samples=np.diff(starts, append=sum(lengths)),
+    )
+
+
+def _joined(parts: Sequence[ResidualBlocks]) -> ResidualBlocks:
+    """Return the blocks of all parts; the temperature is known only if each part has it."""
+    temperatures = [part.temperature_c for part in parts if part.temperature_c is not None]
+    sensors = parts[0].before
+    return ResidualBlocks(
+        time=np.concatenate([part.time for part in parts]),
+        kind=np.concatenate([part.kind for part in parts]),
+        position=np.concatenate([part.position for part in parts]),
+        force_s=np.concatenate([part.force_s for part in parts]),
+        rate_s=np.concatenate([part.rate_s for part in parts]),
+        temperature_c=np.concatenate(temperatures) if len(temperatures) == len(parts) else None,
+        before={name: np.concatenate([part.before[name] for part in parts]) for name in sensors},
+        after={name: np.concatenate([part.after[name] for part in parts]) for name in sensors},
+        samples=np.concatenate([part.samples for part in parts]),
     )
 
 
@@ -413,24 +441,6 @@ def _segment(
     rows = rows[: len(rows) // size * size].reshape(-1, size)
     return OverlaySegment(
         time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()}
-    )
-
-
-def _variables(
-    windows: Sequence[Window], table: Table, model: Solution
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """
-    Return the state of the reference at the samples, at the values of a model.
-
-    The state is position, specific force, rate and temperature (or None).
-    """
-    motion, temperature, rows = all_samples(windows)
-    reference = _references(model, table, motion, temperature)
-    return (
-        motion.position[rows],
-        reference['accelerometer'].force_s[rows],
-        reference['gyroscope'].rate_s[rows],
-        None if temperature is None else temperature[rows],
     )
 
 
