@@ -1,9 +1,9 @@
 """Calibration on a table."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -24,11 +24,17 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution, shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_units
+from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.references.turntable.accumulator import restrict
 from imu_calibration.references.turntable.session_data import SessionData, join
+from imu_calibration.references.turntable.window_statistics import reduce_window
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
+
+if TYPE_CHECKING:  # in the standard library from Python 3.11 on
+    from typing_extensions import Self
 
 
 def calibrate_on_table(
@@ -131,7 +137,7 @@ class TableRecordings:
         mapper: Callable = map,
         names: Sequence[str] | None = None,
         keep_windows: bool = False,
-    ) -> 'TableRecordings':
+    ) -> 'Self':
         """Return recordings with their numbers as names where none are given."""
         numbered = [f'recording {number}' for number in range(1, len(sources) + 1)]
         return cls(sources, table, tuple(names or numbered), mapper, keep_windows)
@@ -158,10 +164,54 @@ class TableRecordings:
             keep_windows,
             judged_from,
         )
-        parts = list(self.mapper(step, enumerate(self.sources)))
+        parts = self.reduced(step)
         gathered = join(parts, self.names, partial(check_units, model=model, table=self.table))
         report('solving')
         return solved_windows(WindowObservations(self.table, gathered, model), options)
+
+    def reduced(self, step: GatherStep) -> list[SessionData]:
+        """Return the windows of each recording, reduced with the columns of a model."""
+        return list(self.mapper(step, enumerate(self.sources)))
+
+
+@dataclass(frozen=True, eq=False)
+class WatchedRecording(TableRecordings):
+    """A recording that is shown to the checks when it is read for the first time."""
+
+    preflight: Preflight = field(default_factory=Preflight)
+    """The checks."""
+
+    def reduced(self, step: GatherStep) -> list[SessionData]:
+        """Return the windows of the recording, reduced with the columns of a model."""
+        if self.preflight.streams:
+            return super().reduced(step)
+        (source,) = self.sources
+        return [step.read(source, 0, self.preflight)]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRecording(TableRecordings):
+    """A recording that is read once: later linearisations reduce its stored windows."""
+
+    windows: StoredWindows = field(default_factory=StoredWindows)
+    """Its windows, unused ones too; empty before the first pass."""
+    first_pass: list[SessionData] = field(default_factory=list)
+    """The data of the first pass; empty before it."""
+
+    def reduced(self, step: GatherStep) -> list[SessionData]:
+        """Return the windows of the recording, reduced with the columns of a model."""
+        if not self.first_pass:
+            (source,) = self.sources
+            preflight = Preflight(step.table.gravity_value, one_sensor=True)
+            self.first_pass.append(step.read(source, 0, preflight, windows=self.windows))
+            return [*self.first_pass]
+        windows = (self.windows[number] for number in range(len(self.windows)))
+        reduced = (
+            reduce_window(window, step.model, step.table)
+            for window in windows
+            if window.kind != 'unused'
+        )
+        return [self.first_pass[0].anew(reduced, step.judged_from)]
 
 
 def solve_in_passes(

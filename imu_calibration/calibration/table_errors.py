@@ -1,16 +1,15 @@
 """Delay of the clocks and zeros of the encoders, fitted where a residual is not noise."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.calibrate import conclude
+from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.document.verdict import incomplete_windows
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import Status
-from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
 from imu_calibration.references.options import CalibrationOptions
 
@@ -29,7 +28,7 @@ class TableErrors:
 
 
 def calibrate_with_table_errors(
-    sources: Sequence[Callable], table: Table, options: CalibrationOptions, *, mapper: Callable
+    recordings: TableRecordings, options: CalibrationOptions
 ) -> TableErrors:
     """
     Return the calibration without a search for effects, but for a delay and zeros of encoders.
@@ -39,22 +38,22 @@ def calibrate_with_table_errors(
 
     Parameters
     ----------
-    sources, table, options, mapper
-        As for `calibrate_on_table`.
+    recordings : TableRecordings
+    options : CalibrationOptions
+        Of the requested model.
 
     """
-    result = calibrate_on_table(sources, table, options, mapper=mapper)
+    result = conclude(recordings.solved(options), options)
     if options.as_asked or not _unlike_noise(result):
         return TableErrors(result, ())
     # The ones that the table has: the zero of the first joint is part of the attitude of the base.
     added = [
         key
-        for key, effect in result.model.catalogue.effects(table.joint_names).items()
+        for key, effect in result.model.catalogue.effects(recordings.table.joint_names).items()
         if effect.set_up_fault is not None
     ]
-    extended = calibrate_on_table(
-        sources, table, replace(options, added=(*options.added, *added)), mapper=mapper
-    )
+    extended_options = replace(options, added=(*options.added, *added))
+    extended = conclude(recordings.solved(extended_options), extended_options)
     findings = _table_error_findings(extended)
     if findings:
         result = extended

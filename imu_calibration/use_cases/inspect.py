@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -30,7 +30,6 @@ from imu_calibration.references.gravity.hand_calibration import solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import hand_options
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.recordings import (
-    Source,
     Topics,
     open_bag,
     source_of,
@@ -41,8 +40,7 @@ from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
 
 if TYPE_CHECKING:
-    from imu_calibration.calibration.collector import GatherStep
-    from imu_calibration.references.turntable.session_data import SessionData
+    pass
 
 MOST_IMUS = 64
 """Imu topics and frames of a recording that are inspected at most; each needs a few scans."""
@@ -232,15 +230,13 @@ def _look(bag, topics, table, *, options, exclude):
     error_findings: tuple[CheckFinding, ...] = ()
     if table is not None:
         # here, because a recording by hand does not need its import
+        from imu_calibration.calibration.table_calibration import WatchedRecording
         from imu_calibration.calibration.table_errors import calibrate_with_table_errors
 
         try:
-            table_errors = calibrate_with_table_errors(
-                sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude),
-                table,
-                options,
-                mapper=_watched_by(preflight),
-            )
+            sources = sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude)
+            watched = replace(WatchedRecording.of(sources, table), preflight=preflight)
+            table_errors = calibrate_with_table_errors(watched, options)
             calibrated = table_errors.result
             stated = [
                 finding
@@ -299,20 +295,3 @@ def _by_hand(source, options, preflight):
         return conclude(solved, options, is_judged=False)
     except ImuCalibrationError as error:
         return error
-
-
-def _watched_by(
-    preflight: Preflight,
-) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[SessionData]]:
-    """
-    Return the map step of one recording that shows it to the checks.
-
-    The checks see the recording when it is read for the first time.
-    """
-
-    def mapper(step, numbered):
-        if preflight.streams:
-            return map(step, numbered)
-        return [step.read(source, session, preflight) for session, source in numbered]
-
-    return mapper

@@ -1,13 +1,12 @@
 """Diagnosis as plain functions, on a table and by hand, and its result as lines of text."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.calibration.calibrate import calibrate_by_evidence, conclude
-from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
     Diagnosis,
@@ -26,7 +25,7 @@ from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.calibration.hand_workflow import calibrate_poses
 from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
-from imu_calibration.calibration.table_calibration import TableRecordings
+from imu_calibration.calibration.table_calibration import StoredRecording, TableRecordings
 from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.calibration.window_search import baseline_options
 from imu_calibration.core.units import error_text
@@ -38,11 +37,8 @@ from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.gravity.model_selection import too_few_poses
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.session_data import SessionData
-from imu_calibration.references.turntable.window_statistics import reduce_window
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.selection.onset import Onset
@@ -171,43 +167,6 @@ class DiagnosisResult:
         return total_lags(found.param_names, found.values, found.covariance)
 
 
-class StoredRecording:
-    """
-    The map step of a calibration from one recording, which is read once.
-
-    Later linearisations reduce its stored windows.
-    """
-
-    def __init__(self) -> None:
-        self.windows = StoredWindows()
-        self._first: SessionData | None = None
-
-    def __call__(
-        self, step: GatherStep, numbered: Iterable[tuple[int, Callable]]
-    ) -> list[SessionData]:
-        """
-        Return the SessionData of the recording.
-
-        The recording is given as (its number, callable that yields its blocks).
-        """
-        ((session, source),) = numbered
-        if self._first is None:
-            self._first = step.read(
-                source,
-                session,
-                Preflight(step.table.gravity_value, one_sensor=True),
-                windows=self.windows,
-            )
-            return [self._first]
-        windows = (self.windows[number] for number in range(len(self.windows)))
-        reduced = (
-            reduce_window(window, step.model, step.table, session=session)
-            for window in windows
-            if window.kind != 'unused'
-        )
-        return [self._first.anew(reduced, step.judged_from)]
-
-
 def diagnose_recording(
     source: Callable,
     table: Table,
@@ -232,42 +191,67 @@ def diagnose_recording(
     DiagnosisResult
 
     """
-    reader = StoredRecording()
-    recordings = TableRecordings.of([source], table, mapper=reader, keep_windows=True)
+    # Calibrate with the effects of the catalogue that the data support, and identify the causes.
+    recording = StoredRecording.of([source], table, keep_windows=True)
     result = calibrate_by_evidence(
-        recordings, replace(options, as_asked=False), provenance=provenance
+        recording, replace(options, as_asked=False), provenance=provenance
     )
     if result.found is None:
         raise too_few_windows(len(result.gathered.spreads[0].windows))
     diagnosis = build_diagnosis(table, result.found, calibrated=result.solution)
 
-    # The formulas of the residual join the model; a second pass reduces the stored windows.
-    recordings = TableRecordings.of([source], table, mapper=reader)
-    extension = ProposedExtension(result, diagnosis, options, provenance)
-    effects = _proposed_effects(diagnosis)
-    proposed = _with_proposals(recordings, extension, effects)
-    transferable = proposed
-    transferable_effects = [effect for effect in effects if _is_transferable(effect)]
-    if len(transferable_effects) < len(effects):
-        transferable = _with_proposals(recordings, extension, transferable_effects)
-    helpful = helpful_formulas(transferable_effects, transferable, result.calibration)
-    if len(helpful) < len(transferable_effects):
-        transferable = _with_proposals(recordings, extension, helpful)
-    unhelpful = [effect for effect in transferable_effects if effect not in helpful]
-    traces = residual_traces(
-        reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution
+    # The formulas of the residual join the model.
+    formulas = _formula_models(
+        replace(recording, keep_windows=False),
+        ProposedExtension(result, diagnosis, options, provenance),
     )
-    diagnosis = replace(diagnosis, traces=traces)
+
+    # Measured against simulated, before and after.
+    traces = residual_traces(
+        recording.windows,
+        table,
+        diagnosis.baseline,
+        after=formulas.proposed or diagnosis.solution,
+    )
     return DiagnosisResult(
-        diagnosis,
+        replace(diagnosis, traces=traces),
         result.calibration,
         result.tolerances,
         result.needed,
         result.observations,
         baseline_options(options),
-        proposed,
-        transferable,
-        tuple(effect.groups[0].text[0] for effect in unhelpful),
+        formulas.proposed,
+        formulas.transferable,
+        formulas.unhelpful,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _FormulaModels:
+    """Calibrations of the model with formulas of the residual."""
+
+    proposed: Calibration | None
+    """With all formulas; None without one."""
+    transferable: Calibration | None
+    """With those that help and that compensation of another recording can undo."""
+    unhelpful: tuple[str, ...]
+    """Formulas that compensation could undo, but which do not help."""
+
+
+def _formula_models(recordings: TableRecordings, extension: 'ProposedExtension') -> _FormulaModels:
+    """Return the calibrations with the formulas of a diagnosis."""
+    effects = _proposed_effects(extension.diagnosis)
+    proposed = _with_proposals(recordings, extension, effects)
+    transferable = proposed
+    transferable_effects = [effect for effect in effects if _is_transferable(effect)]
+    if len(transferable_effects) < len(effects):
+        transferable = _with_proposals(recordings, extension, transferable_effects)
+    helpful = helpful_formulas(transferable_effects, transferable, extension.result.calibration)
+    if len(helpful) < len(transferable_effects):
+        transferable = _with_proposals(recordings, extension, helpful)
+    unhelpful = [effect for effect in transferable_effects if effect not in helpful]
+    return _FormulaModels(
+        proposed, transferable, tuple(effect.groups[0].text[0] for effect in unhelpful)
     )
 
 
