@@ -103,6 +103,7 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         hand: HandCalibration,
         turns: Sequence[TurnData],
         masks: Sequence[np.ndarray],
+        *,
         least_turns: int = 0,
     ) -> 'HeldOutPoses':
         """Return the poses with the parameters of a solution without each part."""
@@ -158,7 +159,9 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
                 errors.append(norm_errors(self.solution, values, part.judged))
             else:
                 errors.append(
-                    turn_errors(self.solution.hand_model, values, self.solution.poses, part.turns)
+                    turn_errors(
+                        self.solution.hand_model, values, self.solution.poses, turns=part.turns
+                    )
                 )
         return errors_of_rows(np.concatenate(errors)[:, None])
 
@@ -302,7 +305,7 @@ def corrected_with(
 
 
 def turn_errors(
-    model: HandModel, values: np.ndarray, poses: Poses, turns: Sequence[TurnData]
+    model: HandModel, values: np.ndarray, poses: Poses, *, turns: Sequence[TurnData]
 ) -> np.ndarray:
     """Return the angle errors of turns, rad."""
     true = corrected_with(model, values, poses.force, temperature_c=poses.temperature_c).force

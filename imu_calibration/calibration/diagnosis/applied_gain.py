@@ -290,7 +290,7 @@ def _pose_errors(
     """
     poses = found.baseline.poses
     if block.duration is not None:
-        missed = turn_errors(model, values, poses, [found.turns[row] for row in rows])
+        missed = turn_errors(model, values, poses, turns=[found.turns[row] for row in rows])
         return (missed / block.duration[rows])[:, None]
     warm = None if poses.temperature_c is None else poses.temperature_c[rows]
     corrected = corrected_with(
