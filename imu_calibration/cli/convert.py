@@ -30,7 +30,11 @@ def add_arguments(parser: OneLineParser) -> None:
         ),
     )
     parser.common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
-    parser.add_rows()
+    parser.add_rows(
+        'C is QUANTITY=NAMES:UNIT, as in time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s'
+        ' temperature=NAME:C joint.JOINT=NAME:deg; a name may be a column number, a leading minus'
+        ' reverses the sign'
+    )
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 

@@ -158,19 +158,9 @@ class OneLineParser(argparse.ArgumentParser):
         """Add the option of times that are not used, with the meaning of a time."""
         self.common('--exclude', metavar='A:B,...', help=f'unused times, {text}')
 
-    def add_rows(self) -> None:
-        """Add the options of columns and rows of a text log."""
-        self.common(
-            '--columns',
-            metavar='QUANTITY=NAMES:UNIT',
-            nargs='+',
-            default=[],
-            help=(
-                'of a text log: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C'
-                ' joint.JOINT=NAME:deg; a name may be a column number, a leading minus reverses'
-                ' the sign'
-            ),
-        )
+    def add_rows(self, columns: str = "columns of a text log: 'convert --help'") -> None:
+        """Add the options of columns and rows of a text log, with the help of the first."""
+        self.common('--columns', metavar='C', nargs='+', default=[], help=columns)
         self.common(
             '--where',
             metavar='COLUMN=VALUE',
@@ -320,7 +310,7 @@ class OneLineParser(argparse.ArgumentParser):
         )
         self.common(
             '--gyroscope-unit',
-            metavar='UNIT',
+            metavar='U',
             help='rad/s, deg/s, urad/s, ..., counts:16.4/(deg/s)',
         )
         self.common(
