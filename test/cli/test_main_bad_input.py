@@ -188,7 +188,7 @@ def test_a_file_that_is_no_bag(capsys, tmp_path, home):
         ({'latitude': None}, ('gravity', 'latitude')),
         ({'joints': []}, ('joint',)),
         ({'gravity': 'much'}, ('gravity', 'much')),
-        ({'colour': 'grey'}, ('colour', 'unknown')),
+        ({'colour': 'grey'}, ('colour', 'gravity')),
     ),
 )
 def test_a_table_description_that_does_not_hold(capsys, tmp_path, home, changes, words):

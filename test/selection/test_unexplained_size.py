@@ -17,7 +17,7 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
 
     Whitened ones are not: "0 deg/s, significant" was told.
     """
-    monkeypatch.setattr(unexplained, 'correlate', lambda explanations, residual: ('time', 0.5))
+    monkeypatch.setattr(unexplained, 'correlate', lambda *_, fitted: ('time', 0.5))
     monkeypatch.setattr(unexplained, '_explanations', lambda recording: {})
     n = 40
     noise = SimpleNamespace(
