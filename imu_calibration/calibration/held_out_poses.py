@@ -228,16 +228,13 @@ def values_without(
     prior = np.column_stack(
         [np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors]
     )[free][:, np.append(free, True)]
-    found, last = [], slice(system.nuisance.shape[1], None)
+    n_nuisances = system.nuisance.shape[1]
+    found = []
     for out in folds:
-        kept = np.concatenate(
-            [
-                triangular_of_band(rows[~np.append(out, False)[system.group].any(axis=1)])[
-                    last, last
-                ],
-                prior,
-            ]
-        )
+        # Sums of biases have the group n_poses, which is never held out.
+        is_out = np.append(out, False)[system.group].any(axis=1)
+        factor = triangular_of_band(rows[~is_out])[n_nuisances:, n_nuisances:]
+        kept = np.concatenate([factor, prior])
         moved = hand.values.copy()
         moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])
         found.append(moved)
@@ -336,11 +333,9 @@ def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarra
 
     """
     known = np.isfinite(rates).all(axis=1)
-    rotated, last = (
-        between_middles(poses, turn, total_rotation(turn.time[known], rates[known]))
-        @ up[turn.first],
-        up[turn.last],
-    )
+    rotation = between_middles(poses, turn, total_rotation(turn.time[known], rates[known]))
+    rotated = rotation @ up[turn.first]
+    last = up[turn.last]
     return float(np.arctan2(np.linalg.norm(np.cross(rotated, last)), rotated @ last))
 
 

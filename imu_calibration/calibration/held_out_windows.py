@@ -7,7 +7,7 @@ table's reference point and the delay of the readings, which compensation does n
 estimated for each side: so a wrong scale that compensates for a lag is visible.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -70,7 +70,13 @@ class HeldOutWindows(HeldOutData[Solution]):
 
     @cached_property
     def _nominal(self) -> np.ndarray:
+        """Nominal parameters, with the table and the clock as described."""
         return nominal_values(self.solution.model)
+
+    @cached_property
+    def _nominal_sensors(self) -> np.ndarray:
+        """The same with the table and the clock as estimated."""
+        return with_reference(self.solution.model, self._nominal, self.solution.values)
 
     @cached_property
     def judged(self) -> dict[str, JudgedData]:
@@ -87,7 +93,7 @@ class HeldOutWindows(HeldOutData[Solution]):
 
     def nominal(self, sensor: str, folds: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return nominal parameters of the sensors, with the table and the clock as estimated."""
-        return [with_reference(self.solution.model, self._nominal, self.solution.values)]
+        return [self._nominal_sensors]
 
     def descriptions(self, folds: Sequence[np.ndarray]) -> Iterator[Sequence[np.ndarray]]:
         """Yield the parameters with the table and the clock as estimated and as described."""
@@ -96,11 +102,7 @@ class HeldOutWindows(HeldOutData[Solution]):
 
     def plain_estimates(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEstimate]:
         """Yield estimates with the table and the clock as described, and as estimated."""
-        model = self.solution.model
-        for reference in (
-            self._nominal,
-            with_reference(model, self._nominal, self.solution.values),
-        ):
+        for reference in (self._nominal, self._nominal_sensors):
             yield _plain_estimate(self.windows, self.solution, sensor, reference)
 
     def fits_elsewhere(
@@ -206,21 +208,16 @@ def reference_model(calibration: Calibration, table: Table) -> SensorModel:
 
     Bias, matrix, and the effects of the table and the clock that are known.
     """
-    known, same_joints = calibration.model, calibration.model.joint_names == table.joint_names
-    names = {
-        sensor: tuple(
-            effect.name
-            for effect in known.effects
-            if effect.sensor == sensor
-            and (
-                effect.role in (Role.OFFSET, Role.LINEAR) or same_joints and is_of_reference(effect)
-            )
-        )
-        for sensor in SENSORS
-    }
+    known = calibration.model
+    same_joints = known.joint_names == table.joint_names
+    names: dict[str, list[str]] = {sensor: [] for sensor in SENSORS}
+    for effect in known.effects:
+        is_plain = effect.role in (Role.OFFSET, Role.LINEAR)
+        if effect.sensor in names and (is_plain or (same_joints and is_of_reference(effect))):
+            names[effect.sensor].append(effect.name)
     model = SensorModel(
-        names['accelerometer'],
-        names['gyroscope'],
+        tuple(names['accelerometer']),
+        tuple(names['gyroscope']),
         reference=known.reference if same_joints else (),
         joint_names=table.joint_names,
         temperature_ref_c=known.temperature_ref_c,
@@ -274,20 +271,22 @@ def errors_of(
     With the delay and the common arm that suit them best.
     """
     regimes = _regimes_of(held_out)
-    parts = [
-        (k, regimes.index(Regime(regime)), rows, folds[k % len(folds)])
-        for k, block in enumerate(held_out.blocks)
-        for (name, regime), rows in block.pieces.items()
-        if name == sensor and len(rows)
-    ]
-    known = {id(values): _Correction(model, sensor, values) for values in folds}
-    stacks = [known[id(values)].errors(rows) for _, _, rows, values in parts]
-    best, delay_free = _nuisances(np.concatenate(stacks, axis=1))
+    corrections = [_Correction(model, sensor, values) for values in folds]
+    places: list[tuple[int, int]] = []
+    stacks: list[np.ndarray] = []
+    for k, block in enumerate(held_out.blocks):
+        for (name, regime), rows in block.pieces.items():
+            if name == sensor and len(rows):
+                places.append((k, regimes.index(Regime(regime))))
+                stacks.append(corrections[k % len(folds)].errors(rows))
+
+    # error + sum(nuisance change), with the same nuisances for all pieces.
+    nuisances, without_delay = _nuisances(np.concatenate(stacks, axis=1))
     squares = np.zeros((len(held_out.blocks), len(regimes)))
-    for (k, regime, *_), (error, *changes) in zip(parts, stacks):
-        left = error + np.tensordot(best, changes, axes=1) if len(best) else error
-        squares[k, regime] += (left**2).sum()
-    return HeldOutErrors(squares, float(best[0]), delay_free)
+    for place, (error, *changes) in zip(places, stacks, strict=True):
+        remaining = error + np.tensordot(nuisances, changes, axes=1)
+        squares[place] += (remaining**2).sum()
+    return HeldOutErrors(squares, float(nuisances[0]), without_delay)
 
 
 def _nuisances(stacked: np.ndarray) -> tuple[np.ndarray, float]:
@@ -317,12 +316,11 @@ class _Correction:
         total = coefficients(model, sensor, values)
         self.matrix = model.matrix(sensor, values)
         self.inverse = np.linalg.inv(self.matrix)
-        self.total, self.arms = total, []
+        self.total = total
         arm = model.part(sensor, Role.ARM)
-        for index in range(arm.start, arm.stop):
-            moved = values.copy()
-            moved[index] += 1.0
-            self.arms.append(coefficients(model, sensor, moved) - total)
+        self.arms = _slopes(
+            model, sensor, values, steps=dict.fromkeys(range(arm.start, arm.stop), 1.0)
+        )
 
     def errors(self, rows: np.ndarray) -> np.ndarray:
         """
@@ -342,6 +340,19 @@ class _Correction:
             *(-columns @ arm for arm in self.arms),
         ]
         return np.stack(parts) @ self.inverse.T
+
+
+def _slopes(
+    model: SensorModel, sensor: str, values: np.ndarray, *, steps: Mapping[int, float]
+) -> list[np.ndarray]:
+    """Return the change of the coefficients of a sensor with a step of each of some parameters."""
+    total = coefficients(model, sensor, values)
+    slopes = []
+    for index, step in steps.items():
+        moved = values.copy()
+        moved[index] += step
+        slopes.append(coefficients(model, sensor, moved) - total)
+    return slopes
 
 
 def _plain_estimate(
@@ -406,11 +417,7 @@ def _error_on_groups(
     total = coefficients(model, sensor, values)
     index = np.flatnonzero(free)
     sd = model.prior()[1][index]
-    slopes = []
-    for place, step in zip(index, sd, strict=True):
-        moved = values.copy()
-        moved[place] += step
-        slopes.append(coefficients(model, sensor, moved) - total)
+    slopes = _slopes(model, sensor, values, steps=dict(zip(index, sd, strict=True)))
     designs = []
     targets = []
     for group in groups:
@@ -449,11 +456,7 @@ def _equations(
     The coefficients are linear in bias and matrix, so that one step from `start` is exact.
     """
     total = coefficients(model, sensor, start)
-    slopes = []
-    for index in np.flatnonzero(fitted):
-        moved = start.copy()
-        moved[index] += 1.0
-        slopes.append(coefficients(model, sensor, moved) - total)
+    slopes = _slopes(model, sensor, start, steps=dict.fromkeys(np.flatnonzero(fitted), 1.0))
     width = len(total)
     rows = []
     targets = []

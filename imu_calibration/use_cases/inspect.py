@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.hand_recording import read_by_hand
@@ -38,9 +37,6 @@ from imu_calibration.use_cases.recordings import (
 from msg_adapters.bag import Recording, list_topics
 from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
-
-if TYPE_CHECKING:
-    pass
 
 MOST_IMUS = 64
 """Imu topics and frames of a recording that are inspected at most; each needs a few scans."""
