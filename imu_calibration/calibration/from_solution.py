@@ -12,6 +12,7 @@ from imu_calibration.core.documents import finite
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.proof_entry import Proof
+from imu_calibration.document.reference_texts import MOUNT_AXES
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import incomplete_windows, judged
 from imu_calibration.effects.base import SENSORS, Role
@@ -318,7 +319,7 @@ def gauge_of(model: SensorModel) -> dict[str, Any]:
     both_arms = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
     gauge: dict[str, Any] = {
         'origin': 'mean_of_sensitive_points' if both_arms else 'mount',
-        'axes': 'mount',
+        'axes': MOUNT_AXES,
     }
     if model.joint_names.angle_sd is not None:
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)

@@ -34,6 +34,11 @@ from imu_calibration.document.decision import (
     most_cautious,
 )
 from imu_calibration.document.proof_entry import Proof
+from imu_calibration.document.reference_texts import (
+    ACCELEROMETER_AXES,
+    ReferenceTexts,
+    texts_of,
+)
 from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import (
@@ -115,6 +120,16 @@ class Calibration:
     def sd(self) -> np.ndarray:
         """Standard deviations, shape (n_params,)."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+
+    @property
+    def texts(self) -> ReferenceTexts:
+        """Texts of its reference."""
+        return texts_of(self.gauge)
+
+    @property
+    def gyroscope_in_accelerometer_axes(self) -> bool:
+        """Whether the accelerometer, which was calibrated too, defines axes of the gyroscope."""
+        return self.gauge.get('axes') == ACCELEROMETER_AXES and not self.absent
 
     @property
     def by_hand(self) -> dict:
@@ -400,8 +415,6 @@ def _stays(effect: Effect, sensors: Sequence[str]) -> bool:
 
 SHOWN_NAMES = 6
 """Names listed one by one; of more, the groups are named."""
-HAND_AXES = 'accelerometer_lower_triangular'
-"""The axes of a calibration by hand."""
 
 
 def listed(names: Sequence[str]) -> str:
@@ -523,13 +536,10 @@ def surpassed_limit(calibration: Calibration, sensor: str) -> InstrumentLimit | 
             f'{sensor}_unit',
         )
     if off > OFF_DIAGONAL:
-        axes = 'check in the driver that both sensors have the same axes'
-        if calibration.gauge.get('axes') != HAND_AXES:
-            axes = 'check the axes of the readings, and the mount in the table description'
         return InstrumentLimit(
             f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is'
             f' {significant(off)}',
-            axes,
+            calibration.texts.off_diagonal,
         )
     if np.abs(bias).max() > LARGEST_BIAS[sensor]:
         return InstrumentLimit(
@@ -548,9 +558,7 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
 
 def needs_accelerometer(calibration: Calibration, decisions: Mapping[str, SensorDecision]) -> bool:
     """Return whether the gyroscope cannot be corrected: its axes by hand are not available."""
-    if calibration.gauge.get('axes') != HAND_AXES or len(calibration.sensors) < len(SENSORS):
-        return False
-    return bool(
+    return calibration.gyroscope_in_accelerometer_axes and bool(
         decisions['accelerometer'] is HARMS or beyond_instruments(calibration, 'accelerometer')
     )
 

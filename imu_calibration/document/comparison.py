@@ -13,8 +13,9 @@ from scipy.special import chdtrc
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import exit_code_of
-from imu_calibration.document.calibration import HAND_AXES, Calibration, listed
+from imu_calibration.document.calibration import Calibration, listed
 from imu_calibration.document.exports.affine import lower_times_rotation
+from imu_calibration.document.reference_texts import ACCELEROMETER_AXES, MOUNT_AXES
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import FIXED, HELD
@@ -23,9 +24,6 @@ COMPARISON_P_VALUE = 0.01
 """Significance level: two calibrations differ when the p-value is below this."""
 MOTION_COLUMNS = {'force', 'rate', 'angular acceleration', 'joint rate', 'vibration'}
 """Quantities with components along the axes of the sensor (`ColumnGroup.uses`)."""
-TABLE_AXES = 'mount'
-"""Axes of a calibration on a table: those of the mount."""
-
 
 Group = tuple[str, float, int, float]
 """SENSOR.EFFECT, chi-square, degrees of freedom, probability by chance."""
@@ -119,11 +117,11 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         )
     notes = _notes(first, second)
     axes = {first.gauge.get('axes'), second.gauge.get('axes')}
-    if axes == {TABLE_AXES, HAND_AXES}:
+    if axes == {MOUNT_AXES, ACCELEROMETER_AXES}:
         note = 'both are compared in the axes of the accelerometer'
         return _compared_turned(first, second, common, [*notes, note])
     comparison = _compared(first, second, common, notes)
-    if comparison.agree is False and axes == {TABLE_AXES}:
+    if comparison.agree is False and axes == {MOUNT_AXES}:
         note = 'the IMU is mounted differently: compared in the axes of the accelerometer'
         turned = _compared_turned(first, second, common, [*notes, note])
         if turned.agree:
@@ -161,7 +159,7 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
         covariance=jacobian @ calibration.covariance @ jacobian.T,
         status=tuple(status),
         covariance_terms={},
-        gauge={**calibration.gauge, 'axes': HAND_AXES},
+        gauge={**calibration.gauge, 'axes': ACCELEROMETER_AXES},
     )
 
 
@@ -316,7 +314,7 @@ def _compared(
         if name in rejected:
             differences.append(text)
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
-    if rejected & linear and TABLE_AXES in (first.gauge.get('axes'), second.gauge.get('axes')):
+    if rejected & linear and MOUNT_AXES in (first.gauge.get('axes'), second.gauge.get('axes')):
         lines.append(
             'off-diagonal terms of a matrix include how the IMU was mounted on the table: '
             'they differ after remounting without a change of the IMU'

@@ -10,7 +10,6 @@ from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import (
     AXES_MISSING,
-    HAND_AXES,
     Calibration,
     beyond_instruments,
     scale_questions,
@@ -339,8 +338,7 @@ def refused_sensors(
             live and _mostly_undetermined(calibration, sensor)
         ):
             refused[sensor] = why
-    by_hand = calibration.gauge.get('axes') == HAND_AXES
-    if by_hand and 'accelerometer' in refused and 'gyroscope' in calibration.sensors:
+    if calibration.gyroscope_in_accelerometer_axes and 'accelerometer' in refused:
         refused.setdefault('gyroscope', AXES_MISSING)
     return refused
 

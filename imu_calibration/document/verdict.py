@@ -11,7 +11,6 @@ from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.units import error_text, for_people, significant
 from imu_calibration.document.calibration import (
     CONVERT,
-    HAND_AXES,
     SHOWN_NAMES,
     Calibration,
     beyond_known,
@@ -417,7 +416,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     A residual that the model does not explain scatters from window to window as well, although the
     bias does not move. So does a sensor that moved where it was held still.
     """
-    reasons, by_hand = [], calibration.gauge.get('axes') == HAND_AXES
+    reasons = []
     for sensor in calibration.sensors:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
@@ -432,8 +431,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
                     f'the {sensor} reads the same motion differently from window to window by'
                     f' {significant(scatter * factor, 2)} {unit}, more than the tolerance on its'
                     ' bias: the mean is well determined, the present bias is not',
-                    f'record after warm-up{"" if by_hand else ", on a rigid table"}, or estimate'
-                    ' the bias in use',
+                    calibration.texts.unsteady_bias,
                     sensors=(sensor,),
                 )
             )
@@ -601,27 +599,21 @@ def _decided(calibration: Calibration, sensor: str, word: SensorDecision) -> Rea
 
 def _step_of(calibration: Calibration, sensor: str) -> tuple[str, str | None]:
     """Return (next step, its key) for a sensor that the calibration does not certainly help."""
-    entry, by_hand = calibration.proof.get(sensor), calibration.gauge.get('axes') == HAND_AXES
+    entry, texts = calibration.proof.get(sensor), calibration.texts
     # Values that are refused have their own cause, and no measurement of their error is missing.
     if limit := surpassed_limit(calibration, sensor):
         return limit.remedy, limit.key
     if moved_at_rest(calibration.by_hand, sensor):
         return MOVED_REMEDY, None
     if entry is None or not entry.windows:
-        if not by_hand:
-            return 'record more windows of rest and motion', None
-        if needs := _needs_of(calibration, sensor):
+        needs = _needs_of(calibration, sensor)
+        if texts.needs_first and needs:
             return needs[0], REMEDY_KEYS.get(needs[0])
-        more = {
-            'accelerometer': 'hold it still in more attitudes',
-            'gyroscope': 'turn it between more attitudes held still',
-        }
-        return more[sensor], None
+        return texts.too_few[sensor], None
     if entry.few_directions:
         return 'hold it still between the axes of the sensor as well', None
     if same_directions(entry):
-        mount = '' if by_hand else ', or mount it at another angle'
-        return f'hold it still in more attitudes{mount}', None
+        return texts.more_attitudes, None
     if decide(entry) is HELPS and _periodic(calibration, sensor):
         return 'record rests between the motions', None
     if decide(entry) is HELPS:

@@ -11,7 +11,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT, dropped_text
 from imu_calibration.core.scales import scale_range
-from imu_calibration.document.calibration import HAND_AXES, scale_questions, true_calibration
+from imu_calibration.document.calibration import scale_questions, true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import HELPS, UNPROVEN
 from imu_calibration.document.outcome import (
@@ -21,6 +21,7 @@ from imu_calibration.document.outcome import (
     shortcomings,
 )
 from imu_calibration.document.proof_entry import ProofEntry
+from imu_calibration.document.reference_texts import ACCELEROMETER_AXES
 from imu_calibration.document.trust import caveats, refused_sensors
 from imu_calibration.document.verdict import judge
 from imu_calibration.effects.sensor_model import SensorModel
@@ -120,7 +121,7 @@ def test_a_doubtful_scale_without_the_support_of_the_data_is_refused():
 
 
 def test_by_hand_the_gyroscope_does_not_help_without_the_axes_of_the_accelerometer():
-    bad = with_scale(3.0, gauge={'axes': HAND_AXES})
+    bad = with_scale(3.0, gauge={'axes': ACCELEROMETER_AXES})
     assert set(bad.decisions.values()) == {UNPROVEN} == set(verdict_of(bad).decisions.values())
     assert set(refused_sensors(bad)) == set(PROOF)
 

@@ -13,7 +13,6 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import decision, trust
-from imu_calibration.document.calibration import HAND_AXES
 from imu_calibration.document.calibration_text import (
     calibration_from_text,
     calibration_mapping,
@@ -30,6 +29,7 @@ from imu_calibration.document.decision import (
     reason_of,
 )
 from imu_calibration.document.proof_entry import ProofEntry
+from imu_calibration.document.reference_texts import ACCELEROMETER_AXES
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD
 from msg_adapters.write import write_session
@@ -122,7 +122,7 @@ def test_what_is_applied(first, second, anyway, live):
 
 
 def test_by_hand_the_gyroscope_is_not_applied_without_the_accelerometer():
-    gauge = {'axes': HAND_AXES}
+    gauge = {'axes': ACCELEROMETER_AXES}
     assert trust.usable(proven(HELPS, HARMS, gauge=gauge)).refused.keys() == {'gyroscope'}
     with refused(DocumentError, 'no_sensor_helps', HARMS):
         trust.usable(proven(HARMS, HELPS, gauge=gauge))

@@ -1237,7 +1237,7 @@ BY_SENSOR = _of(
     (
         'by hand the gyroscope is used beside a refused accelerometer',
         'refused_sensors',
-        "_1.gauge.get('axes') == HAND_AXES",
+        '_1.gyroscope_in_accelerometer_axes',
         'False',
         'test_trust.py::test_by_hand_the_gyroscope_is_not_applied_without_the_accelerometer',
     ),
