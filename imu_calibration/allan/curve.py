@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 from operator import itemgetter
 from typing import Protocol
 
@@ -184,17 +184,13 @@ class _Level:
     def _with_holes(self, first, m):
         """Return m times the differences of neighbouring means of the samples that are there."""
         end = self.sums.shape[1]
-        sums, counts = (
-            [values[..., first - k : end - k] for k in (0, m, 2 * m)]
-            for values in (self.sums, self.counts)
-        )
-        late, early = counts[0] - counts[1], counts[1] - counts[2]
+        last, middle, begin = (slice(first - k, end - k) for k in (0, m, 2 * m))
+        late = self.counts[last] - self.counts[middle]
+        early = self.counts[middle] - self.counts[begin]
         usable = np.minimum(late, early) >= PRESENT * m
-        means = [
-            (a - b)[:, usable] / n[usable]
-            for a, b, n in ((sums[0], sums[1], late), (sums[1], sums[2], early))
-        ]
-        return m * (means[0] - means[1])
+        later_sum = (self.sums[:, last] - self.sums[:, middle])[:, usable]
+        earlier_sum = (self.sums[:, middle] - self.sums[:, begin])[:, usable]
+        return m * (later_sum / late[usable] - earlier_sum / early[usable])
 
     def _shorten(self):
         """Keep the sums that later differences need, from the first sample kept."""
@@ -320,11 +316,11 @@ class Detrending:
         if not any(self.trends):
             return None
         warmth = None if self.temperature is None else np.interp(time, *self.temperature)
-        columns = [
-            sum((trend.at(time, warmth, self.reference) for trend in trends), np.zeros(len(time)))
-            for trends in self.trends
-        ]
-        return np.column_stack(columns)
+        total = np.zeros((len(time), len(self.trends)))
+        for axis, trends in enumerate(self.trends):
+            for trend in trends:
+                total[:, axis] += trend.at(time, warmth, self.reference)
+        return total
 
 
 class Sink(Protocol):
@@ -381,10 +377,10 @@ class RestReader:
 
     def _pieces(self, outliers):
         """Yield (epoch, number of the part, accepted samples)."""
-        bounds = [
-            np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2)
-            for parts in self.parts
-        ]
+        bounds = []  # ns, shape (n_parts, 2) for each epoch
+        for parts in self.parts:
+            ends = [(part.first_ns, part.end_ns) for part in parts]
+            bounds.append(np.array(ends, np.int64).reshape(-1, 2))
         cleaner = BlockCleaner(nominal=self.nominal, one_sensor=True)
         for cleaned in without_outliers(cleaner.all_of(self.source()), outliers):
             for epoch, imu in cleaned.imu:
@@ -396,9 +392,8 @@ class RestReader:
 
     def curve(self) -> AllanCurve:
         """Return the Allan variances of the parts."""
-        factors = averaging_factors(
-            max(round(part.seconds / self.period) for of_epoch in self.parts for part in of_epoch)
-        )
+        longest = max(part.seconds for part in chain.from_iterable(self.parts))
+        factors = averaging_factors(round(longest / self.period))
         bare, faults = AllanSums(factors, 6), FaultSearch()
         raw = AllanSums(factors, 6) if any(self.detrending.trends) else None
         outliers = self.read(bare, raw=(faults,) if raw is None else (raw, faults))

@@ -202,26 +202,28 @@ def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
 
     Figures that are held do not enter: a bound is no measurement.
     """
-    return {
-        sensor: _processes(
-            [{p.name: (p, c) for p, c in axis.processes()} for axis in figures.sensor(sensor)]
-        )
-        for sensor in figures.sensors
-    }
+    return {sensor: _processes(figures.sensor(sensor)) for sensor in figures.sensors}
 
 
 def _processes(axes):
+    """Return the bias processes whose variances are the means of those of the axes."""
+    flicker = walk = 0.0
+    correlated: dict[float, float] = {}  # correlation time -> variance
+    for axis in axes:
+        for process, coefficient in axis.processes():
+            if process.name == FLICKER.name:
+                flicker += coefficient
+            elif process.name == RANDOM_WALK.name:
+                walk += coefficient
+            elif process.name == GAUSS_MARKOV:
+                correlated[process.time] = correlated.get(process.time, 0.0) + coefficient
     share = 1.0 / len(axes)
-    flicker, walk = (
-        share * sum(axis[name][1] for axis in axes if name in axis)
-        for name in (FLICKER.name, RANDOM_WALK.name)
-    )
+    flicker, walk = share * flicker, share * walk
+    # Flicker noise is a sum of exponential correlations with equal variances, one for each time.
     variances = {time: flicker * np.log(PROCESS_TIME_RATIO) / np.pi for time in PROCESS_TIMES}
     variances[PROCESS_TIMES[-1]] += walk * PROCESS_TIMES[-1] / 2.0
-    for axis in axes:
-        if GAUSS_MARKOV in axis:
-            process, coefficient = axis[GAUSS_MARKOV]
-            variances[process.time] = variances.get(process.time, 0.0) + share * coefficient
+    for time, variance in correlated.items():
+        variances[time] = variances.get(time, 0.0) + share * variance
     return tuple(
         BiasProcess(float(np.sqrt(variance)), float(time))
         for time, variance in sorted(variances.items())

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 
@@ -334,12 +335,14 @@ def read_rest(
             f' {found.period:g} s; record at its full rate',
             code='rate_too_low',
         )
-    pieces = [still_parts(chunks, found.period, found.resolution) for chunks in found.epochs]
-    parts, left_out = (
-        [part for part, _ in pieces],
-        {reason: sum(left[reason] for _, left in pieces) for reason in LEFT_OUT},
-    )
-    seconds = sum(part.seconds for of_epoch in parts for part in of_epoch)
+    parts, left_out = [], dict.fromkeys(LEFT_OUT, 0.0)
+    for chunks in found.epochs:
+        still, left = still_parts(chunks, found.period, found.resolution)
+        parts.append(still)
+        for reason in LEFT_OUT:
+            left_out[reason] += left[reason]
+    flat = tuple(chain.from_iterable(parts))
+    seconds = sum(part.seconds for part in flat)
     if seconds < MIN_CURVE_SAMPLES * found.period or not found.period:
         raise InputError(
             f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for'
@@ -366,7 +369,6 @@ def read_rest(
             continue
         kept = search.kept(axis, trends[axis])
         moments.append(Moments(scales, variance, variance > 0, kept, curve.parts[axis]))
-    flat = tuple(part for of_epoch in parts for part in of_epoch)
     return RestingRecord(
         curve=curve,
         moments=tuple(moments),
@@ -549,7 +551,7 @@ class _Clock:
 
 def _blocks(found, parts, clock):
     """Return the means of equal numbers of chunks within the parts."""
-    total = sum(part.chunks.stop - part.chunks.start for of_epoch in parts for part in of_epoch)
+    total = sum(part.chunks.stop - part.chunks.start for part in chain.from_iterable(parts))
     size = max(int(np.ceil(total / MAX_TREND_BLOCKS)), 1)
     time, mean, number, seconds = [], [], [], 0.0
     for epoch, (chunks, of_epoch) in enumerate(zip(found.epochs, parts)):
@@ -578,10 +580,8 @@ def _blocks(found, parts, clock):
 
 
 def _sample_sd(found, parts):
-    variances = [
-        chunks.sd[part.chunks] ** 2
-        for chunks, of_epoch in zip(found.epochs, parts)
-        for part in of_epoch
-    ]
+    variances = []
+    for chunks, of_epoch in zip(found.epochs, parts):
+        variances += [chunks.sd[part.chunks] ** 2 for part in of_epoch]
     size = found.epochs[0].size
     return np.sqrt(np.concatenate(variances).mean(axis=0) * size / (size - 1))

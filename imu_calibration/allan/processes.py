@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import product
 
 import numpy as np
 from scipy.special import factorial
@@ -180,7 +181,12 @@ class ScaleCovariance:
         """
         Return the products of all pairs, shape (n_processes, n_processes, n_scales, n_scales).
         """
-        return np.array([[self.product(one, other) for other in processes] for one in processes])
+        scales, count = len(self.factors), len(processes)
+        products = np.empty((count, count, scales, scales))
+        for i, one in enumerate(processes):
+            for j, other in enumerate(processes):
+                products[i, j] = self.product(one, other)
+        return products
 
     def _sum(self, first, second):
         """
@@ -302,7 +308,7 @@ def _lags(short, long, length):
     local = np.concatenate([-far[::-1], DENSE, far])[None, :] * short
     local = np.clip(local, -MAX_LAG_RATIO * long, MAX_LAG_RATIO * long)
     first, last = (np.maximum(length - 2 * factor + 1, 0.0) for factor in (short, long))
-    bends = [share * end for end in (-first, last - first, last) for share in (0.25, 0.5, 1.0)]
+    bends = [share * end for end, share in product((-first, last - first, last), (0.25, 0.5, 1.0))]
     points = np.concatenate([short - k * long + local for k in range(3)] + bends, axis=1)
     return np.sort(np.rint(points), axis=1)
 

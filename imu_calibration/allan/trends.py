@@ -178,14 +178,14 @@ class TrendSearch:
         """
         span = np.ptp(self.blocks.time) + self.blocks.seconds
         taken = {name for name, _ in chosen}
-        tried = [
-            (name, constant)
-            for name in names
-            if name not in taken
-            for constant in (
-                [share * span for share in SETTLING_SHARES] if name == TURN_ON_TREND else [0.0]
-            )
-        ]
+        tried = []
+        for name in names:
+            if name in taken:
+                continue
+            if name == TURN_ON_TREND:
+                tried += [(name, share * span) for share in SETTLING_SHARES]
+            else:
+                tried.append((name, 0.0))
         scores = []
         for trial in tried:
             values, sd, _ = self.regress(axis, [*chosen, trial])

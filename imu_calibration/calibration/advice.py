@@ -358,11 +358,10 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
             for names in lacking.values()
         )
     knowledge = knowledge_after(hand)
-    parts = {
-        sensor: [hand.param_names.index(name) for name in lacking[sensor]]
-        for sensor in SENSORS
-        if sensor in lacking
-    }
+    parts = {}  # sensor -> places of its parameters, in the order of the sensors
+    for sensor in SENSORS:
+        if sensor in lacking:
+            parts[sensor] = [hand.param_names.index(name) for name in lacking[sensor]]
     plan = foretold(knowledge)[:1] if parts else []
 
     def gain(part: list[int], step: HandStep) -> float:

@@ -194,12 +194,11 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
         model.with_role(limit.sensor, Role.LIMIT).effect_of(limit.sensor, Role.LIMIT).name
         for limit in found.limits
     )
-    rests = {
-        sensor: rest.entry
-        for each in reversed(searches)
-        for sensor, rest in each.unexplained_rests().items()
-        if rest.significant
-    }
+    rests = {}
+    for each in reversed(searches):
+        for sensor, rest in each.unexplained_rests().items():
+            if rest.significant:
+                rests[sensor] = rest.entry
     return ModelChanges(
         (*clipping, *(name for _, name in added)),
         tuple(question.name for question in found.unstable),
@@ -287,11 +286,11 @@ def _strange(found: Sequence[SelectedEffects]) -> dict[str, float]:
 
     The first of several investigations has priority.
     """
-    return {
-        question.name: each.explained.share(each.named, question)
-        for each in reversed(found)
-        for question in each.implausible
-    }
+    shares = {}
+    for each in reversed(found):
+        for question in each.implausible:
+            shares[question.name] = each.explained.share(each.named, question)
+    return shares
 
 
 def _moves(

@@ -110,13 +110,13 @@ class CheckResult:
         """The decision on each sensor with its reason, then the regimes with a larger error."""
         if not self.proof:
             return [f'unproven: {self.why}']
+        decided, worse = [], []
+        for sensor, entry in self.proof.items():
+            decided.append(self._line(sensor, entry))
+            worse += [f'{sensor}: {line}' for line in worse_regimes(entry)]
         return [
-            *(self._line(sensor, entry) for sensor, entry in self.proof.items()),
-            *(
-                f'{sensor}: {line}'
-                for sensor, entry in self.proof.items()
-                for line in worse_regimes(entry)
-            ),
+            *decided,
+            *worse,
             *self._change_lines().values(),
         ]
 

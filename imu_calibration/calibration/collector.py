@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -130,14 +130,14 @@ def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
         return ['plain', values]
     kinds = [_kind(value) for value in values]
     if len(set(kinds)) > 1:
-        each = list(dict.fromkeys(kinds))
+        each: dict[Any, list] = {}  # kind -> its values
+        for value, kind in zip(values, kinds):
+            each.setdefault(kind, []).append(value)
+        order = list(each)
         return [
             'mixed',
-            [each.index(kind) for kind in kinds],
-            [
-                _packed([value for value, own in zip(values, kinds) if own == kind], arrays)
-                for kind in each
-            ],
+            [order.index(kind) for kind in kinds],
+            [_packed(own, arrays) for own in each.values()],
         ]
     first = values[0]
     if isinstance(first, np.ndarray):
@@ -147,7 +147,7 @@ def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
         return [
             'list',
             [len(value) for value in values],
-            _packed([part for value in values for part in value], arrays),
+            _packed(list(chain.from_iterable(values)), arrays),
         ]
     keys = tuple(first) if isinstance(first, dict) else ()
     rows = (

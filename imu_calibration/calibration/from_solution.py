@@ -295,10 +295,8 @@ def weak_on_table(
         solution.covariance[np.ix_(present, present)], tolerances[present], names
     )
     others = _besides(directions, needed, dict(zip(solution.param_names, solution.sd / tolerances)))
-    return tuple(
-        {'parameters': weights, 'needs': need}
-        for weights, need in (*((each, _need(each, needed)) for each in directions), *others)
-    )
+    known = [(weights, _need(weights, needed)) for weights in directions]
+    return tuple({'parameters': weights, 'needs': need} for weights, need in (*known, *others))
 
 
 def _counted(solution: Solution) -> list[str]:

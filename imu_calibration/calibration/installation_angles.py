@@ -67,7 +67,9 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
     blocks = [covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(3)]
     scale_sd = np.array([np.sqrt(axes[i] @ blocks[i] @ axes[i]) for i in range(3)])
     spread = [tangent[i] @ blocks[i] @ tangent[i] for i in range(3)]
-    angles_sd = np.array([[_angle_sd(axes[i], j, spread[i]) for j in range(3)] for i in range(3)])
+    angles_sd = np.empty((3, 3))
+    for i, j in np.ndindex(3, 3):
+        angles_sd[i, j] = _angle_sd(axes[i], j, spread[i])
     between = np.array([_angle(axes[i], axes[j]) for i, j in AXIS_PAIRS])
     between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in AXIS_PAIRS])
     return Derived(

@@ -6,6 +6,7 @@ Windows and solutions while data arrive, with the same result as offline.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -377,7 +378,7 @@ class LiveCalibration:
         # Made by `_begin`.
         assert self._collector is not None
         blocks, self._waiting = self._waiting, []
-        return [window for held_back in blocks for window in self._collector.push(held_back)]
+        return list(chain.from_iterable(map(self._collector.push, blocks)))
 
     def _begin(self, model: SensorModel) -> None:
         session = 0

@@ -66,11 +66,9 @@ from imu_calibration.references.gravity.poses import (
 from imu_calibration.references.gravity.sample_store import HandStore
 from imu_calibration.references.options import CalibrationOptions
 
-FACE_DIRECTIONS = {
-    f'{sign}{axis}': direction
-    for axis, unit in zip('xyz', np.eye(3))
-    for sign, direction in (('+', unit), ('-', -unit))
-}
+FACE_DIRECTIONS = dict(
+    zip(('+x', '-x', '+y', '-y', '+z', '-z'), np.kron(np.eye(3), [[1.0], [-1.0]]))
+)
 """The six directions that can be turned up."""
 FACE_REACH = np.pi / 4
 """A face counts as seen when an attitude lies within this angle of it, rad."""

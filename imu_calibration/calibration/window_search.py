@@ -45,9 +45,7 @@ def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
     The largest recording is first.
     """
     return [
-        windows
-        for windows in (spread.windows for spread in gathered.spreads)
-        if len(windows) >= MIN_FOLD_WINDOWS
+        spread.windows for spread in gathered.spreads if len(spread.windows) >= MIN_FOLD_WINDOWS
     ]
 
 

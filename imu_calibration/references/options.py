@@ -92,17 +92,9 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     model = with_common_arm(model) if table.mount_xyz is None else model
     for sensor, name in options.added:
         model = model if (sensor, name) in model.slices else model.with_effect(sensor, name)
-    return replace(
-        model,
-        point={
-            **model.point,
-            **{
-                name: value
-                for name, value in options.point.items()
-                if any(e.name == name for e in model.effects)
-            },
-        },
-    )
+    known = {effect.name for effect in model.effects}
+    point = {name: value for name, value in options.point.items() if name in known}
+    return replace(model, point={**model.point, **point})
 
 
 def settle_model(

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, combinations_with_replacement, product
+from itertools import chain, combinations, combinations_with_replacement, product
 
 import numpy as np
 from scipy.linalg import svd
@@ -65,14 +65,11 @@ class Formula:
     @property
     def family(self) -> frozenset[str]:
         """Quantities in it."""
-        texts = [
-            text
-            for column in self.columns
-            for text in ((column,) if isinstance(column, str) else column)
-        ]
-        return frozenset(QUANTITY_OF[name] for text in texts for name in names_in(read(text))) - {
-            'reference temperature'
-        }
+        quantities = set()
+        for column in self.columns:
+            for text in (column,) if isinstance(column, str) else column:
+                quantities.update(QUANTITY_OF[name] for name in names_in(read(text)))
+        return frozenset(quantities) - {'reference temperature'}
 
     @property
     def smooth(self) -> bool:
@@ -129,7 +126,7 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
 
 def _atoms(*letters: str) -> list[Product]:
     kinds = {'f': 'force', 'w': 'rate', 'alpha': 'angular acceleration'}
-    return [(f'{letter}_{a}', (kinds[letter],)) for letter in letters for a in AXES]
+    return [(f'{letter}_{a}', (kinds[letter],)) for letter, a in product(letters, AXES)]
 
 
 def _sense(text: str) -> str:
@@ -138,23 +135,25 @@ def _sense(text: str) -> str:
 
 def _times(*parts: Product) -> Product:
     """Return (text, factors) of a product, powers gathered."""
-    texts, factors = (
-        [text for text, _ in parts],
-        tuple(factor for _, own in parts for factor in own),
-    )
-    powers = {text: texts.count(text) for text in texts}
-    return ' * '.join(
-        text if power == 1 else f'{text} ** {power}' for text, power in powers.items()
-    ), factors
+    powers: Counter[str] = Counter()
+    factors: list[str] = []
+    for text, own in parts:
+        powers[text] += 1
+        factors += own
+    written = [text if power == 1 else f'{text} ** {power}' for text, power in powers.items()]
+    return ' * '.join(written), tuple(factors)
 
 
-def _monomials(degree: int) -> list[Product]:
-    return [_times(*parts) for parts in combinations_with_replacement(_atoms('f', 'w'), degree)]
+def _monomials(atoms: Sequence[Product], highest: int) -> Iterator[Product]:
+    """Yield the products of up to so many atoms, repetition allowed."""
+    for degree in range(1, highest + 1):
+        for parts in combinations_with_replacement(atoms, degree):
+            yield _times(*parts)
 
 
 def _of_motion() -> Iterator:
     felt = _atoms('f', 'w')
-    yield from (entry for degree in (1, 2, 3) for entry in _monomials(degree))
+    yield from _monomials(felt, 3)
     yield from _atoms('alpha')
     yield from (_times(*pair) for pair in product(_atoms('alpha'), felt))
     for text, own in felt:
@@ -167,23 +166,24 @@ def _of_motion() -> Iterator:
 
 
 def _slow(thermal: bool, duration: float) -> Iterator:
-    warm = [(TEMPERATURE_FACTOR, ('temperature',))] if thermal else []
+    felt, warm = _atoms('f', 'w'), (TEMPERATURE_FACTOR, ('temperature',))
     if thermal:
         yield 'temperature_rate', ('temperature rate',)
     settles = [(f'(1 - exp(-time / {share * duration:.3g}))', ()) for share in CONSTANTS] + [
         ('time', ('time',))
     ]
-    yield from (
-        (f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power)
-        for power in (2, 3)
-        if thermal
-    )
-    for slow in (*warm, *settles):
-        yield from (_times(slow, entry) for degree in (1, 2) for entry in _monomials(degree))
-        for text, own in _atoms('f', 'w'):
+    if thermal:
+        for power in (2, 3):
+            yield f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power
+    for slow in ([warm] if thermal else []) + settles:
+        for entry in _monomials(felt, 2):
+            yield _times(slow, entry)
+        for text, own in felt:
             yield _times(slow, (f'abs({text})', own))
             yield _times(slow, (_sense(text), ()))
-    yield from (_times(*warm, *warm, entry) for entry in _monomials(1) if thermal)
+    if thermal:
+        for atom in felt:
+            yield _times(warm, warm, atom)
 
 
 def _turn(joint: int, order: int, before: str = '') -> tuple[str, str, str]:
@@ -216,28 +216,28 @@ def _of_joint_rates(n_joints: int) -> Iterator[Formula]:
         yield Formula((f'abs({text})',), own)
         yield Formula((SOFT_SIGN.format(text),), ())
         yield Formula((f'{text} * abs({text})',), own * 2)
-    yield from (
-        Formula((text,), own)
-        for degree in (1, 2)
-        for text, own in (_times(*p) for p in combinations_with_replacement(rates, degree))
-    )
+    for text, own in _monomials(rates, 2):
+        yield Formula((text,), own)
 
 
 def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
     """Yield vectors fixed to the level frame while the sensor turns."""
     joints = range(1, n_joints + 1)
-    vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
+    vectors = [tuple(f'c_{axis}{level}' for axis in AXES) for level in AXES]
     befores: list[tuple[str, tuple[str, ...]]] = [('', ())]
     if thermal:
         befores.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
     befores += [(f'joint_rate_{joint} * ', ('joint rate',)) for joint in joints]
     for before, factors in befores:
-        yield Formula(tuple(tuple(before + text for text in vector) for vector in vectors), factors)
+        yield Formula(tuple(_prefixed(before, vector) for vector in vectors), factors)
     for vector, joint, order in product(vectors, joints, FEW_ORDERS):
-        yield Formula(
-            tuple(tuple(f'{wave} * {text}' for text in vector) for wave in _turn(joint, order)[:2]),
-            (),
-        )
+        cosine, sine, _ = _turn(joint, order)
+        waves = _prefixed(f'{cosine} * ', vector), _prefixed(f'{sine} * ', vector)
+        yield Formula(waves, ())
+
+
+def _prefixed(before: str, vector: Sequence[str]) -> tuple[str, ...]:
+    return tuple(before + text for text in vector)
 
 
 NEW = 1e-3
@@ -290,12 +290,10 @@ class FormulaSearch:
         reference_temperature: float,
     ):
         self.blocks, self.formulas = blocks, formulas
-        self._place = {
-            text: k
-            for k, text in enumerate(
-                dict.fromkeys(t for f in formulas for column in f.columns for t in _three(column))
-            )
-        }
+        self._place: dict[str, int] = {}  # text -> its number, in the order of first use
+        for formula in formulas:
+            for text in chain.from_iterable(map(_three, formula.columns)):
+                self._place.setdefault(text, len(self._place))
         self.means = self._worked_out(tuple(self._place), reference_temperature)
         whiten = blocks.white[0]
         every = whiten(np.concatenate([*blocks.design, self.means], axis=1))
@@ -391,18 +389,16 @@ class FormulaSearch:
     def _at(self, column: Column) -> list[int]:
         return [self._place[text] for text in _three(column)]
 
+    def _places(self, formula: Formula, axis: int) -> list[int]:
+        return [self._at(column)[axis] for column in formula.columns]
+
     def _gains(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (fall of chi-square, number of amplitudes) of each formula, shape (n,) both."""
         gains, counts = np.zeros(len(self.formulas)), np.zeros(len(self.formulas))
         for width in {len(formula.columns) for formula in self.formulas}:
             chosen = [k for k, formula in enumerate(self.formulas) if len(formula.columns) == width]
             for axis in range(3):
-                at = np.array(
-                    [
-                        [self._at(column)[axis] for column in self.formulas[k].columns]
-                        for k in chosen
-                    ]
-                )
+                at = np.array([self._places(self.formulas[k], axis) for k in chosen])
                 free = self._free[axis]
                 size = np.sqrt(np.maximum(np.einsum('bt,bt->t', free, free), 1e-300))
                 slopes = (free.T @ self._rest[axis]) / size

@@ -137,10 +137,9 @@ def gain_in_turn(
                 ]
             )
             pair.append(_squares(problem.all_samples, values[fold], sensor))
-        of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
-        found += [
-            (gain_of(sensor, measure, each), _certainty(each)) for measure, each in of.items()
-        ]
+        for measure in MEASURES:
+            each = [squares[measure] for squares in pair]
+            found.append((gain_of(sensor, measure, each), _certainty(each)))
     most = max(
         (gain for gain, _ in found if gain.measure != REST_MEASURE), key=lambda gain: gain.least
     )

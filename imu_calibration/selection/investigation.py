@@ -238,10 +238,8 @@ class _Trial:
     @property
     def rank(self) -> tuple[int, int, int]:
         """Numbers of its lags that are named and chosen, then the order of the trials."""
-        named, chosen = (
-            len(self.lags & {question.name for question in some})
-            for some in (self.outcome.named, self.outcome.chosen)
-        )
+        named = sum(question.name in self.lags for question in self.outcome.named)
+        chosen = sum(question.name in self.lags for question in self.outcome.chosen)
         return named, chosen, -self.number
 
     @property

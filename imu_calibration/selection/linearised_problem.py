@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from typing import AbstractSet
 
 import numpy as np
@@ -100,7 +101,9 @@ class LinearisedProblem:
             values=values,
             bank=make_bank(effects, self.constants, model, values=values),
         )
-        used = tuple(k for e in baseline.effects for k in range(len(values))[model.slices[e.key]])
+        places = range(len(values))
+        own = chain.from_iterable(places[model.slices[effect.key]] for effect in baseline.effects)
+        used = tuple(own)  # parameters of the baseline within the full model
         judged = recording.select(~locked)
         if point is None:
             judged = _at_baseline(judged, baseline, used)

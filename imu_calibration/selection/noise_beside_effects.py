@@ -255,6 +255,9 @@ def _with_bias_process(
         )
     )
     smooth_columns = rows[:, :, len(structural) : -1]
+    options = []  # columns of each smooth effect
+    for parameters in smooth:
+        options.append([place[k] - len(structural) for k in parameters])
     wander = _WanderProblem(
         recording=recording,
         noise=noise[sensor],
@@ -262,7 +265,7 @@ def _with_bias_process(
         n_structural=len(structural),
         white=white,
         information=_known_otherwise(space, sensor, noise, own),
-        options=[[place[k] - len(structural) for k in parameters] for parameters in smooth],
+        options=options,
         prior_sd=drift_prior(
             smooth_columns, space.prior_sd[superfluous], max(natural, STABLE[sensor])
         ),

@@ -6,6 +6,7 @@ Biases after a shock, exchanged axes, a displaced mount, a belt that slipped, a 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -81,7 +82,7 @@ class Onset:
     @property
     def axes(self) -> tuple[str, ...]:
         """Axes of any sensor that change."""
-        return tuple(dict.fromkeys(axis for own in self.sensor_axes.values() for axis in own))
+        return tuple(dict.fromkeys(chain.from_iterable(self.sensor_axes.values())))
 
     def to_mapping(self) -> dict:
         """Return the onset as plain data."""
@@ -391,13 +392,12 @@ def _refined(
     """
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
     noise = dict(zip(SENSORS, np.median([w.noise_sd for w in near], axis=0)))
-    found = [
-        residuals(near, table, model, values=state[: len(model.param_names)]) for state in states
-    ]
-    squares = [
-        sum(((rest / noise[sensor]) ** 2).sum(axis=1) for sensor, rest in of_sensors.items())
-        for of_sensors in found
-    ]
+    squares = []  # of each state, in noise: one sum for each sample
+    for state in states:
+        rests = residuals(near, table, model, values=state[: len(model.param_names)])
+        squares.append(
+            sum(((rest / noise[sensor]) ** 2).sum(axis=1) for sensor, rest in rests.items())
+        )
     time, cost = np.concatenate([w.time for w in near]), np.cumsum(squares[0] - squares[1])[:-1]
     gap, weight = np.diff(time), np.exp((cost.min() - cost) / 2) * np.diff(time)
     middle = time[:-1] + gap / 2

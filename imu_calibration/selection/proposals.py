@@ -6,6 +6,7 @@ Search, test on held-out windows, description and a term for a model.
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -258,7 +259,8 @@ def _proposal_of(
     plain: BlockFit,
     choices: Sequence[FormulaChoice],
 ) -> Proposal:
-    terms = [entry for choice in choices for entry in _shapes(fits, choices, choice)][:MOST_TERMS]
+    shapes = chain.from_iterable(_shapes(fits, choices, choice) for choice in choices)
+    terms = list(shapes)[:MOST_TERMS]
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)
     share = share_removed(plain, after)
@@ -401,14 +403,8 @@ def _size(effect: Effect, values: np.ndarray, sd: np.ndarray) -> str:
 
 
 def _motion(effects: Iterable[Effect]) -> str:
-    return '; '.join(
-        dict.fromkeys(
-            ALL_MOTIONS[name]
-            for effect in effects
-            for name in effect.motion[:1]
-            if name in ALL_MOTIONS
-        )
-    )
+    first = dict.fromkeys(effect.motion[0] for effect in effects if effect.motion)
+    return '; '.join(dict.fromkeys(ALL_MOTIONS[name] for name in first if name in ALL_MOTIONS))
 
 
 def _nearest(

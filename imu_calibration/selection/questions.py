@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.session_noise import VIBRATES
 from imu_calibration.estimation.solution import Solution
@@ -190,10 +190,9 @@ def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel
     The exceptions are warm-ups and saturation.
     """
     kept = [e for e in effects if e.warp is not None or not special(e)]
-    added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SECTIONS}
-    return replace(
-        model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()}
-    )
+    for effect in kept:
+        model = model.with_effect(effect.sensor, effect.name)
+    return model
 
 
 def point_with(

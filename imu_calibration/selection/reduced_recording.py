@@ -5,6 +5,7 @@ A recording reduced to factors: columns at a bank of time constants, windows of 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -331,10 +332,13 @@ class ReducedRecording:
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
         """Return the recording of the windows `rows` (mask) alone."""
         chosen = np.flatnonzero(rows)
+        factors = {}
+        for key, each in self.factors.items():
+            factors[key] = [each[k] for k in chosen]
         return replace(
             self,
             windows=tuple(self.windows[k] for k in chosen),
-            factors={key: [factors[k] for k in chosen] for key, factors in self.factors.items()},
+            factors=factors,
             describe={name: values[rows] for name, values in self.describe.items()},
         )
 
@@ -348,16 +352,13 @@ class ReducedRecording:
 
     def _with_factors(self, k: int) -> WindowStatistics:
         """Return a window with its triangular factors."""
-        sensors = {
-            sensor: replace(
-                known,
-                **{
-                    part: unpacked([self.factors[sensor, part][k]], self._width(sensor))[0]
-                    for part in FACTOR_PARTS
-                },
-            )
-            for sensor, known in self.windows[k].sensors.items()
-        }
+        sensors = {}
+        for sensor, known in self.windows[k].sensors.items():
+            factors = {}
+            for part in FACTOR_PARTS:
+                packed_factor = self.factors[sensor, part][k]
+                factors[part] = unpacked([packed_factor], self._width(sensor))[0]
+            sensors[sensor] = replace(known, **factors)
         return replace(self.windows[k], sensors=sensors)
 
 
@@ -386,7 +387,7 @@ def reduce_recording(
     """
     reduced = []
     factors: dict[tuple[str, str], list[np.ndarray]] = {
-        (sensor, part): [] for sensor in sensors_of(windows) for part in FACTOR_PARTS
+        key: [] for key in product(sensors_of(windows), FACTOR_PARTS)
     }
     for some in chunks(windows):
         for window in reduce_windows(
@@ -395,25 +396,16 @@ def reduce_recording(
             for (sensor, part), kept in factors.items():
                 factor = getattr(window.sensors[sensor], part)
                 kept.append(np.zeros(0) if factor is None else packed(factor))
-            reduced.append(
-                replace(
-                    window,
-                    sensors={
-                        sensor: replace(known, within=known.within[:0].copy(), slow=None)
-                        for sensor, known in window.sensors.items()
-                    },
-                )
-            )
+            bare = {}  # without the factors, which are kept packed
+            for sensor, known in window.sensors.items():
+                bare[sensor] = replace(known, within=known.within[:0].copy(), slow=None)
+            reduced.append(replace(window, sensors=bare))
         report(REDUCING, len(reduced), len(windows))
     descriptions = [_describe(window) for window in windows]
-    return ReducedRecording(
-        model,
-        values,
-        bank,
-        tuple(reduced),
-        factors,
-        {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]},
-    )
+    describe = {}
+    for name in descriptions[0]:
+        describe[name] = np.array([description[name] for description in descriptions])
+    return ReducedRecording(model, values, bank, tuple(reduced), factors, describe)
 
 
 def _describe(window: Window) -> dict[str, float]:

@@ -59,12 +59,10 @@ class Variable:
         Ranges of neighbouring bins, 1 in each bin of a range, the shortest first, shape (r, k).
         """
         count, places = int(self.bins.max()) + 1, np.arange(int(self.bins.max()) + 1)
-        parts = [
-            (places - first) % count < length
-            for length in range(1, count)
-            for first in range(count)
-            if self.cyclic or first + length <= count
-        ]
+        parts = []
+        for length in range(1, count):
+            starts = count if self.cyclic else count - length + 1
+            parts += [(places - first) % count < length for first in range(starts)]
         return np.array(parts, float).reshape(-1, count)
 
     @property

@@ -7,6 +7,7 @@ Permutation test, and comparison with smooth curves and formulas.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import combinations
 
 import numpy as np
 
@@ -521,8 +522,7 @@ def _tightened(chosen: Sequence[int], excess: np.ndarray) -> Sequence[int]:
     sums = np.append(0.0, np.cumsum(excess[chosen]))
     parts = [
         (first, last)
-        for first in range(len(chosen))
-        for last in range(first + 1, len(chosen) + 1)
+        for first, last in combinations(range(len(sums)), 2)
         if sums[last] - sums[first] >= NEARLY_ALL * sums[-1]
     ]
     first, last = min(parts, key=lambda part: (part[1] - part[0], sums[part[0]] - sums[part[1]]))

@@ -7,6 +7,7 @@ Supported effects, without findings that a formula or a regime replaces.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -162,7 +163,7 @@ class ResidualAnalysis(Investigation):
         if proposal is None:
             return None
         blocks = self.blocks[sensor]
-        groups = [group for effect in proposal.effects for group in effect.groups]
+        groups = list(chain.from_iterable(effect.groups for effect in proposal.effects))
         known = {'temperature_ref_c': self.problem.recording.model.temperature_ref_c}
         means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
         return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
@@ -355,9 +356,8 @@ def _done_without(found: ResidualAnalysis, question: Question) -> bool:
     if not asked:
         return False
     others = [other for other in found.named if other is not question]
-    kept, left_out = (
-        {sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others)
-    )
+    kept = {sensor: found.fits(sensor, found.named) for sensor in sensors}
+    left_out = {sensor: found.fits(sensor, others) for sensor in sensors}
     alone = {
         sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors
     }

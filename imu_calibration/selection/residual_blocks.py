@@ -462,9 +462,9 @@ class BlockFits:
         prior_mean: np.ndarray,
     ):
         self.blocks, self.used, self._prior = blocks, frozenset(used), (prior_sd, prior_mean)
-        self._design = [
-            [white(part, axis) for axis, part in enumerate(blocks.design)] for white in blocks.white
-        ]
+        self._design = []  # of each part of the recording, one array for each axis
+        for white in blocks.white:
+            self._design.append([white(part, axis) for axis, part in enumerate(blocks.design)])
         self._at = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
 
     def fit(
@@ -601,12 +601,11 @@ def share_interval(
 ) -> tuple[float, float]:
     """Return the 95 % interval of `share_removed`, by resampling locked windows."""
     windows = np.unique(before.window)
-    sums = np.array(
-        [
-            [(fit.rest[before.window == w] ** 2 - 1.0).sum() for w in windows]
-            for fit in (before, after)
-        ]
-    )
+    sums = np.empty((2, len(windows)))  # excess of each window before and after
+    for k, window in enumerate(windows):
+        inside = before.window == window
+        sums[0, k] = (before.rest[inside] ** 2 - 1.0).sum()
+        sums[1, k] = (after.rest[inside] ** 2 - 1.0).sum()
     drawn = sums[:, rng.integers(len(windows), size=(SHARE_RESAMPLES, len(windows)))].sum(axis=2)
     shares = 1.0 - np.maximum(drawn[1], 0.0) / np.maximum(drawn[0], 1e-300)
     low, high = np.quantile(shares, (0.025, 0.975))

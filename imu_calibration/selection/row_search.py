@@ -30,12 +30,10 @@ class RowProblem:
         *,
         baseline: Sequence[int],
     ):
-        smooth = [
-            k
-            for q in questions
-            if q.effect.smooth and not q.effect.time_constant
-            for k in q.parameters
-        ]
+        smooth: list[int] = []
+        for question in questions:
+            if question.effect.smooth and not question.effect.time_constant:
+                smooth += question.parameters
         self.blocks, self.space, self.questions = blocks, space, questions
         self.evidence = RowEvidence(blocks, space, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)
@@ -121,13 +119,10 @@ class RowProblem:
 
         The improvement is by cross-validation of the fit.
         """
-        squares = [
-            [
-                np.sum(rest**2)
-                for rest in self.evidence.heldout_residuals(self.search.indices(choice))
-            ]
-            for choice in (before, after)
-        ]
+        squares = []
+        for choice in (before, after):
+            rests = self.evidence.heldout_residuals(self.search.indices(choice))
+            squares.append([np.sum(rest**2) for rest in rests])
         own = [k for k, block in enumerate(self.blocks) if block.sensor == sensor]
         return self.blocks[min(own, key=lambda k: squares[1][k] / max(squares[0][k], 1e-300))]
 

@@ -260,9 +260,9 @@ def without_clipping(
                 part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd
             )
         )
-    entries = [
-        (window.time[0], number, window) for number, part in enumerate(kept) for window in part
-    ]
+    entries = []
+    for number, part in enumerate(kept):
+        entries += [(window.time[0], number, window) for window in part]
     in_order = sorted(entries, key=lambda entry: entry[:2])
     return (
         [window for *_, window in in_order],
@@ -293,10 +293,10 @@ def _limits(
     suspects = [sensor for sensor in sensors_of(windows) if may_be_clipped(windows, sensor)]
     if not suspects:
         return nothing
-    limits = {
-        sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows))
-        for sensor in suspects
-    }
+    limits = {}
+    for sensor in suspects:
+        largest = [np.abs(measured(window, sensor)).max() for window in windows]
+        limits[sensor] = float(max(largest))
     noise_sd = {sensor: sample_sd_at_rest(windows, sensor) for sensor in sensors_of(windows)}
     kept = windows
     for _ in range(2):
@@ -306,12 +306,9 @@ def _limits(
             return nothing  # output that is always at or near its limit does not determine it
     values = simple_fit(kept, table, model)
     predicted = predictions(windows, table, model, values=values)
-    found = [
-        limit
-        for limit in (
-            find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor)
-            for sensor in suspects
-        )
-        if limit
-    ]
+    found = []
+    for sensor in suspects:
+        limit = find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor)
+        if limit:
+            found.append(limit)
     return found, noise_sd, values

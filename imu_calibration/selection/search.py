@@ -6,6 +6,7 @@ With earlier choices reconsidered after each step.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import AbstractSet, Any, ClassVar
 
 import numpy as np
@@ -128,7 +129,7 @@ class Search:
 
     def indices(self, chosen: Sequence[Question]) -> tuple[int, ...]:
         """Return the parameters of the baseline and of the chosen effects."""
-        return self.baseline + tuple(k for q in chosen for k in q.parameters)
+        return (*self.baseline, *chain.from_iterable(q.parameters for q in chosen))
 
     def others(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the questions about effects that are not chosen, and not resolved."""

@@ -319,23 +319,17 @@ def find_tones(
     both = [np.concatenate(pair, axis=1) for pair in zip(*parts.values())]
     orders = [orders_of(found.used, both, joint) for joint in range(len(table.joint_names))]
     for place, (sensor, own) in enumerate(parts.items()):
-        turning = (
-            tone
-            for joint, name in enumerate(table.joint_names)
-            for tone in (
-                *of_stretches(sensor, _stretches(found.used, own, joint), name),
-                *_whole(sensor, orders[joint], name, place=place),
-            )
-        )
+        turning: list[Tone] = []
+        for joint, name in enumerate(table.joint_names):
+            turning += of_stretches(sensor, _stretches(found.used, own, joint), name)
+            turning += _whole(sensor, orders[joint], name, place=place)
         tones[sensor] |= _significant(turning, tests)
     rested = any(window.kind == 'static' for window in found.used)
-    return {
-        sensor: tuple(
-            replace(tone, rested=rested)
-            for tone in sorted(every.values(), key=lambda tone: tone.p_value)
-        )
-        for sensor, every in tones.items()
-    }
+    surest_first = {}
+    for sensor, every in tones.items():
+        in_order = sorted(every.values(), key=lambda tone: tone.p_value)
+        surest_first[sensor] = tuple(replace(tone, rested=rested) for tone in in_order)
+    return surest_first
 
 
 def _significant(tones: Iterable[Tone], tests: int) -> dict[tuple[str, str | None], Tone]:

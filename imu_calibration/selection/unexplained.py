@@ -284,8 +284,14 @@ def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray
         if name.startswith('angle'):
             number = name[len('angle') :]
             angle, known = describe[name], describe['span' + number] < 0.7
-            turns = np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1)
-            yield f'angle of {recording.model.joint_names[int(number)]}', turns, known
+            turns = []
+            for multiple in (1, 2, 3):
+                turns += [np.cos(multiple * angle), np.sin(multiple * angle)]
+            yield (
+                f'angle of {recording.model.joint_names[int(number)]}',
+                np.stack(turns, axis=1),
+                known,
+            )
     yield IN_MOTION, recording.moving[:, None].astype(float), every
 
 

@@ -374,7 +374,10 @@ def _blocks_of(
 def _joined(parts: Sequence[ResidualBlocks]) -> ResidualBlocks:
     """Return the blocks of all parts; the temperature is known only if each part has it."""
     temperatures = [part.temperature_c for part in parts if part.temperature_c is not None]
-    sensors = parts[0].before
+    before, after = {}, {}
+    for sensor in parts[0].before:
+        before[sensor] = np.concatenate([part.before[sensor] for part in parts])
+        after[sensor] = np.concatenate([part.after[sensor] for part in parts])
     return ResidualBlocks(
         time=np.concatenate([part.time for part in parts]),
         kind=np.concatenate([part.kind for part in parts]),
@@ -382,8 +385,8 @@ def _joined(parts: Sequence[ResidualBlocks]) -> ResidualBlocks:
         force_s=np.concatenate([part.force_s for part in parts]),
         rate_s=np.concatenate([part.rate_s for part in parts]),
         temperature_c=np.concatenate(temperatures) if len(temperatures) == len(parts) else None,
-        before={name: np.concatenate([part.before[name] for part in parts]) for name in sensors},
-        after={name: np.concatenate([part.after[name] for part in parts]) for name in sensors},
+        before=before,
+        after=after,
         samples=np.concatenate([part.samples for part in parts]),
     )
 

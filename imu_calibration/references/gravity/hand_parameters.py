@@ -6,6 +6,7 @@ Bias and matrix of both sensors, and further effects of the catalogue.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 
@@ -137,14 +138,17 @@ class HandModel:
     def base_index(self, sensor: str) -> np.ndarray:
         """Return the estimated parameters of bias and matrix of one sensor."""
         parts = [self.model.part(sensor, role) for role in (Role.OFFSET, Role.LINEAR)]
-        return np.array(
-            [k for part in parts for k in range(part.start, part.stop) if not self.fixed[k]]
-        )
+        places = np.concatenate([self._places(part) for part in parts])
+        return places[~self.fixed[places]]
 
     def extra_index(self, sensor: str) -> np.ndarray:
         """Return the parameters of the further effects of one sensor."""
         parts = [self.model.slices[e.key] for e in self.extras if e.sensor == sensor]
-        return np.array([k for part in parts for k in range(part.start, part.stop)], int)
+        return np.concatenate([np.zeros(0, int), *map(self._places, parts)])
+
+    @staticmethod
+    def _places(part: slice) -> np.ndarray:
+        return np.arange(part.start, part.stop)
 
     def linear(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """
@@ -154,8 +158,7 @@ class HandModel:
         """
         found = (
             values[self.model.part(sensor, role)]
-            for sensor in SENSORS
-            for role in (Role.OFFSET, Role.LINEAR)
+            for sensor, role in product(SENSORS, (Role.OFFSET, Role.LINEAR))
         )
         bias_f, matrix_f, bias_w, matrix_w = found
         return bias_f, matrix_f.reshape(3, 3), bias_w, matrix_w.reshape(3, 3)

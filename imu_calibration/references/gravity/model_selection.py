@@ -124,13 +124,10 @@ class HandInvestigation(SelectedEffects):
         """
         hand, point, fit = self.baseline, self.point(problem, chosen), problem.search.values(chosen)
         base = hand.model
-        names = {
-            sensor: getattr(base, sensor) + tuple(q.name for q in chosen if q.sensor == sensor)
-            for sensor in SENSORS
-        }
-        model = replace(
-            hand.hand_model, model=replace(base, **names, point={**base.point, **point})
-        )
+        extended = base
+        for question in chosen:
+            extended = extended.with_effect(question.sensor, question.name)
+        model = replace(hand.hand_model, model=replace(extended, point={**base.point, **point}))
         values = model.model.start_from(base, hand.values + fit[: hand.hand_model.size])
         for question in chosen:
             if question.name not in point:

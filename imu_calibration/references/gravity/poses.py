@@ -60,15 +60,11 @@ def average_poses(
     }
     noise = {sensor: _pooled_noise(part, rounding[sensor]) for sensor, part in parts.items()}
     count, kinds = np.array([b - a for a, b in ranges]), ['static'] * len(ranges)
-    means = [np.array([part.mean(0) for part in parts[sensor]]) for sensor in SENSORS]
-    sems = [
-        np.sqrt(
-            _with_rounding(
-                noise[sensor].mean_variance(kinds, count), parts[sensor], rounding[sensor]
-            )
-        )
-        for sensor in SENSORS
-    ]
+    means, sems = [], []
+    for sensor in SENSORS:
+        means.append(np.array([part.mean(0) for part in parts[sensor]]))
+        variance = noise[sensor].mean_variance(kinds, count)
+        sems.append(np.sqrt(_with_rounding(variance, parts[sensor], rounding[sensor])))
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
     length = 1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start])
@@ -299,11 +295,10 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
     fresh = np.ones(len(rate), bool)  # a reading published twice is one reading
     fresh[1:] = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rate.T])
     ended = np.zeros(len(rate), bool)
-    for signed, axes in (
-        (np.abs, range(3)),
-        *((signed, [axis]) for axis in range(3) for signed in (np.positive, np.negative)),
-    ):
-        ended |= _at_end(signed, rate.T[axes], fresh)
+    ended |= _at_end(np.abs, rate.T, fresh)
+    for axis in rate.T:
+        for signed in (np.positive, np.negative):
+            ended |= _at_end(signed, axis[None], fresh)
     return ended
 
 
@@ -421,13 +416,9 @@ def _clock_times(stamps: np.ndarray, period: float) -> np.ndarray:
 
 def _clock_line(number: np.ndarray, time: np.ndarray, pieces: int) -> np.ndarray:
     line = np.polynomial.Polynomial.fit(number, time, 1)(number)
-    means = np.array(
-        [
-            [part.mean() for part in np.array_split(values, pieces)]
-            for values in (number, time - line)
-        ]
-    )
-    return line + np.interp(number, *means)
+    middles = [part.mean() for part in np.array_split(number, pieces)]
+    late = [part.mean() for part in np.array_split(time - line, pieces)]
+    return line + np.interp(number, middles, late)
 
 
 def _roughness(time: np.ndarray, rate: np.ndarray) -> float:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -247,7 +248,9 @@ class HeldOut:
     @property
     def sensors(self) -> tuple[str, ...]:
         """Sensors with pieces for judging."""
-        found = {sensor for block in self.blocks for sensor, _ in block.pieces}
+        found: set[str] = set()
+        for block in self.blocks:
+            found.update(sensor for sensor, _ in block.pieces)
         return tuple(sensor for sensor in SENSORS if sensor in found)
 
     @property
@@ -419,12 +422,8 @@ class SessionData:
         """
         Moving windows with all their kept samples; live, the windows of the search of effects.
         """
-        return self.kept or [
-            window
-            for spread in self.spreads
-            for window in spread.windows
-            if window.kind != 'static'
-        ]
+        windows = chain.from_iterable(spread.windows for spread in self.spreads)
+        return self.kept or [window for window in windows if window.kind != 'static']
 
     @property
     def duration(self) -> float:

@@ -209,10 +209,11 @@ def reduce_windows(
     references = references_of(windows, model, table)
     designs = {sensor: column_function(references, sensor) for sensor in SENSORS}
     edges = np.cumsum([0] + [len(window.motion) for window in windows])
-    return [
-        _reduced(window, {sensor: design[a:b] for sensor, design in designs.items()}, session)
-        for window, a, b in zip(windows, edges, edges[1:])
-    ]
+    reduced = []
+    for window, first, last in zip(windows, edges, edges[1:]):
+        own = {sensor: design[first:last] for sensor, design in designs.items()}
+        reduced.append(_reduced(window, own, session))
+    return reduced
 
 
 def reduce_window(
