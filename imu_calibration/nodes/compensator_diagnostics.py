@@ -113,8 +113,8 @@ class CompensatorDiagnostics:
                 f'corrected with calibration {adopted.version}'
                 f' ({decisions_text(adopted.calibration.decisions)})'
             )
-        elif node.unready:
-            good = f'{node.unready}; {self._uncorrected()}'
+        elif self._unready():
+            good = f'{self._unready()}; {self._uncorrected()}'
         frame_id = '' if adopted is None else adopted.calibration.frame_id
         return [
             *self._health(compensation, frame_id),
@@ -192,6 +192,15 @@ class CompensatorDiagnostics:
             return 'messages pass unchanged'
         return 'nothing is published'
 
+    def _unready(self):
+        """Return which calibration is in progress while there is none and no fault; else ''."""
+        node = self._node
+        if node.unready or node.problem or node.awaited or node.adopted is not None:
+            return node.unready
+        if node.settings.takes_topic and node.documents.publishers:
+            return f'{", ".join(node.documents.names())} has not sent a calibration yet'
+        return ''
+
     def _lines(self, compensation):
         """Return (faults that prevent correction, notes), one line each."""
         node = self._node
@@ -202,7 +211,7 @@ class CompensatorDiagnostics:
                 + (f'; calibration {node.adopted.version} remains in use' if node.adopted else '')
             )
         if compensation is None:
-            if node.unready:
+            if self._unready():
                 return serious, []
             what = self._uncorrected()
             waiting = (
