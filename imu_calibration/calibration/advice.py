@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.units import DEG
-from imu_calibration.document.rest_noise import moved_at_rest
+from imu_calibration.document.rest_noise import motions_at_rest
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.estimation.observability import sd_excess, share_gained
 from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY, TURNS_REMEDY, remedy
@@ -400,7 +400,7 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
     # A turn is compared with the directions of gravity before and after it, so that a moved
     # accelerometer spoils it as well.
     used_sensors = SENSORS if of_turns else (hand.param_names[index].partition('.')[0],)
-    if any(moved_at_rest(hand.statistics, sensor) for sensor in used_sensors):
+    if motions_at_rest(hand.statistics, used_sensors):
         return MOVED_REMEDY
 
     # More turns are left out as well where most of them contradict gravity.

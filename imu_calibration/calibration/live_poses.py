@@ -41,6 +41,7 @@ from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.outcome import parameter_count
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import (
     COMMON_SCALE,
@@ -50,12 +51,14 @@ from imu_calibration.estimation.solution import (
     tolerances_of,
 )
 from imu_calibration.kinematics.rotations import unit_rows
+from imu_calibration.preprocessing.absent_sensor import without_sensor
+from imu_calibration.preprocessing.checks import frozen_text
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.sensor_join import delay_of
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.references.gravity.equations import Poses
+from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.hand_calibration import MIN_ATTITUDES, POSES_FULL
 from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions, hand_options
 from imu_calibration.references.gravity.poses import (
@@ -90,6 +93,8 @@ class PoseScan:
     """Reason -> number of unusable turns."""
     resting: float
     """Duration of the current rest, s; 0 in motion."""
+    absent: tuple[str, ...] = ()
+    """Sensors without readings."""
 
 
 EMPTY_SCAN = PoseScan([], None, 0, 0, {}, 0.0)
@@ -102,10 +107,14 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> PoseScan:
         return EMPTY_SCAN
     seconds = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
     poses = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
-    turns, dropped = collect_turns(seconds, imu, poses=poses)
+    turns: list[TurnData] = []
+    dropped: dict[str, int] = {}
+    if not imu.absent:  # a turn relates both sensors
+        turns, dropped = collect_turns(seconds, imu, poses=poses)
     goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
     resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
-    return PoseScan(rests, poses, distinct_attitudes(poses.force), len(turns), dropped, resting)
+    attitudes = distinct_attitudes(poses.force)
+    return PoseScan(rests, poses, attitudes, len(turns), dropped, resting, imu.absent)
 
 
 def hand_status(
@@ -163,6 +172,8 @@ def unseen(found: PoseScan) -> list[str]:
     """
     Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first.
     """
+    if 'accelerometer' in found.absent:
+        return []
     if found.poses is None:
         return list(FACE_DIRECTIONS)
     up = unit_rows(found.poses.force)
@@ -184,6 +195,15 @@ def _needs(
     step: str,
     hints: dict[str, str],
 ) -> tuple[Progress, list[str]]:
+    if 'accelerometer' in found.absent:
+        # Gravity is not measured: one rest determines the bias, and no turn the matrix.
+        if calibration is None:
+            return Progress.WAITING, ['hold it still']
+        if not parameter_count(calibration).lacking:
+            return Progress.DETERMINED, []
+        return Progress.WEAK, list(
+            dict.fromkeys(item['needs'] for item in calibration.undetermined)
+        )
     if found.attitudes < MIN_ATTITUDES or calibration is None:
         more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
         return Progress.WAITING, [
@@ -241,6 +261,9 @@ def hand_coverage(
 
     The cells, the next pose with the turn to it, and the remaining seconds.
     """
+    if 'accelerometer' in found.absent:
+        no_ups = ups_of(None)
+        return Coverage(np.zeros(len(DIRECTIONS)), no_ups, None, Step(''), 0.0, frame_id=frame_id)
     seen = ups_of(found.poses)
     up = None if found.poses is None else seen[-1]
     knowledge = knowledge_of(found, result, options)
@@ -319,7 +342,7 @@ class LiveByHand:
         self._asked = hand_options(self.options)
         _check_model(self.model)
         self._check, self._store, self._drops = (
-            StreamCheck(),
+            StreamCheck(one_sensor=True),
             HandStore(by_hand.hand_samples),
             Counter(),
         )
@@ -467,8 +490,12 @@ class LiveByHand:
             )
         self._check.sources.require_one()
         self._search(store)
+        frozen_sensors = _frozen(imu)
+        for sensor in frozen_sensors:
+            imu = without_sensor(imu, sensor)
         delay = delay_of(imu)
-        recording = HandRecording(imu, None, self.counts, tuple(late_gyroscope(delay)), delay)
+        findings = tuple(late_gyroscope(delay))
+        recording = HandRecording(imu, None, self.counts, findings, delay, frozen_sensors)
         self.result = calibrate_poses(recording, self.options, provenance, stills=self.found.rests)
         return self.result
 
@@ -493,20 +520,22 @@ class LiveByHand:
         time = 1e-9 * (mean.stamp_ns - self.result.gathered.first_stamp_ns)
         true, turning = hand.compensate(mean.force_s, mean.rate_s, time)
         gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
-        return ImuSamples(
-            mean.stamp_ns,
-            (true - gravity_s) @ hand.accelerometer[1].T,
-            turning @ hand.gyroscope[1].T,
-            mean.frame_id,
-        )
+        force_residual = (true - gravity_s) @ hand.accelerometer[1].T
+        rate_residual = turning @ hand.gyroscope[1].T
+        if 'accelerometer' in self.result.calibration.absent:
+            force_residual = np.full_like(true, np.nan)
+        if 'gyroscope' in self.result.calibration.absent:
+            rate_residual = np.full_like(turning, np.nan)
+        return ImuSamples(mean.stamp_ns, force_residual, rate_residual, mean.frame_id)
 
     def groups(self) -> list[GroupState]:
         """Return the GroupState of every effect."""
         if self.result is None:
-            return [
-                replace(group, needs=_FIRST_NEEDS[group.sensor])
-                for group in waiting_groups(self.model)
-            ]
+            waiting = []
+            for group in waiting_groups(self.model):
+                if group.sensor not in self.found.absent:
+                    waiting.append(replace(group, needs=_FIRST_NEEDS[group.sensor]))
+            return waiting
         return group_states(self.result)
 
     def coverage(self) -> Coverage:
@@ -543,6 +572,25 @@ class LiveByHand:
                 'samples forgotten': self._store.forgotten,
             },
         )
+
+
+def _frozen(imu: ImuSamples) -> dict[str, str]:
+    """
+    Return the sensor whose outputs never change -> why it cannot be used.
+
+    Raises
+    ------
+    InputError
+        When no other sensor can be used.
+
+    """
+    found = {}
+    for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)):
+        if sensor not in imu.absent and not np.ptp(values, axis=0).any():
+            found[sensor] = frozen_text(sensor, len(imu), is_zero=not values.any())
+    if len({*found, *imu.absent}) == len(SENSORS) and found:
+        raise InputError(next(iter(found.values())), code='frozen')
+    return found
 
 
 def _check_model(model: SensorModel) -> None:

@@ -204,6 +204,8 @@ def _show_by_hand(out, found, hints):
     """
     Print whether the recording can be calibrated by hand, and which parameters that determines.
     """
+    from imu_calibration.document.rest_noise import motions_at_rest
+
     if isinstance(found, ImuCalibrationError):
         out.print(f'not usable for calibration without a table: {found.with_hint(hints)}')
         return
@@ -212,6 +214,8 @@ def _show_by_hand(out, found, hints):
         f'by hand, without a table, it determines, from {windows["static"]} poses and'
         f' {windows["turns"]} turns between them:'
     )
+    for text in motions_at_rest(found.calibration.by_hand, found.calibration.sensors):
+        out.print(f'warning: {text}')
     _show_parameters(out, found.calibration, hints)
 
 

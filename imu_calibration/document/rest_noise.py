@@ -1,6 +1,6 @@
-"""Noise at rest that no sensor has: the IMU moved while it was held."""
+"""Noise at rest that no sensor has, or a tilt: the IMU moved while it was held."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,6 +11,12 @@ MOVED_DENSITY = {'accelerometer': 0.02, 'gyroscope': 0.003}
 """
 m/s^2/√Hz, rad/s/√Hz: about five times the densities of the noisiest grades of sensors (0.4 mg/√Hz,
 0.03 deg/s/√Hz). Hands that hold an IMU still cause less than a tenth of it.
+"""
+
+MOVED_TILT = 3e-4
+"""
+rad: tilt within the rests from which on an IMU swayed. Its rates then scatter by more than
+1 mrad/s from rest to rest, and most longer rests are cut.
 """
 
 
@@ -49,3 +55,29 @@ def moved_at_rest(by_hand: Mapping, sensor: str) -> str:
         f'the {sensor} scatters by {error_text(density, unit)}/√Hz where the IMU was held still,'
         f' noise of sensors is below {error_text(limit, unit)}/√Hz: it moved or vibrated'
     )
+
+
+def swayed_at_rest(by_hand: Mapping) -> str:
+    """
+    Return that both sensors measure a slow tilt where the IMU was held still, or ''.
+
+    Arguments as for `rest_density`.
+    """
+    tilt = by_hand.get('sway', 0.0)
+    if tilt <= MOVED_TILT:
+        return ''
+    return (
+        f'the IMU tilted by {1e3 * tilt:.2g} mrad (rms) where it was held still, as both sensors'
+        ' measure: it moved'
+    )
+
+
+def motions_at_rest(by_hand: Mapping, sensors: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return text -> sensors for each motion of an IMU that was held still."""
+    found: dict[str, tuple[str, ...]] = {}
+    for sensor in sensors:
+        if text := moved_at_rest(by_hand, sensor):
+            found[text] = (sensor,)
+    if not found and (text := swayed_at_rest(by_hand)):
+        found[text] = tuple(sensors)
+    return found

@@ -45,7 +45,7 @@ from imu_calibration.document.outcome import (
     parameter_count,
 )
 from imu_calibration.document.proof_entry import ProofEntry
-from imu_calibration.document.rest_noise import moved_at_rest
+from imu_calibration.document.rest_noise import motions_at_rest, moved_at_rest, swayed_at_rest
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.effects.forward_equations import without_input
@@ -421,7 +421,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
         certain = scatter * _smallest_share(calibration, sensor)
-        if moved_at_rest(calibration.by_hand, sensor):
+        if moved_at_rest(calibration.by_hand, sensor) or swayed_at_rest(calibration.by_hand):
             continue
         if certain > tolerances[part][0] and scatter > _misfit(calibration, sensor):
             factor, unit = for_people(UNITS[sensor])
@@ -774,12 +774,11 @@ def _needs_of(calibration: Calibration, sensor: str) -> list[str]:
 
 
 def _moved(calibration: Calibration) -> list[Reason]:
-    """Return a warning for each sensor that moved where it was held still."""
-    reasons = []
-    for sensor in calibration.sensors:
-        if text := moved_at_rest(calibration.by_hand, sensor):
-            reasons.append(Reason(WARNING, text, MOVED_REMEDY, sensors=(sensor,)))
-    return reasons
+    """Return a warning for each motion of an IMU that was held still."""
+    motions = motions_at_rest(calibration.by_hand, calibration.sensors)
+    return [
+        Reason(WARNING, text, MOVED_REMEDY, sensors=sensors) for text, sensors in motions.items()
+    ]
 
 
 def _undetermined(calibration: Calibration) -> list[Reason]:

@@ -65,6 +65,15 @@ def both_sensors(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     )
 
 
+def frozen_text(sensor: str, n_samples: int, *, is_zero: bool) -> str:
+    """Return that the outputs of a sensor never change."""
+    band = ' (always 0: a dead band, or no sensor)' if is_zero else ''
+    return (
+        f'the {sensor} must measure something, its outputs never change in {n_samples}'
+        f' samples{band}; check the sensor and its driver'
+    )
+
+
 def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """No output is constant while other axes move."""
     chunks = evidence.chunks
@@ -77,12 +86,10 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         constant = evidence.n_changed[part] == 0
         if constant.all():
             zero = not chunks.mean[:, part].any()
-            band = ' (always 0: a dead band, or no sensor)' if zero else ''
             yield CheckFinding(
                 'frozen',
                 REFUSE,
-                f'the {sensor} must measure something, its outputs never change in'
-                f' {evidence.n_samples} samples{band}; check the sensor and its driver',
+                frozen_text(sensor, evidence.n_samples, is_zero=zero),
                 sensor=sensor,
             )
             continue

@@ -7,10 +7,20 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from imu_calibration.core.samples import ImuSamples, SampleBlock
-from imu_calibration.document.rest_noise import MOVED_DENSITY, moved_at_rest, rest_density
+from imu_calibration.document.rest_noise import (
+    MOVED_DENSITY,
+    MOVED_TILT,
+    moved_at_rest,
+    rest_density,
+    swayed_at_rest,
+)
 from imu_calibration.document.verdict import _step_of, judge
 from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY
+from imu_calibration.references.gravity.sway import sway_at_rest
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate_recordings
+from imu_calibration.use_cases.inspect import inspect_recording
+from imu_calibration.use_cases.recordings import Topics
 
 from worlds.hand_sessions import GRAVITY, simulate
 
@@ -62,6 +72,47 @@ def test_a_steady_hand_is_not_named():
     for sensor, limit in MOVED_DENSITY.items():
         assert 0 < rest_density(found.by_hand, sensor) < 0.3 * limit
         assert not moved_at_rest(found.by_hand, sensor)
+
+
+def swaying(imu, amplitude):
+    """Return samples of an IMU that also turns by ``amplitude sin(2 pi t / 1.4 s)`` (rad, xyz)."""
+    speed = 2 * np.pi / 1.4
+    time = np.arange(len(imu)) * PERIOD_S
+    angle = amplitude * np.sin(speed * time)[:, None] * [1.0, -0.8, 0.6]
+    rate = amplitude * speed * np.cos(speed * time)[:, None] * [1.0, -0.8, 0.6]
+    force = imu.force_s + np.cross(imu.force_s, angle)
+    return ImuSamples(imu.stamp_ns, force, imu.rate_s + rate, imu.frame_id)
+
+
+def test_a_slow_sway_is_named_by_calibrate_and_inspect():
+    imu, _, _ = simulate(10272, n_poses=14, period=PERIOD_S, still=2.5, force_sd=0.01, rate_sd=1e-3)
+    # Rates of 4.5 mrad/s: the white noise of the rests does not show them.
+    imu = swaying(imu, 1e-3)
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    text = swayed_at_rest(found.by_hand)
+    assert text and any(text in note for note in found.notes)
+    assert not any(moved_at_rest(found.by_hand, sensor) for sensor in found.sensors)
+    lacking = [name for name, status in found.requested.items() if status in LACKING]
+    assert lacking and {entry['needs'] for entry in found.undetermined} == {MOVED_REMEDY}
+
+    options = CalibrationOptions(gravity=GRAVITY)
+    (look,) = inspect_recording(SampleBlock(imu), [Topics()], None, options=options)
+    assert look.by_hand.calibration.by_hand['sway'] == found.by_hand['sway']
+
+
+def test_the_tilt_of_a_sway_is_measured_and_noise_is_none():
+    imu, ranges, _ = simulate(
+        10273, n_poses=10, period=PERIOD_S, still=2.8, force_sd=0.1, rate_sd=8e-3, drift_sd=2e-3
+    )
+
+    def tilt_of(samples):
+        forces = [samples.force_s[part] for part in ranges]
+        return sway_at_rest(forces, [samples.rate_s[part] for part in ranges], np.full(10, 2.8))
+
+    assert tilt_of(imu) < 0.3 * MOVED_TILT
+    # Two periods: the mean square of a sine is a half; a third of it is along gravity.
+    expected = 5e-3 * np.sqrt(0.5 * 2.0 * 2 / 3)
+    assert tilt_of(swaying(imu, 5e-3)) == pytest.approx(expected, rel=0.15)
 
 
 def test_a_sensor_without_a_determined_parameter_is_not_said_to_help():

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
+from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.document.trust import usable
 from imu_calibration.preprocessing.absent_sensor import MIN_ABSENT_SAMPLES, SensorPresence
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from imu_calibration.use_cases.compensate import compensate_recording
 
@@ -98,6 +102,52 @@ def test_a_gyroscope_alone_has_its_bias():
     assert np.abs(corrected.imu.rate_s[still].mean(axis=0)).max() < 2e-4
     with refused(InputError, 'absent'):
         check_recording(block(time, force, without(rate)), found, gravity=GRAVITY)
+
+
+def live_session(saved=None):
+    return LiveByHand(
+        CalibrationOptions(),
+        LiveSettings(),
+        LiveByHandSettings(gravity=GRAVITY),
+        saved=saved,
+        clock=lambda: 0.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ('sensor', 'other_reading'),
+    [('accelerometer', np.nan), ('accelerometer', 0.0), ('gyroscope', np.nan)],
+)
+def test_live_one_sensor_gives_the_calibration_of_the_recording(sensor, other_reading):
+    time, force, rate = readings(10280)
+    if sensor == 'accelerometer':
+        rate = np.full_like(rate, other_reading)
+    else:
+        force = np.full_like(force, other_reading)
+    imu = block(time, force, rate).imu
+    expected = calibrate_recordings([SampleBlock(imu)], gravity=GRAVITY).calibration
+    live = live_session()
+    for start in range(0, len(imu), 400):
+        live.push(SampleBlock(imu.select(slice(start, start + 400))))
+        live.coverage()
+    found = live.solve(pending=True).calibration
+    assert (found.absent, found.decisions) == (expected.absent, expected.decisions)
+    np.testing.assert_array_equal(found.values, expected.values)
+    assert not any(live.counts.values())
+    assert {group.sensor for group in live.groups()} == {sensor}
+    # The samples that another run continues with have no readings of the absent sensor either.
+    again = live_session(live.saved()).solve().calibration
+    np.testing.assert_array_equal(again.values, expected.values)
+    # With consent a gyroscope alone is corrected by its bias.
+    assert sensor not in usable(found, anyway=True, live=True).refused
+
+
+def test_a_live_stream_without_any_change_is_refused():
+    time, force, rate = readings(10281, n_poses=2)
+    live = live_session()
+    live.push(block(time, np.tile(force[0], (len(time), 1)), without(rate)))
+    with refused(InputError, 'frozen', len(time)):
+        live.solve(pending=True)
 
 
 def test_presence_does_not_depend_on_the_pieces():

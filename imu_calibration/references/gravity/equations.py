@@ -69,6 +69,8 @@ class Poses:
     Angle by which the attitude creeps across gravity from the middle of each interval to its end,
     rad, shape (k, 3); not in `rate`.
     """
+    sway: float = 0.0
+    """Rms tilt within the intervals that both sensors measure, rad (`sway.sway_at_rest`)."""
     hidden: 'HiddenRates | None' = None
     """Errors of `rate` that are the same in all poses."""
 

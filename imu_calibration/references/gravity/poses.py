@@ -23,6 +23,7 @@ from imu_calibration.preprocessing.stamping import (
 )
 from imu_calibration.references.gravity.equations import HiddenRates, Poses, State, TurnData
 from imu_calibration.references.gravity.hand_parameters import KnownTurn
+from imu_calibration.references.gravity.sway import sway_at_rest
 
 CREEPS = 3.0
 """
@@ -83,6 +84,7 @@ def average_poses(
         temperature_c=warm,
         noise=noise,
         half_turn=0.5 * length[:, None] * creep,
+        sway=sway_at_rest(parts['accelerometer'], parts['gyroscope'], length),
         period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9,
         hidden=_hidden_rates(imu.rate_s, parts['gyroscope'], means[1]),
     )
@@ -141,7 +143,7 @@ def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: NoiseModel) 
 
 
 def noise_statistics(poses: Poses) -> dict:
-    """Return the noise within the intervals as plain numbers."""
+    """Return noise and tilt within the intervals as plain numbers."""
     found = {}
     for sensor, name in zip(SENSORS, ('force', 'rate')):
         noise = poses.noise[sensor]
@@ -149,7 +151,7 @@ def noise_statistics(poses: Poses) -> dict:
             f'{name}_noise_sd': noise.white_sd.tolist(),
             f'{name}_noise_colour': np.sqrt(noise.inflation).tolist(),
         }
-    return found | {'period': poses.period}
+    return found | {'period': poses.period, 'sway': poses.sway}
 
 
 def _pooled_noise(parts: Sequence[np.ndarray], rounding: np.ndarray, pieces: int = 8) -> NoiseModel:

@@ -7,12 +7,14 @@ All samples up to a limit, then the least informative are discarded first.
 import io
 from collections.abc import Iterable, Sequence
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import ImuSamples
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.preprocessing.stream_cleaning import ContinuedStamps
 
 SAMPLES_FORMAT = 'imu_calibration/hand_samples/1'
@@ -65,14 +67,24 @@ class HandStore:
                 continue
             moved = self._stamps.moved(epoch, samples)
             self._parts.append(
-                ImuSamples(moved.stamp_ns, moved.force_s, moved.rate_s, moved.frame_id)
+                ImuSamples(
+                    moved.stamp_ns,
+                    moved.force_s,
+                    moved.rate_s,
+                    moved.frame_id,
+                    absent=moved.absent,
+                )
             )
 
     def samples(self) -> ImuSamples | None:
         """Return all samples, or None."""
         if not self._parts:
             return None
-        self._parts = [ImuSamples.concatenate(self._parts)]
+        if len(self._parts) > 1:
+            # A sensor that one run lacks has no readings in the joined ones.
+            absent = {sensor for part in self._parts for sensor in part.absent}
+            joined = ImuSamples.concatenate(self._parts)
+            self._parts = [replace(joined, absent=tuple(sorted(absent)))]
         return self._parts[0]
 
     def true_stamps(self, stamp_ns: np.ndarray) -> np.ndarray:
@@ -132,6 +144,7 @@ class HandStore:
             target,
             format=np.array(SAMPLES_FORMAT),
             frame_id=np.array(imu.frame_id),
+            absent=np.array(imu.absent, str),
             stamp_ns=imu.stamp_ns,
             force_s=imu.force_s,
             rate_s=imu.rate_s,
@@ -155,8 +168,17 @@ class HandStore:
                         f"samples must have the format '{SAMPLES_FORMAT}', got"
                         f" '{arrays['format']}'; remove the file, or start without resume"
                     )
+                absent: tuple[str, ...] = ()
+                if 'absent' in arrays:
+                    absent = tuple(str(sensor) for sensor in arrays['absent'])
+                if not set(absent) <= set(SENSORS):
+                    raise ValueError(f'its absent sensors are {absent}')
                 imu = ImuSamples(
-                    arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id'])
+                    arrays['stamp_ns'],
+                    arrays['force_s'],
+                    arrays['rate_s'],
+                    str(arrays['frame_id']),
+                    absent=absent,
                 )
             for values, kind, shape in (
                 (imu.stamp_ns, 'i', ()),
