@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.kinematics.rotations import unit_rows
 
-PIECES = 8
+REST_PIECES = 8
 """Means per rest: the noise of the accelerometer hides the tilt of single samples."""
 LEAST_CORRELATION = 2.5
 """
@@ -39,15 +39,15 @@ def sway_at_rest(
     predicted_power = 0.0
     n_rests = 0
     for force, rate, seconds in zip(forces, rates, length, strict=True):
-        size = len(force) // PIECES
+        size = len(force) // REST_PIECES
         mean_length = float(np.linalg.norm(force.mean(axis=0)))
         if not size or not mean_length > 0.0:
             continue
         direction = unit_rows(force)
         turned = np.cumsum(np.cross(direction, rate - bias), axis=0) * seconds / len(force)
-        used = slice(0, size * PIECES)
-        measured = direction[used].reshape(PIECES, size, 3).mean(axis=1)
-        predicted = turned[used].reshape(PIECES, size, 3).mean(axis=1)
+        used = slice(0, size * REST_PIECES)
+        measured = direction[used].reshape(REST_PIECES, size, 3).mean(axis=1)
+        predicted = turned[used].reshape(REST_PIECES, size, 3).mean(axis=1)
         measured -= measured.mean(axis=0)
         predicted -= predicted.mean(axis=0)
         shared += float(np.sum(measured * predicted))
@@ -57,4 +57,4 @@ def sway_at_rest(
     least = LEAST_CORRELATION * np.sqrt(measured_power * predicted_power / max(1, 2 * n_rests))
     if not shared > least:
         return 0.0
-    return float(np.sqrt(shared / (n_rests * PIECES)))
+    return float(np.sqrt(shared / (n_rests * REST_PIECES)))
