@@ -18,14 +18,20 @@ LANES = {'core': 'not live and not long', 'live': 'live and not long', 'long': '
 
 
 class Failures:
-    """Pytest plugin that keeps the first failed report of each test."""
+    """Pytest plugin that keeps the first failed report of each test, and names the test at once."""
 
     def __init__(self):
         self.reports, self.others = {}, False
+        self.terminal = None
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_configure(self, config):
+        self.terminal = config.pluginmanager.get_plugin('terminalreporter')
 
     def pytest_runtest_logreport(self, report):
         if report.failed:
             self.reports.setdefault(report.nodeid, report)
+            self.terminal.write_line(f'\nfailed: {report.nodeid}')
 
     def pytest_collectreport(self, report):
         self.others |= report.failed

@@ -123,7 +123,7 @@ def test_live_the_next_step_is_the_cause_where_no_attitude_helps():
             requested=status, undetermined=({'parameters': {}, 'needs': need},)
         )
         _, [shown] = _needs(
-            SimpleNamespace(attitudes=20),
+            SimpleNamespace(attitudes=20, absent=()),
             [],
             calibration,
             step='the planned pose',

@@ -29,6 +29,8 @@ PROBLEMS = {
     'lint': 'benchmarks/run.py:7: error: no attribute "runs"',
     'test-all': 'E   assert 3 == 4',
 }
+PLACE = 'test/test_a.py:7: '
+"""What pytest prints above an error of a function of the test."""
 NOTE = 'note: the latitude must agree with the rates'
 STAGES = {'demo-check': 'demo', 'readme-check': 'readme', 'lint': 'lint', 'test-all': 'tests'}
 
@@ -42,7 +44,9 @@ def result_of_run(folder, failing):
         (folder / 'bin' / name).write_text(text)
         (folder / 'bin' / name).chmod(0o755)
     for goal in failing:
-        (folder / f'{goal}.fails').write_text(f'{NOTE}\n{PROBLEMS[goal]}\nmake: *** [{goal}]\n')
+        place = f'{PLACE}\n' if PROBLEMS[goal].startswith('E ') else ''
+        printed = f'{NOTE}\n{place}{PROBLEMS[goal]}\nmake: *** [{goal}]\n'
+        (folder / f'{goal}.fails').write_text(printed)
     path = f'{folder / "bin"}{os.pathsep}{os.environ["PATH"]}'
     return subprocess.run(
         ['bash', folder / '.ci/run'],

@@ -100,5 +100,6 @@ def test_only_live_tests_are_repeated(tmp_path, text, code, unstable):
         bool(code),
         unstable,
     ), done.stdout
+    assert ('failed: test_it.py::' in done.stdout) == (unstable or 'def' in text and bool(code))
     assert not unstable or 'the first failure' in done.stdout.partition('unstable: ')[2]
     assert 'passed' in done.stdout.splitlines()[-1] or code
