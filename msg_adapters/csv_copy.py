@@ -67,13 +67,12 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
     writer.writerow(names)
 
     # Rows as they were read, with new cells of force and rate.
-    comma = text.decimal_comma and delimiter != ','
     for k, row in enumerate(text.row_of_sample.tolist()):
         cells = split_cells(text.lines[row], text.delimiter, text.path)
         cells += [''] * (len(names) - len(cells))
         for quantity, values in readings.items():
             for place, value in zip(text.places[quantity], values[k].tolist(), strict=True):
-                cells[place] = _number(value, comma)
+                cells[place] = _number(value, text.decimal_comma)
         writer.writerow(cells)
     write_whole(path, out.getvalue().encode())
 

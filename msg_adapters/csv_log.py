@@ -21,7 +21,7 @@ import numpy as np
 from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.core.progress import remark
-from imu_calibration.core.readings import READING_SPELLINGS, UNIT_SIZES, unit_of
+from imu_calibration.core.readings import READING_SPELLINGS, SI_UNITS, UNIT_SIZES, unit_of
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.files import name_of_path
@@ -132,6 +132,10 @@ PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns
 Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within
 the usual rates.
 """
+GROUPED_NUMBER = re.compile(r'\s*[-+]?\d{1,3}(,\d{3})+\s*')
+"""Digits in groups of three: of a quoted cell it is not known whether the comma is decimal."""
+COMMENT = re.compile(r'(?:^|\s)#(?!N/A|NAME\?|VALUE!|DIV/0!|REF!|NUM!|NULL!).*')
+"""A comment after the cells, which is none of the errors that spreadsheets print."""
 TIME_OF_DAY = re.compile(
     r'\s*(?:\d{1,2}[./-]\d{1,2}[./-]\d{2,4},?[ T]\s*)?(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?\s*'
     r'(?:([AaPp])\.?[Mm]\.?)?\s*'
@@ -500,6 +504,9 @@ def read_logs(
             continue  # a folder has logs of other sensors too
         if log is not None:
             found[log.columns.quantity].append(log)
+    if in_folder and len(found['force']) > 1:
+        # Phones add linear accelerations, which have no gravity.
+        found['force'] = [log for log in found['force'] if log.has_gravity]
     for quantity, logs in found.items():
         if len(logs) != 1:
             names = ', '.join(log.table.path.name for log in logs)
@@ -554,15 +561,28 @@ class _SensorLog:
     """Force in SI; rates as in the log."""
     counted: CounterStamps
 
+    @property
+    def has_gravity(self) -> bool:
+        """Whether a force has the length of gravity most of the time."""
+        return _force_unit(self.stream.values) == SI_UNITS['accelerometer']
+
+
+def _one_sensor(columns):
+    """Return 'force' or 'rate' for the columns of a log of one sensor; None for another log."""
+    quantities = {each.quantity for each in columns}
+    sensors = [quantity for quantity in SENSOR_OF if quantity in quantities]
+    return sensors[0] if 'time' in quantities and len(sensors) == 1 else None
+
 
 def _sensor_log(path, where):
     """Return the `_SensorLog` of a path; None where it has neither sensor."""
     table = _Table(path)
-    found = {each.quantity: each for each in _guess(table)}
-    sensors = [quantity for quantity in SENSOR_OF if quantity in found]
-    if 'time' not in found or len(sensors) != 1:
+    guess = _guess(table)
+    found = {each.quantity: each for each in guess}
+    sensor = _one_sensor(guess)
+    if sensor is None:
         return None
-    columns = found[sensors[0]]
+    columns = found[sensor]
     table.load([*found['time'].names, *columns.names], where)
     time, counted = _times(table, found['time'])
     values = table.values(columns.names)
@@ -598,9 +618,29 @@ def autopilot_of(path: str | PathLike[str]) -> str:
     return ''
 
 
-def has_corrected_readings(path: str | PathLike[str]) -> bool:
-    """Return whether the header of a text log states that its readings are corrected."""
-    return any(_words(name)[1].endswith(CORRECTED) for name in _Table(Path(path)).names)
+def corrected_log(path: str | PathLike[str]) -> Path | None:
+    """
+    Return the text log whose header states that its readings are corrected; None for none.
+
+    Of a folder with one log per sensor each of them is read.
+    """
+    path = Path(path)
+    if not is_log_folder(path):
+        is_log = is_text_log(path) and path.is_file()
+        return path if is_log and _states_corrected(_Table(path)) else None
+    for log in sorted(filter(is_text_log, path.iterdir())):
+        try:
+            table = _Table(log)
+        except InputError:
+            continue  # a folder has logs of other sensors too
+        if _one_sensor(_guess(table)) and _states_corrected(table):
+            return log
+    return None
+
+
+def _states_corrected(table):
+    """Return whether a header states corrected readings."""
+    return any(_words(name)[1].endswith(CORRECTED) for name in table.names)
 
 
 def _require_one_imu(imu):
@@ -694,9 +734,23 @@ COMPRESSORS = {b'\x1f\x8b': 'gzip', b'PK': 'zip', b'\x28\xb5': 'zstd', b'BZ': 'b
 """First two bytes -> program that has compressed a file."""
 
 
+def _is_utf_8(head):
+    """Return whether the first bytes of a file are text in UTF-8, of which the last may be cut."""
+    try:
+        codecs.getincrementaldecoder('utf-8')().decode(head)
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
 def _opened(path):
     file = open_regular(path)
-    encoding = 'utf-16' if file.read(2) in UTF_16 else 'utf-8-sig'
+    head = file.read(HEAD_BYTES)
+    encoding = 'utf-8-sig'
+    if head[:2] in UTF_16:
+        encoding = 'utf-16'
+    elif not _is_utf_8(head):
+        encoding = 'cp1252'  # spreadsheets of Western Europe
     file.seek(0)
     return io.TextIOWrapper(file, encoding=encoding, errors='replace')
 
@@ -755,6 +809,7 @@ class _Table:
         self.first, self.first_row = first, rows[first]
         self.decimal_comma = any(
             re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', cell)
+            and (self.delimiter != ',' or not GROUPED_NUMBER.fullmatch(cell))
             for row in rows[first:]
             for cell in row
         )
@@ -835,22 +890,27 @@ class _Table:
         """
         wanted = sorted({self.column(name) for name in names})
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
-        options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
+        options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': None}
         with _opened(self.path) as file:
             lines = plain_lines(file.read().splitlines())[self.first :]
         lines = self._selected(lines, where)
         lines = self.lines = self._complete(lines, wanted[-1] + 1)
-        if self.decimal_comma and self.delimiter != ',':
-            lines = [line.replace(',', '.') for line in lines]
+        number_lines = [self._as_numbers(line) for line in lines]
         with warnings.catch_warnings():
-            # Rows without all columns, which are left out, and files without rows.
-            warnings.simplefilter('ignore', UserWarning)
+            warnings.simplefilter('ignore', UserWarning)  # files without rows
             try:
-                data = np.loadtxt(lines, usecols=numbers, ndmin=2, quotechar='"', **options)
-            except ValueError:  # empty cells, text such as "nan" in other languages, truncated rows
+                data = np.loadtxt(number_lines, usecols=numbers, ndmin=2, **options)
+            except ValueError:  # empty cells, text such as "nan" in other languages
                 data = np.genfromtxt(
-                    lines, usecols=numbers, invalid_raise=False, **options
+                    number_lines, usecols=numbers, invalid_raise=False, **options
                 ).reshape(-1, len(numbers))
+        if numbers and len(data) != len(lines):
+            # Readings and times would belong to different rows.
+            raise InputError(
+                f'each row of {self.path} must have the columns that are read, {len(lines)} rows'
+                f' gave {len(data)} samples; remove text between the rows',
+                code='csv_rows',
+            )
         self._values = dict(zip(numbers, data.T, strict=True))
         for k in set(wanted) & self.clocks:
             self._values[k] = _times_of_day([self._cells(line)[k] for line in lines])
@@ -862,19 +922,34 @@ class _Table:
                 f'{self.path} must have at least two rows of numbers, got fewer; check the file'
             )
 
+    def _as_numbers(self, line):
+        """Return a line without comment, with cells that have no quotes, and decimal points."""
+        line = COMMENT.sub('', line)
+        if '"' not in line:
+            comma = self.decimal_comma and self.delimiter != ','
+            return line.replace(',', '.') if comma else line
+        plain = []
+        for cell in self._cells(line):
+            if self.decimal_comma:
+                cell = cell.replace(',', '.')
+            # Text may contain the delimiter.
+            plain.append(cell.replace(self.delimiter or ' ', ''))
+        return (self.delimiter or ' ').join(plain)
+
     def _complete(self, lines, width):
         """Return the lines with at least `width` cells; count those that are dropped."""
         complete = []
         for line in lines:
-            if not line.strip() or line.startswith('#'):
+            plain = COMMENT.sub('', line)
+            if not plain.strip():
                 continue
             if line.strip() in self._header_lines:
                 self.n_dropped += 1
                 continue
-            if self.delimiter is not None and '"' not in line:
-                n_cells = line.count(self.delimiter) + 1
+            if self.delimiter is not None and '"' not in plain:
+                n_cells = plain.count(self.delimiter) + 1
             else:
-                n_cells = len(self._cells(line))
+                n_cells = len(self._cells(plain))
             if n_cells >= width:
                 complete.append(line)
             else:

@@ -220,8 +220,24 @@ SPIKE_SHARE = 5e-3
 Occasional knocks resemble spikes, and 1 % of spikes do not degrade a calibration; a larger share
 has a cause.
 """
+MOST_REPEATED_STAMPS = 0.9
+"""Share of repeated stamps above which a recording has no times."""
 GAP_SHARE = 0.01
 RATE_SHARE = 0.02
+
+
+def is_one_stamp(n_repeated: int, total: int) -> bool:
+    """Return whether nearly all of `total` samples repeat the stamp before them."""
+    return n_repeated > MOST_REPEATED_STAMPS * total
+
+
+def one_stamp_text(name: str, n_repeated: int, total: int) -> str:
+    """Return that stamps do not advance, with the remedy."""
+    return (
+        f'{name} must have header stamps that advance, {n_repeated} of {total} repeat the stamp'
+        ' before: written with too few digits, or set only once?; stamp each sample at its'
+        ' measurement'
+    )
 
 
 def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -234,6 +250,11 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             for reason, count in found.dropped.items()
             if reason not in ('clock reset', 'spike', 'wrapped')
         )
+        if is_one_stamp(found.dropped.get('repeated stamp', 0), total):
+            n_repeated = found.dropped['repeated stamp']
+            text = one_stamp_text(MESSAGES[name], n_repeated, total)
+            yield CheckFinding('stamps_equal', REFUSE, text)
+            continue
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
             yield CheckFinding(

@@ -23,11 +23,16 @@ from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.document.calibration import ABSENT, Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
-from imu_calibration.preprocessing.checks import frozen_lines, refuse
+from imu_calibration.preprocessing.checks import (
+    frozen_lines,
+    is_one_stamp,
+    one_stamp_text,
+    refuse,
+)
 from imu_calibration.preprocessing.exclusion import ExclusionMask, parse_exclusions
 from imu_calibration.preprocessing.recording_evidence import EvidenceGatherer
 from imu_calibration.preprocessing.scan import FrozenSearch
-from imu_calibration.preprocessing.two_sources import TwoSourceSearch
+from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.preprocessing.value_checks import rate_unit, refuse_units
 from imu_calibration.use_cases.choices import log_options, noise_of, readings_for
 from imu_calibration.use_cases.recordings import (
@@ -38,7 +43,7 @@ from imu_calibration.use_cases.recordings import (
     temperatures,
 )
 from msg_adapters.csv_log import (
-    has_corrected_readings,
+    corrected_log,
     is_log_folder,
     is_text_log,
     read_directly,
@@ -73,6 +78,8 @@ class Compensated:
     """A line for each sensor that was corrected although the decision on it is not `helps`."""
     frozen: int = 0
     """Samples in which a sensor repeats one reading that its noise does not allow."""
+    wrapped: int = 0
+    """Samples in motions whose readings wrap around at the end of the range of the converter."""
 
     @property
     def exit_code(self) -> int:
@@ -92,7 +99,9 @@ class Compensated:
         dropped = dict(self.lost)
         if self.frozen:
             dropped['frozen output'] = self.frozen
-        if lost := dropped_text(dropped, self.count - self.frozen):
+        if self.wrapped:
+            dropped['wrapped'] = self.wrapped
+        if lost := dropped_text(dropped, self.count - self.frozen - self.wrapped):
             lines.append(lost)
         return lines
 
@@ -264,6 +273,7 @@ def compensate_recording(
                 bag.lost,
                 used=used,
                 search=search,
+                checks=checks,
             )
         from msg_adapters.copying import copy_with_corrected
 
@@ -287,7 +297,7 @@ def compensate_recording(
             keep=keep if exclude or other is not None else None,
             other=other,
         )
-        return _outcome(None, stream, lost, used=used, search=search)
+        return _outcome(None, stream, lost, used=used, search=search, checks=checks)
 
 
 def _into_text_log(recording, output, calibration, *, transfer, late, used, readings, topics, mask):
@@ -318,14 +328,13 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
 
 
 def _refuse_corrected_log(recording):
-    """Refuse a text log whose header states that its readings are corrected."""
-    if is_text_log(recording) and existing(recording).is_file():
-        if has_corrected_readings(recording):
-            raise InputError(
-                f'the log must hold raw measurements, the header of {recording} states corrected'
-                ' ones; give the raw log',
-                code='corrected_already',
-            )
+    """Refuse text logs whose header states that their readings are corrected."""
+    if (log := corrected_log(recording)) is not None:
+        raise InputError(
+            f'the log must hold raw measurements, the header of {log} states corrected ones; give'
+            ' the raw log',
+            code='corrected_already',
+        )
 
 
 def _refuse_bag_unit(recording, topics, readings):
@@ -345,7 +354,7 @@ def _refuse_bag_unit(recording, topics, readings):
 
 class RawChecks:
     """
-    Checks of raw readings that need all of them: one sensor, and the unit of the rates.
+    Checks of raw readings that need all of them: stamps, one sensor, and the unit of the rates.
 
     Parameters
     ----------
@@ -355,23 +364,38 @@ class RawChecks:
     """
 
     def __init__(self, readings: RawReadings):
-        self._readings, self._sources = readings, TwoSourceSearch()
+        self._readings, self._check = readings, StreamCheck(one_sensor=True)
         self._gatherer = EvidenceGatherer(STANDARD_GRAVITY)
+        self._n_samples = 0
 
     def push(self, imu: ImuSamples) -> None:
-        """Process raw samples; without a reading of each sensor there is nothing to compare."""
+        """Process raw samples; the unit of the rates needs readings of both sensors."""
+        applied = self._readings.apply(imu)
+        self._n_samples += len(imu)
+        self._check.push(applied)
         finite = np.isfinite(imu.force_s).all(axis=1) & np.isfinite(imu.rate_s).all(axis=1)
-        if not finite.any():
-            return
-        measured = imu.select(finite)
-        self._sources.push(measured)
-        self._gatherer.push_imu(self._readings.apply(measured))
+        if finite.any():
+            self._gatherer.push_imu(applied.select(finite))
 
     def require(self) -> None:
-        """Raise where there are two sensors, or the rates do not turn gravity in their unit."""
-        self._sources.require_one()
+        """
+        Raise where stamps do not advance, there are two sensors, or the unit of rates is wrong.
+
+        After the last samples.
+        """
+        self._check.finish()
+        n_repeated = self._check.counts['repeated stamp']
+        if is_one_stamp(n_repeated, self._n_samples):
+            text = one_stamp_text('Imu', n_repeated, self._n_samples)
+            raise InputError(text, code='stamps_equal')
+        self._check.sources.require_one()
         evidence = self._gatherer.evidence({}, self._readings)
         refuse(tuple(rate_unit(evidence)))
+
+    @property
+    def n_wrapped(self) -> int:
+        """Samples in motions whose readings wrap around, after `require`."""
+        return self._check.counts['wrapped']
 
 
 def _in_memory(recording, calibration, transfer, *, late, used, readings, mask):
@@ -393,10 +417,10 @@ def _in_memory(recording, calibration, transfer, *, late, used, readings, mask):
         force, rate = np.full((2, len(kept), 3), np.nan)
         force[kept], rate[kept] = corrected.force_s, corrected.rate_s
         corrected = ImuSamples(block.imu.stamp_ns - late, force, rate, corrected.frame_id)
-    return _outcome(corrected, stream, {}, used=used, search=search)
+    return _outcome(corrected, stream, {}, used=used, search=search, checks=checks)
 
 
-def _outcome(imu, stream, lost, *, used, search):
+def _outcome(imu, stream, lost, *, used, search, checks):
     against = [*used.lines, *caveats(stream.calibration)]
     refused = dict(used.refused)
     for sensor in stream.calibration.absent:
@@ -405,6 +429,12 @@ def _outcome(imu, stream, lost, *, used, search):
             against.append(f'the {sensor} is not corrected: {ABSENT}')
     frozen = search.parts()
     against += frozen_lines(frozen, 'the corrected topic has no measurements there')
+    if checks.n_wrapped:
+        against.append(
+            f'{checks.n_wrapped} samples are in motions whose readings wrap around at the end of'
+            ' the range of the converter: their corrected readings are wrong; move less fast or'
+            ' choose a wider range'
+        )
     # both sensors are frozen in one part where the IMU is
     samples = {(part.start, part.stop): part.samples for part in frozen}
     return Compensated(
@@ -415,6 +445,7 @@ def _outcome(imu, stream, lost, *, used, search):
         refused,
         used.cautions,
         sum(samples.values()),
+        checks.n_wrapped,
     )
 
 

@@ -255,3 +255,26 @@ def test_excluded_times_have_no_corrected_readings(tmp_path, calibration):
     assert np.array_equal(stamps, whole.stamp_ns[~inside])
     with refused(InputError, 'exclude_outside'):
         compensate_recording(tmp_path / 'log.csv', calibration, exclude='900:901')
+
+
+@pytest.mark.parametrize('corrected_name', ['Accelerometer', 'Gyroscope'])
+def test_a_corrected_log_of_one_sensor_in_a_folder_is_found(tmp_path, calibration, corrected_name):
+    """The export of a phone in which one of two logs was corrected by itself."""
+    time, force, rate = readings()
+    folder = tmp_path / 'export'
+    (tmp_path / 'raw').mkdir()
+    folder.mkdir()
+    for name, values, unit in (('Accelerometer', force, 'm/s^2'), ('Gyroscope', rate, 'rad/s')):
+        columns = np.column_stack([1e3 * time, values])
+        header = f't_ms,x ({unit}),y ({unit}),z ({unit})'
+        for place in (tmp_path / 'raw', folder):
+            path = place / f'{name}.csv'
+            np.savetxt(path, columns, delimiter=',', header=header, comments='')
+    (folder / 'Annotation.csv').write_text('time,text\n1,start\n')
+    (folder / f'{corrected_name}.csv').unlink()
+    raw_log = tmp_path / f'raw/{corrected_name}.csv'
+    compensate_recording(raw_log, calibration, output=folder / f'{corrected_name}.csv')
+    for output in (tmp_path / 'again.csv', tmp_path / 'bag', None):
+        with refused(InputError, 'corrected_already', f'{corrected_name}.csv'):
+            compensate_recording(folder, calibration, output=output)
+    assert not (tmp_path / 'again.csv').exists() and not (tmp_path / 'bag').exists()

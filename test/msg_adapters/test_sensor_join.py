@@ -90,6 +90,10 @@ def folder(streams, tmp_path_factory):
     write(path / 'Magnetometer.csv', SensorStream(force.stamp_ns, 30 + 0 * force.values))
     linear = SensorStream(force.stamp_ns, force.values - [0.31, -0.12, 9.98] + 0 * force.values)
     write(path / 'Gravity.csv', SensorStream(force.stamp_ns, force.values - linear.values))
+    # Without gravity, and with the unit in the header.
+    header = 'time,z (m/s^2),y (m/s^2),x (m/s^2)'
+    shaken = SensorStream(force.stamp_ns, 0.03 * force.values[:, ::-1])
+    write(path / 'Linear Acceleration.csv', shaken, header)
     return path
 
 

@@ -1278,6 +1278,43 @@ BY_SENSOR = _of(
         'test_adoption.py::test_many_small_changes_from_the_topic_do_not_add_up',
     ),
 )
+READINGS = _of(
+    (
+        'a sway at rest by hand is not named',
+        'swayed_at_rest',
+        '_1 <= MOVED_TILT',
+        'True',
+        'test_moved_at_rest.py::test_a_slow_sway_is_named_by_calibrate_and_inspect',
+    ),
+    (
+        'one sensor alone is not accepted live by hand',
+        'LiveByHand.__init__',
+        'StreamCheck(one_sensor=True)',
+        'StreamCheck()',
+        'test_absent_sensor.py::test_live_one_sensor_gives_the_calibration_of_the_recording',
+    ),
+    (
+        'stamps that do not advance are accepted',
+        'is_one_stamp',
+        'n_repeated > MOST_REPEATED_STAMPS * total',
+        'False',
+        'test_faults_in_bags.py::test_each_verb_refuses_with_the_key',
+    ),
+    (
+        'wrapped readings are corrected silently',
+        'RawChecks.n_wrapped',
+        "self._check.counts['wrapped']",
+        '0',
+        'test_faults_in_bags.py::test_wrapped_rates_are_named',
+    ),
+    (
+        'a corrected log in a folder is corrected again',
+        'corrected_log',
+        '_one_sensor(_guess(_1)) and _states_corrected(_1)',
+        'False',
+        'test_compensate_text_log.py::test_a_corrected_log_of_one_sensor_in_a_folder_is_found',
+    ),
+)
 MUTANTS = (
     *NOISE,
     *COVARIANCE,
@@ -1290,4 +1327,5 @@ MUTANTS = (
     *SIGNS,
     *LIVE,
     *BY_SENSOR,
+    *READINGS,
 )

@@ -270,7 +270,7 @@ FAULTS = (
     (fast_at_rest, 'bias', WARNING, (80.0,)),
     (clipped_gyroscope, 'clipping', WARNING, ('gyroscope', 1.0, 57.0)),
     (repeated_stamps, 'stamps', WARNING, ('Imu', 149.0)),
-    (no_stamps, 'stamps', REFUSE, ()),
+    (no_stamps, 'stamps_equal', REFUSE, ()),
     (late_samples, 'stamps', WARNING, (30.0,)),
     (jumping_clock, 'stamps', WARNING, ('Imu',)),
     (not_finite, 'stamps', WARNING, (15.0,)),

@@ -9,6 +9,7 @@ from refusal import refused
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.exports.export import export, find_target
 from imu_calibration.kinematics.table import Table
@@ -19,6 +20,7 @@ from imu_calibration.use_cases.compensate import compensate_recording
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics
+from msg_adapters.csv_log import read_csv
 
 from worlds.physics import make_session
 
@@ -176,3 +178,27 @@ def test_an_export_leaves_the_other_sensor_as_it_is(name):
     lines = [line for line in found.content.decode().splitlines() if not line.startswith('#')]
     assert any('ACC' in line for line in lines)
     assert not any('GYR' in line for line in lines)
+
+
+def test_a_text_log_with_one_sensor_and_joints_in_degrees(tmp_path):
+    """The accelerometer in mg: calibrated, and corrected into a log with the same columns."""
+    session, block = alone('accelerometer', seed=10298)
+    degrees = np.degrees(session.joints.position)
+    columns = [
+        (session.imu.stamp_ns - session.imu.stamp_ns[0]) * 1e-6,
+        *(session.imu.force_s.T / STANDARD_GRAVITY * 1e3),
+    ]
+    table = Table.from_mapping(session.table)
+    for angles in degrees.T:
+        columns.append(np.interp(session.imu.stamp_ns, session.joints.stamp_ns, angles))
+    names = ['t_ms', 'ax_mg', 'ay_mg', 'az_mg', *(f'joint_{n} (deg)' for n in table.joint_names)]
+    log, output = tmp_path / 'log.csv', tmp_path / 'corrected.csv'
+    np.savetxt(log, np.column_stack(columns), '%.8f', ';', header=';'.join(names), comments='')
+    calibration = calibrated('accelerometer', session, log).calibration
+    assert calibration.absent == ('gyroscope',)
+    assert np.sqrt(np.mean(errors_in_sd('accelerometer', session, calibration) ** 2)) < 2.0
+    compensate_recording(log, calibration, output=output)
+    written = read_csv(output)
+    expected = compensate_recording(block, calibration).imu.force_s
+    np.testing.assert_allclose(written.imu.force_s, expected, atol=1e-6)
+    assert len(output.read_text().split('\n', 1)[0].split(';')) == len(names)

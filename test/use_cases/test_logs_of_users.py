@@ -6,12 +6,16 @@ The log of an autopilot in forward-right-down axes is also calibrated and export
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.export import export, find_target
 from imu_calibration.use_cases.calibrate import calibrate_recordings
+from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.csv_log import read_csv
 
+from worlds.compensation_cases import random_calibration
 from worlds.small_hand import ACCELEROMETER, GRAVITY, GYROSCOPE, hand_motion
 
 G0 = 9.80665
@@ -28,6 +32,13 @@ def readings():
 def numbers(values):
     """Return a column as text with nine decimals."""
     return [f'{value:.9f}' for value in values]
+
+
+def affine(calibration, sensor):
+    """Return bias and matrix of a sensor."""
+    bias = calibration.values[calibration.model.slices[sensor, 'bias']]
+    matrix = calibration.values[calibration.model.slices[sensor, 'matrix']]
+    return bias, matrix.reshape(3, 3)
 
 
 def whole(values):
@@ -142,12 +153,79 @@ def two_imus(time, force, rate):
     return joined(f'{header},gx,gy,gz', columns)
 
 
+CORRECTED_FIRST = ('force=2,3,4:m/s^2', 'rate=8,9,10:rad/s')
 OF_FIRST = ('force=imu1_accel_x,imu1_accel_y,imu1_accel_z:m/s^2', 'rate=gx,gy,gz:rad/s')
+
+
+def quoted_commas(time, force, rate):
+    """A comma is the delimiter and, within quotes, the decimal sign; some cells are empty."""
+    columns = [numbers(time), *axes(force), *axes(rate), numbers(0.1 * time)]
+    columns = [[f'"{cell}"'.replace('.', ',') for cell in column] for column in columns]
+    columns[-1][7] = '""'
+    return joined('"t","ax","ay","az","gx","gy","gz","note"', columns)
+
+
+def errors_of_spreadsheets(time, force, rate):
+    """Cells without a number, in a column that is not read, and a comment behind a row."""
+    notes = numbers(0.1 * time)
+    notes[20:24] = ['#N/A', 'null', '#DIV/0!', '-nan(ind)']
+    columns = [numbers(time), *axes(force), notes, *axes(rate)]
+    columns[-1][30] += ' # knocked'
+    return joined('t,ax,ay,az,note,gx,gy,gz', columns)
+
+
+def date_and_time(time, force, rate):
+    """A date and a time of day in two columns, past midnight."""
+    day = ['08/30/2021'] * len(time)
+    columns = [day, clock(time, 86_391.0), *axes(1e3 * force / G0), *axes(np.degrees(rate))]
+    return joined('rtcDate,rtcTime,aX,aY,aZ,gX,gY,gZ,', columns, end=',')
+
+
+def tabs_and_time_of_day(time, force, rate):
+    header = 'Time(s)\tax(g)\tay(g)\taz(g)\twx(deg/s)\twy(deg/s)\twz(deg/s)'
+    columns = [clock(time, 86_385.0), *axes(force / G0), *axes(np.degrees(rate))]
+    return joined(header, columns, '\t')
+
+
+def counter_32(time, force, rate):
+    """Metadata, then a counter of microseconds that overflows; each row ends with a comma."""
+    ticks = [f'{(2**32 - 5_000_000 + round(1e6 * second)) % 2**32}' for second in time]
+    header = 'sep=,\nDeviceTag:,left\n\nSampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z,'
+    return joined(header, [ticks, *axes(force), *axes(np.degrees(rate))], end=',')
+
+
+def blackbox(time, force, rate):
+    names = [f' {sensor}[{k}]' for sensor in ('gyroADC', 'accSmooth') for k in range(3)]
+    header = f'loopIteration, time (us),{",".join(names)}, motor[0]'
+    count = whole(np.arange(len(time)))
+    of_force = axes(2048.0 * force / G0, whole)
+    return joined(
+        header, [count, whole(1e6 * time), *axes(np.degrees(rate)), *of_force, count], ', '
+    )
+
+
+OF_BLACKBOX = ('force=accSmooth[0],accSmooth[1],accSmooth[2]:counts:2048/g',)
+
+
+def phone_table(time, force, rate):
+    """Rows of both sensors, axes in the order z, y, x."""
+    names = [f'{sensor}_{axis}' for sensor in ('totalacceleration', 'gyroscope') for axis in 'zyx']
+    stamps = [f'{1_718_030_736_872_695_300 + round(1e9 * second)}' for second in time]
+    header = f'time,seconds_elapsed,{",".join(names)}'
+    return joined(header, [stamps, numbers(time), *axes(force)[::-1], *axes(rate)[::-1]])
 
 
 @pytest.mark.parametrize(
     ('log', 'encoding', 'columns', 'force_step', 'rate_step'),
     [
+        (decimal_commas, 'cp1252', (), 1e-8, 1e-8),
+        (quoted_commas, 'utf-8', (), 1e-8, 1e-8),
+        (errors_of_spreadsheets, 'utf-8', (), 1e-8, 1e-8),
+        (date_and_time, 'utf-8', (), 1e-8, 1e-8),
+        (tabs_and_time_of_day, 'utf-8', (), 1e-7, 1e-8),
+        (counter_32, 'utf-8', (), 1e-8, 1e-8),
+        (blackbox, 'utf-8', OF_BLACKBOX, G0 / 2048.0, 1e-8),
+        (phone_table, 'utf-8', (), 1e-8, 1e-8),
         (decimal_commas, 'utf-8', (), 1e-8, 1e-8),
         (decimal_commas, 'utf-16', (), 1e-8, 1e-8),
         (day_first, 'utf-8', (), 1e-8, 1e-8),
@@ -167,7 +245,11 @@ OF_FIRST = ('force=imu1_accel_x,imu1_accel_y,imu1_accel_z:m/s^2', 'rate=gx,gy,gz
 def test_the_readings_are_those_of_the_log(
     tmp_path, readings, log, encoding, columns, force_step, rate_step
 ):
-    """`force_step`, `rate_step`: rounding of the text in SI."""
+    """
+    Also those of the corrected log, after the inverse of the calibration.
+
+    `force_step`, `rate_step`: rounding of the text in SI.
+    """
     time, force, rate = readings
     path = tmp_path / 'log.csv'
     path.write_bytes(log(time, force, rate).encode(encoding))
@@ -176,6 +258,40 @@ def test_the_readings_are_those_of_the_log(
     np.testing.assert_allclose(seconds, time - time[0], atol=1e-3)  # stamps in whole ms
     np.testing.assert_allclose(imu.force_s, force, atol=force_step)
     np.testing.assert_allclose(imu.rate_s, rate, atol=rate_step)
+
+    calibration = random_calibration(5, (), (), sd=1e-5)
+    output = tmp_path / 'corrected.csv'
+    compensate_recording(path, calibration, columns=columns, output=output)
+    # The header of two IMUs names two sets; its units are those of the corrected columns.
+    written = read_csv(output, CORRECTED_FIRST if columns == OF_FIRST else ()).imu
+    np.testing.assert_array_equal(
+        written.stamp_ns - written.stamp_ns[0], imu.stamp_ns - imu.stamp_ns[0]
+    )
+    bias, matrix = affine(calibration, 'accelerometer')
+    np.testing.assert_allclose(bias + written.force_s @ matrix.T, force, atol=force_step + 1e-7)
+    bias, matrix = affine(calibration, 'gyroscope')
+    np.testing.assert_allclose(bias + written.rate_s @ matrix.T, rate, atol=rate_step + 1e-7)
+
+
+def test_one_instance_of_an_autopilot_is_corrected_by_itself(tmp_path, readings):
+    """Rows of two IMUs: those of the selected one are written, with its readings corrected."""
+    time, force, rate = readings
+    rows = []
+    for k, second in enumerate(time):
+        for number, shift in ((0, 0.0), (1, 0.4)):
+            vectors = (*(rate[k] + 0.1 * shift), *(force[k] + shift))
+            cells = [str(round(1e6 * second + 4e7)), str(number), *numbers(vectors)]
+            rows.append(','.join(cells))
+    path, output = tmp_path / 'log.csv', tmp_path / 'corrected.csv'
+    path.write_text('\n'.join(['TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ', *rows]))
+    calibration = random_calibration(5, (), (), sd=1e-5)
+    with refused(InputError, 'one_source'):
+        compensate_recording(path, calibration, output=output)
+    compensate_recording(path, calibration, where=['I=1'], output=output)
+    assert {row.split(',')[1] for row in output.read_text().splitlines()[1:]} == {'1'}
+    bias, matrix = affine(calibration, 'accelerometer')
+    written = read_csv(output).imu
+    np.testing.assert_allclose(bias + written.force_s @ matrix.T, force + 0.4, atol=1e-7)
 
 
 def test_the_log_of_an_autopilot_is_exported_with_the_signs_of_the_vehicle(
