@@ -159,6 +159,7 @@ def _entry_of(effect: Effect, with_sd: bool) -> Requirement:
     # Saturation levels may be infinite; `check_numbers` checks the values.
     values = array(effect.shape, number(finite=False, code='document_parts'))
     centre = {group.name: array((group.width,), number(code='centre')) for group in effect.groups}
+    slope = {group.name: array((group.width, 3), number(code='centre')) for group in effect.groups}
     unit = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
     needed = {
         'value': values,
@@ -168,6 +169,7 @@ def _entry_of(effect: Effect, with_sd: bool) -> Requirement:
     further = {
         'unit': maybe(equal(unit, code='unit')),
         'centre': maybe(mapping(optional=centre, closed=True, code='centre')),
+        'centre_slope': maybe(mapping(optional=slope, closed=True, code='centre')),
         'held_reason': array(effect.shape, maybe(text())),
     }
     return mapping(needed | sd, further) if with_sd else mapping(needed, further | sd)
@@ -299,8 +301,11 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
         for name, reason in zip(effect.param_names(), reasons):
             if reason:
                 held_reason[name] = reason
+        slopes = entry.get('centre_slope') or {}
         for group, value in (entry.get('centre') or {}).items():
-            centre[group] = np.asarray(value, float)
+            offset = np.asarray(value, float)
+            slope = np.asarray(slopes.get(group, np.zeros((len(offset), 3))), float)
+            centre[group] = np.column_stack([offset, slope])
     terms = {}
     for name, variance in (document.get('covariance_terms') or {}).items():
         terms[str(name)] = np.asarray(variance, float)[order]
@@ -457,7 +462,10 @@ def _section(calibration: Calibration, section: str) -> dict[str, Any]:
             if group.name in calibration.model.centre
         }
         if centre:
-            entries[effect.name]['centre'] = plain(centre)
+            entries[effect.name]['centre'] = plain({name: c[:, 0] for name, c in centre.items()})
+        slopes = {name: each[:, 1:] for name, each in centre.items() if np.any(each[:, 1:])}
+        if slopes:
+            entries[effect.name]['centre_slope'] = plain(slopes)
         reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]
         if any(reasons):
             entries[effect.name]['held_reason'] = (

@@ -42,6 +42,11 @@ SETTLED = 0.1
 An effect in time has settled if a recording of twice the length would change it by at most this
 share more: 2.3 time constants.
 """
+LEAST_INPUT = {'accelerometer': 1.0, 'gyroscope': 0.1}
+"""
+Sensor -> rms of its true input in a direction, m/s^2 or rad/s, from which bias and matrix take the
+place of an effect that compensation cannot undo: 0.1 g, and 6 deg/s.
+"""
 PROBABLE = 2.0
 """Standard deviations above a time constant with which an effect has to have settled."""
 
@@ -51,7 +56,7 @@ class Uncorrected:
     """Constant values that compensation applies instead of effects that it cannot undo."""
 
     centre: Centre = field(default_factory=dict)
-    """Column group -> values of its columns at which the effect is applied."""
+    """The part of the effects that the applied bias and matrix contain."""
     sizes: tuple[dict[str, Any], ...] = ()
     """
     Entries of the statistics: effect, sensor, 'applied' (`END` or `MEAN`), rms of the rest on each
@@ -88,7 +93,8 @@ def uncorrected_on_table(
     """
     latest = latest or model
     counts, end = np.array([row.count for row in accumulator.rows], float), end_of(accumulator)
-    centre, sizes = {}, []
+    centre: dict[str, np.ndarray] = {}
+    sizes = []
     at_columns = replace(
         model,
         point=model.point
@@ -101,25 +107,72 @@ def uncorrected_on_table(
                 gathered.layout(effect.sensor).rows[group.name],
                 model.layout(effect.sensor).rows[group.name],
             )
-            means = np.array([row.sensors[effect.sensor].mean[rows] for row in accumulator.rows])
-            centre[group.name] = (
-                columns_at(model, effect, [end])[group.name][0]
-                if at_end
-                else _moved(
+            true_input = gathered.columns_of(effect.sensor, Role.LINEAR)
+            means = np.array([row.sensors[effect.sensor].mean for row in accumulator.rows])
+            within = [
+                factor
+                for (sensor, _), factor in accumulator.within.items()
+                if sensor == effect.sensor
+            ]
+            if at_end:
+                column = columns_at(model, effect, [end])[group.name][0]
+                centre[group.name] = np.column_stack([column, np.zeros((len(column), 3))])
+            else:
+                centre[group.name] = _moved(
                     effect,
-                    counts @ means / counts.sum(),
+                    _projection(effect, rows, true_input, counts, means, within),
                     values[model.slices[effect.key]] - gathered.point_of(effect),
                 )
-            )
-            applied = centre[group.name] @ coefficients(model, effect.sensor, values)[own]
+            applied = centre[group.name].T @ coefficients(model, effect.sensor, values)[own]
             value = coefficients(at_columns, effect.sensor, values)[own]
-            squares += counts @ (means @ value - applied) ** 2
-            for (sensor, _), factor in accumulator.within.items():
-                squares += (
-                    ((factor[:, rows] @ value) ** 2).sum(axis=0) if sensor == effect.sensor else 0.0
-                )
+            rest = means[:, rows] @ value - applied[0] - means[:, true_input] @ applied[1:]
+            squares += counts @ rest**2
+            for factor in within:
+                rest = factor[:, rows] @ value - factor[:, true_input] @ applied[1:]
+                squares += (rest**2).sum(axis=0)
         sizes.append(_size(effect, np.sqrt(squares / counts.sum()), at_end))
     return Uncorrected(centre, tuple(sizes))
+
+
+def _projection(
+    effect: Effect,
+    rows: slice,
+    true_input: slice,
+    counts: np.ndarray,
+    means: np.ndarray,
+    within: Sequence[np.ndarray],
+) -> np.ndarray:
+    """
+    Return the part of the columns of an effect that bias and matrix describe, shape (width, 4).
+
+    It minimises the squares of ``column - centre[0] - centre[1:] @ true`` over all samples. An
+    effect in time only is no function of the motion: its mean is the value in another session.
+
+    Parameters
+    ----------
+    effect : Effect
+    rows, true_input : slice
+        Columns of the effect, and of the true input of its sensor.
+    counts : array, shape (n_windows,)
+        Samples of each window.
+    means : array, shape (n_windows, n_columns + 3)
+        Mean rows of the windows.
+    within : sequence of array, shape (k, n_columns + 3)
+        Factors of the rows about these means.
+
+    """
+    mean = counts @ means / counts.sum()
+    slope = np.zeros((rows.stop - rows.start, 3))
+    if not in_time(effect):
+        about_mean = np.sqrt(counts)[:, None] * (means - mean)
+        stacked = np.concatenate([about_mean, *within])
+        inputs, columns = stacked[:, true_input], stacked[:, rows]
+        # Directions in which the sensor had no input have no slope.
+        power, directions = np.linalg.eigh(inputs.T @ inputs / counts.sum())
+        directions = directions[:, power > LEAST_INPUT[effect.sensor] ** 2]
+        along = inputs @ directions
+        slope = (directions @ np.linalg.lstsq(along, columns, rcond=None)[0]).T
+    return np.column_stack([mean[rows] - slope @ mean[true_input], slope])
 
 
 def _moved(effect: Effect, columns: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -152,10 +205,13 @@ def uncorrected_in_time(
     for effect in not_applied(model):
         at_end, at_times = has_settled(latest, effect, end), columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
-        centre |= {name: columns.mean(axis=0) for name, columns in applied.items()}
+        for name, columns in applied.items():
+            constant = columns.mean(axis=0)
+            centre[name] = np.column_stack([constant, np.zeros((len(constant), 3))])
         rows = model.layout(effect.sensor).rows
         rest = sum(
-            (at_times[name] - centre[name]) @ coefficients(model, effect.sensor, values)[rows[name]]
+            (at_times[name] - centre[name][:, 0])
+            @ coefficients(model, effect.sensor, values)[rows[name]]
             for name in at_times
         )
         sizes.append(_size(effect, np.sqrt(np.mean(np.square(rest), axis=0)), at_end))
@@ -247,8 +303,8 @@ def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:
     for entry in statistics.get('uncorrected') or ():
         size = error_text(max(entry['rms']), entry['unit'])
         lines.append(
-            f'{entry["effect"]} is not corrected: the {entry["sensor"]} bias has its value at the'
-            f' {entry["applied"]}, with an error of {size} rms during the'
+            f'{entry["effect"]} is not corrected: {entry["sensor"]} bias and matrix contain its'
+            f' value at the {entry["applied"]}, with an error of {size} rms during the'
             f' recording{AGAIN if entry["applied"] == END else ""}'
         )
     return lines

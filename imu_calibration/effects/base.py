@@ -16,6 +16,8 @@ AXES = ('x', 'y', 'z')
 SENSORS = ('accelerometer', 'gyroscope')
 UNITS = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
 """Sensor -> unit of its readings."""
+INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
+"""Sensor -> field of a `Reference` with its true input."""
 PREFIXES = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
 """Beginning of the names of a sensor's own effects and columns."""
 SECTIONS = SENSORS + ('reference',)

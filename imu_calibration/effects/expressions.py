@@ -457,7 +457,7 @@ class ColumnGroup:
             The true motion.
         point : dict
             'temperature_ref_c', effect name -> values where columns depend on them, 'centre': group
-            -> value to subtract (``SensorModel.full_point``).
+            -> field of the true input and `Centre` to subtract (``SensorModel.full_point``).
 
         Raises
         ------
@@ -484,7 +484,8 @@ class ColumnGroup:
                 if self.width > count:
                     result[:, count + k] = np.imag(column) / COMPLEX_STEP
         if self.name in point.get('centre', ()):
-            result -= point['centre'][self.name]
+            true_input, centre = point['centre'][self.name]
+            result -= centre[:, 0] + getattr(ref, true_input) @ centre[:, 1:].T
         if self._may_fail and not np.all(np.isfinite(result)):
             raise InputError(
                 f"the columns of '{self.name}' must be finite in the whole recording,"

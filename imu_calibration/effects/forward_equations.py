@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import SENSORS, Effect, Lag, Role
+from imu_calibration.effects.base import INPUT_OF, SENSORS, Effect, Lag, Role
 from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion, shifted
@@ -62,9 +62,6 @@ def _mean_reference(weighted, motion):
         weighted_sum = sum(weight * getattr(ref, name) for weight, ref in weighted)
         mean[name] = weighted_sum / total
     return replace(weighted[0][1], motion=motion, **mean)
-
-
-INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
 
 
 class References:
@@ -439,8 +436,9 @@ def sensor_output(
 
 Centre = Mapping[str, np.ndarray]
 """
-Column group -> the values of its columns at which an effect that compensation cannot undo counts as
-zero, shape (width,).
+Column group -> the part of its columns that bias and matrix describe, for effects that compensation
+cannot undo: ``column ~ centre[0] + centre[1:] @ true``, shape (width, 4). `true` is the input of
+the sensor.
 """
 
 
@@ -472,16 +470,17 @@ def centred(
     """
     Return (values, their derivative by the given ones) for centred columns.
 
-    The columns are measured from `centre`.
+    With ``column = centre[0] + centre[1:] @ true + rest`` the output is that of a changed bias and
+    matrix, and of the rest::
 
-    ``bias + column value = (bias + centre value) + (column - centre) value``: only the biases
-    change.
+        bias_i + matrix_ij true_j + column value_i
+            = (bias_i + centre[0] value_i) + (matrix_ij + centre[1+j] value_i) true_j + rest value_i
 
     Parameters
     ----------
     model : SensorModel
     values : array, shape (n_params,)
-    centre : mapping
+    centre : Centre
 
     """
     moved = values.copy()
@@ -489,14 +488,20 @@ def centred(
     for effect in not_applied(model):
         sensor = effect.sensor
         bias = model.part(sensor, Role.OFFSET)
+        matrix = model.part(sensor, Role.LINEAR)
         for group in effect.groups:
             if group.name not in centre:
                 continue
             at_centre = centre[group.name]
             rows = model.layout(sensor).rows[group.name]
-            moved[bias] += at_centre @ coefficients(model, sensor, values)[rows]
+            change = at_centre.T @ coefficients(model, sensor, values)[rows]
             slopes = coefficient_jacobian(model, sensor, values)[rows]
-            slope[bias] += np.einsum('q,qan->an', at_centre, slopes)
+            change_slope = np.einsum('qk,qan->akn', at_centre, slopes)
+            moved[bias] += change[0]
+            slope[bias] += change_slope[:, 0]
+            if np.any(at_centre[:, 1:]):
+                moved[matrix] += change[1:].T.ravel()
+                slope[matrix] += change_slope[:, 1:].reshape(9, -1)
     return moved, slope
 
 
@@ -527,7 +532,7 @@ def applied_values(
     """
     Return the values with effects that compensation cannot undo fixed at the centre.
 
-    These effects are at their value in the centre, which the bias contains; those that need
+    These effects are at their value in the centre, which bias and matrix contain; those that need
     readings of the sensors `absent` are zero.
     """
     applied = centred(model, values, centre or {})[0]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
+from imu_calibration.effects.base import INPUT_OF, SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
@@ -147,7 +147,7 @@ class SensorModel:
     catalogue: Catalogue = CATALOGUE
     """Where the effects are declared."""
     centre: dict = field(default_factory=dict)
-    """Column group -> value from which its columns are measured (`effects.forward_equations`)."""
+    """Column group -> what its columns are measured from (`effects.forward_equations.Centre`)."""
 
     def __post_init__(self):
         object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))
@@ -427,8 +427,15 @@ class SensorModel:
     def full_point(self) -> dict[str, Any]:
         """Return the data of the column groups in addition to the reference."""
         settling = {e.name: self.point_of(e) for e in self.effects if e.time_constant}
-        centre = {'centre': self.centre} if self.centre else {}
-        return {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c, **centre}
+        point = {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c}
+        if self.centre:
+            point['centre'] = {
+                group.name: (INPUT_OF[effect.sensor], self.centre[group.name])
+                for effect in self.effects
+                for group in effect.groups
+                if group.name in self.centre
+            }
+        return point
 
 
 def linear_names(sensor: str) -> np.ndarray:

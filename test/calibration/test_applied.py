@@ -19,6 +19,9 @@ from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.trust import END, MEAN, caveats
 from imu_calibration.effects.catalogue import CATALOGUE, term
+from imu_calibration.effects.forward_equations import centred, sensor_output
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.write import write_session
@@ -220,12 +223,77 @@ def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_w
 
 def model_output(calibration, time):
     """Return the output of the gyroscope of a calibration at rest at a time, rad/s, shape (3,)."""
-    from imu_calibration.effects.forward_equations import sensor_output
-    from imu_calibration.kinematics.rotations import Reference
-
     nothing = np.zeros((1, 3))
     ref = Reference(np.array([time]), np.eye(3)[None], nothing, nothing, nothing, 0.0)
     return sensor_output(calibration.model, 'gyroscope', calibration.values, ref=ref)[0]
+
+
+def test_a_centred_model_has_the_output_of_the_model():
+    """Bias and matrix contain what the columns lose, for any centre; the slope is exact."""
+    rng = np.random.default_rng(3)
+    effect = term(
+        'own',
+        sensor='gyroscope',
+        column=['time * w_x', 'time', 'c_xz'],
+        unit='1',
+        tolerance=1e-4,
+        text='A formula.',
+    )
+    model = SensorModel(
+        gyroscope=('bias', 'matrix', 'own'), catalogue=CATALOGUE.with_effects(effect)
+    )
+    values = rng.normal(size=len(model.param_names))
+    centre = {'own': rng.normal(size=(3, 4))}
+    motion = [rng.normal(size=(9, 3)) for _ in range(3)]
+    ref = Reference(np.arange(9.0), rng.normal(size=(9, 3, 3)), *motion, 9.8)
+
+    moved, slope = centred(model, values, centre)
+
+    wanted = sensor_output(model, 'gyroscope', values, ref=ref)[0]
+    found = sensor_output(replace(model, centre=centre), 'gyroscope', moved, ref=ref)[0]
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(moved, slope @ values, rtol=0, atol=1e-12)
+
+
+def test_a_scale_that_settles_is_applied_as_its_mean_over_the_motion():
+    """
+    In another session it starts again: its part in the matrix is that of a plain fit.
+
+    Uncertainty 1e-4: noise of the matrix.
+    """
+    effect = term(
+        'settling_scale',
+        sensor='gyroscope',
+        column=[f'(1 - exp(-time / 80)) * w_{axis}' for axis in 'xyz'],
+        unit='1',
+        tolerance=1e-4,
+        text='A formula.',
+    )
+    session = imu.simulate('quick', seed=5, **RATES)
+    samples = session.samples
+    time = 1e-9 * (samples.imu.stamp_ns - samples.imu.stamp_ns[0])
+    growth = -np.expm1(-time / 80)[:, None]
+    rate = samples.imu.rate_s
+    moved = replace(samples, imu=replace(samples.imu, rate_s=rate + 0.02 * growth * rate))
+    calibration = imu.calibrate(
+        moved,
+        session.table,
+        catalogue=CATALOGUE.with_effects(effect),
+        gyroscope_model='bias+matrix+settling_scale',
+        model_as_asked=True,
+    ).result.calibration
+    mean = (growth * rate**2).sum(axis=0) / (rate**2).sum(axis=0)
+    change = np.diag(
+        calibration.value('gyroscope', 'matrix') - session.truth.value('gyroscope', 'matrix')
+    )
+    np.testing.assert_allclose(change, 0.02 * mean, rtol=0, atol=4e-4)
+    np.testing.assert_allclose(
+        calibration.value('gyroscope', 'settling_scale'), 0.02, rtol=0, atol=4e-4
+    )
+    stored = calibration_from_text(calibration_to_text(calibration)).model.centre
+    np.testing.assert_allclose(
+        stored['settling_scale'], calibration.model.centre['settling_scale'], rtol=1e-9
+    )
 
 
 def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
@@ -261,7 +329,7 @@ def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     assert np.abs(calibration.value('gyroscope', 'bias') - truth).max() < 0.01 * DEG
     assert calibration.proof['gyroscope'].after < 0.05 * DEG
     part = calibration.model.slices['gyroscope', 'by_angle']
-    mean_column = calibration.model.centre['by_angle'][0]
+    mean_column = calibration.model.centre['by_angle'][:, 0]
     np.testing.assert_allclose(
         calibration.value('gyroscope', 'bias') - uncentred,
         mean_column * calibration.values[part],

@@ -836,6 +836,13 @@ TRUST = _of(
         'test_applied.py',
     ),
     (
+        'motion in an effect that is not applied has no part in the matrix',
+        '_projection',
+        'not in_time(_1)',
+        'False',
+        'test_applied.py::test_a_scale_that_settles_is_applied_as_its_mean_over_the_motion',
+    ),
+    (
         'one significant coefficient is not required',
         'one_significant',
         'np.any(np.abs(_1) > MIN_COEFFICIENT_SDS * _2)',

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import INPUT_OF, References
+from imu_calibration.effects.base import INPUT_OF, SENSORS
+from imu_calibration.effects.forward_equations import References
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.joint_motion import JointMotion
