@@ -96,4 +96,5 @@ def check_errors(
         changes=changes,
         change_limit=change_limit,
         dropped=dropped_text({**errors.lost, 'unusable': unusable(errors.findings)}, errors.n_used),
+        sensors=tuple(calibration.sensors),
     )

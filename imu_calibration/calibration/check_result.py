@@ -14,7 +14,7 @@ from imu_calibration.document.decision import (
     reason_of,
     worse_regimes,
 )
-from imu_calibration.document.proof_entry import Proof, ProofEntry
+from imu_calibration.document.proof_entry import Proof
 
 TOO_FEW_WINDOWS = 'fewer than three windows of rest or motion were found; record for longer'
 """Why there is no proof on a table."""
@@ -40,6 +40,13 @@ class CheckResult:
     """Factor of the error from which a significant change counts."""
     dropped: str = ''
     """Why dropped samples make the result incomplete; '' where they do not."""
+    sensors: tuple[str, ...] = ()
+    """Sensors of the calibration: each without an entry in the proof is unproven."""
+
+    @property
+    def judged(self) -> tuple[str, ...]:
+        """The sensors on which there is a decision."""
+        return tuple(dict.fromkeys((*self.proof, *self.sensors)))
 
     @property
     def changed(self) -> tuple[RegimeChange, ...]:
@@ -49,7 +56,7 @@ class CheckResult:
     @property
     def helps(self) -> bool:
         """Whether the decision on each sensor is `helps`."""
-        return bool(self.proof) and len(self.helped) == len(self.proof)
+        return bool(self.proof) and len(self.helped) == len(self.judged)
 
     @property
     def exit_code(self) -> int:
@@ -61,11 +68,7 @@ class CheckResult:
         """Why the exit code is 3, a line each."""
         if not self.proof:
             return self.lines
-        lines = [
-            self._line(sensor, entry)
-            for sensor, entry in self.proof.items()
-            if sensor not in self.helped
-        ]
+        lines = [self._line(sensor) for sensor in self.judged if sensor not in self.helped]
         changed = {each.sensor for each in self.changed}
         lines += [line for sensor, line in self._change_lines().items() if sensor in changed]
         if self.dropped:
@@ -94,9 +97,9 @@ class CheckResult:
         found = decide(self.proof.get(sensor))
         return most_cautious([found, UNPROVEN]) if sensor in self.refused else found
 
-    def _line(self, sensor: str, entry: ProofEntry) -> str:
+    def _line(self, sensor: str) -> str:
         why = f'; not applied: {self.refused[sensor]}' if sensor in self.refused else ''
-        return f'{sensor} {self.decision(sensor)}: {reason_of(entry)}{why}'
+        return f'{sensor} {self.decision(sensor)}: {reason_of(self.proof.get(sensor))}{why}'
 
     @property
     def helped(self) -> Proof:
@@ -110,12 +113,11 @@ class CheckResult:
         """The decision on each sensor with its reason, then the regimes with a larger error."""
         if not self.proof:
             return [f'unproven: {self.why}']
-        decided, worse = [], []
+        worse = []
         for sensor, entry in self.proof.items():
-            decided.append(self._line(sensor, entry))
             worse += [f'{sensor}: {line}' for line in worse_regimes(entry)]
         return [
-            *decided,
+            *(self._line(sensor) for sensor in self.judged),
             *worse,
             *self._change_lines().values(),
         ]

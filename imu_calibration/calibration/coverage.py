@@ -1,7 +1,7 @@
 """Coverage of directions by a calibration, and the state of each effect."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,12 +9,13 @@ from imu_calibration.calibration.from_solution import possible_motions
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.core.text_enum import StrEnum
+from imu_calibration.document.outcome import parameter_count
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.observability import added_information, sd_excess, share_gained
 from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
-from imu_calibration.estimation.solution import DETERMINED, LACKING
+from imu_calibration.estimation.solution import LACKING, REMEDY_KEYS
 from imu_calibration.estimation.standard_motions import (
     ALL_MOTIONS,
     DIRECTIONS,
@@ -159,7 +160,7 @@ class Coverage:
     seconds: float
     """Remaining time, s; NaN when unknown."""
     done: bool = False
-    """Whether every parameter group is determined."""
+    """Whether every requested parameter of the sensors is determined."""
     arms: np.ndarray | None = None
     """
     Sensitive points of the accelerometer's axes, m in the sensor frame, rows x, y, z, shape (3, 3);
@@ -167,14 +168,6 @@ class Coverage:
     """
     frame_id: str = ''
     """Frame of the sensor."""
-
-    def with_done(self, groups: Sequence[GroupState]) -> 'Coverage':
-        """
-        Return the coverage that is done where every group is determined; never without groups.
-        """
-        return replace(
-            self, done=bool(groups) and all(group.status == DETERMINED for group in groups)
-        )
 
 
 NOTHING_SEEN = Coverage(
@@ -190,8 +183,8 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     Each cell is a rest of five seconds with that direction up.
 
     The next step is the standard motion with the largest gain per second; `seconds` is the time of
-    it and of all later ones needed. If these do not suffice, it is the motion that the solution
-    proposes for the parameter with the largest sd in tolerances.
+    it and of all later ones needed. If these do not suffice, or no motion determines what is
+    missing, it is what the solution proposes for the parameter with the largest sd in tolerances.
 
     Parameters
     ----------
@@ -200,7 +193,14 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
 
     """
     solution = result.solution
-    wanted = np.array(result.model.requested, bool)
+    requested = result.calibration.requested
+    # No motion determines a parameter whose remedy is another one.
+    wanted = np.array(
+        [
+            name in requested and not _has_remedy(result, name)
+            for name in result.calibration.param_names
+        ]
+    )
     prior = make_prior(solution.model)
     gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge  # as exact as sums of squares bear it
     base = solution.information + np.diag(1 / prior.sd**2) + gauge.T @ gauge
@@ -235,7 +235,19 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     # Without an accelerometer no directions of gravity are shown.
     force = errors.true.get('accelerometer', np.zeros((len(errors.kind), 3)))
     force = force[(np.asarray(errors.kind) == 'static') & force.any(axis=1)]
-    return Coverage(worth, unit_rows(force), None, step, seconds, False, _arms(result), frame_id)
+    return Coverage(
+        worth, unit_rows(force), None, step, seconds, is_done(result), _arms(result), frame_id
+    )
+
+
+def is_done(result: CalibrationResult) -> bool:
+    """Return whether every requested parameter of the sensors is determined."""
+    return not parameter_count(result.calibration).lacking
+
+
+def _has_remedy(result: TableResult, name: str) -> bool:
+    """Return whether a parameter needs something that is no motion."""
+    return name in result.needed and result.needed[name][0] in REMEDY_KEYS
 
 
 def _foretold(
@@ -269,7 +281,8 @@ def _foretold(
 
 def _next_on_table(result: TableResult) -> Step:
     """Return the motion that serves the parameter worst off."""
-    needed = result.needed
+    requested = result.calibration.requested
+    needed = {name: need for name, need in result.needed.items() if name in requested}
     if not needed:
         return Step('')
     names = list(result.calibration.param_names)

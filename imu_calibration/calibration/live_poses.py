@@ -29,6 +29,7 @@ from imu_calibration.calibration.coverage import (
     Progress,
     Step,
     group_states,
+    is_done,
     waiting_groups,
 )
 from imu_calibration.calibration.hand_recording import HandRecording, late_gyroscope
@@ -45,8 +46,9 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import (
     COMMON_SCALE,
-    LACKING,
+    GRAVITY,
     NO_STEP,
+    REMEDIES,
     REMEDY_KEYS,
     tolerances_of,
 )
@@ -201,33 +203,29 @@ def _needs(
             return Progress.WAITING, ['hold it still']
         if not parameter_count(calibration).lacking:
             return Progress.DETERMINED, []
-        return Progress.WEAK, list(
-            dict.fromkeys(item['needs'] for item in calibration.undetermined)
-        )
+        return Progress.WEAK, needs_of(calibration)
     if found.attitudes < MIN_ATTITUDES or calibration is None:
         more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
         return Progress.WAITING, [
             f'{step}{more}; {MIN_ATTITUDES} attitudes at least, {POSES_FULL} for all parameters'
         ]
-    lacking = list(parameter_count(calibration).lacking)
-    if not lacking:
+    if not parameter_count(calibration).lacking:
         return Progress.DETERMINED, []
-    if lacking == [COMMON_SCALE]:
-        return Progress.WEAK, [
-            with_hint(
-                'give the local gravity, which scales the accelerometer as a whole',
-                'gravity',
-                hints,
-            )
-        ]
-    needs = dict.fromkeys(item['needs'] for item in calibration.undetermined)
+    needs = needs_of(calibration)
     without_motion = [
         with_hint(need, REMEDY_KEYS.get(need), hints) for need in needs if need in NO_STEP
     ]
     if len(without_motion) == len(needs) > 0:
         return Progress.WEAK, without_motion
     # The planned step serves the parameters whose need is a pose or a turn.
-    return Progress.WEAK, [step, *without_motion] if step else list(needs)
+    return Progress.WEAK, [step, *without_motion] if step else needs
+
+
+def needs_of(calibration: Calibration) -> list[str]:
+    """Return what the undetermined parameters need; the gravity where it alone is missing."""
+    if parameter_count(calibration).lacking == (COMMON_SCALE,):
+        return [REMEDIES[GRAVITY,]]
+    return list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
 
 
 def _plural(count: int, noun: str) -> str:
@@ -261,19 +259,25 @@ def hand_coverage(
 
     The cells, the next pose with the turn to it, and the remaining seconds.
     """
-    if 'accelerometer' in found.absent:
-        no_ups = ups_of(None)
-        return Coverage(np.zeros(len(DIRECTIONS)), no_ups, None, Step(''), 0.0, frame_id=frame_id)
-    seen = ups_of(found.poses)
-    up = None if found.poses is None else seen[-1]
+    # Without an accelerometer gravity is not measured, and no attitude has a gain.
+    without_gravity = 'accelerometer' in found.absent
+    seen = ups_of(None if without_gravity else found.poses)
+    up = seen[-1] if len(seen) else None
+    no_gain = Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
+    if result is not None:
+        if is_done(result):
+            return replace(no_gain, done=True)
+        # Nor does an attitude determine more where each need is an input or a cause to be found. A
+        # sensor that moved at rest is put down in the attitude that the picture shows.
+        needs = needs_of(result.calibration)
+        if needs and set(needs) <= set(REMEDY_KEYS):
+            return replace(no_gain, next=Step(needs[0]))
+    if without_gravity:
+        return no_gain
     knowledge = knowledge_of(found, result, options)
-    steps = (
-        []
-        if result is not None and not set(LACKING) & set(result.applied.statuses)
-        else foretold(knowledge)
-    )
+    steps = foretold(knowledge)
     if not steps:
-        return Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
+        return no_gain
     first, worth = steps[0], knowledge.best()[1]
     return Coverage(
         worth,

@@ -227,16 +227,13 @@ class Verdict:
     The requested parameter with the largest sd in units of its tolerance, and that ratio; ('', 0)
     without any.
     """
+    complete: bool
+    """Whether the exit code is 0 (`outcome.shortcomings`)."""
 
     @property
     def word(self) -> SensorDecision:
         """The more cautious of the decisions."""
         return most_cautious(self.decisions.values())
-
-    @property
-    def complete(self) -> bool:
-        """Whether each sensor helps and every requested parameter is determined."""
-        return self.word is HELPS and self.within == self.requested
 
     @property
     def text(self) -> str:

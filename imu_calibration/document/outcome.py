@@ -4,12 +4,11 @@ Outcome of a calibration: parameters that count, samples left out, and the exit 
 Verbs, nodes, exports and reports use these functions, so that they agree.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.document.calibration import Calibration, listed, never_applied
-from imu_calibration.document.decision import HELPS, WARNING, SensorDecision, reason_of
+from imu_calibration.document.decision import HELPS, WARNING, reason_of
 from imu_calibration.estimation.solution import DETERMINED
 
 STATED_CHECKS = ('latitude', 'mount')
@@ -52,11 +51,6 @@ def missing(calibration: Calibration) -> str:
         f'{len(count.lacking)} of {count.requested} parameters not determined'
         f' ({listed(count.lacking)})'
     )
-
-
-def is_complete(decisions: Mapping[str, SensorDecision], count: ParameterCount) -> bool:
-    """Return whether every sensor helps and every requested parameter is determined."""
-    return set(decisions.values()) == {HELPS} and not count.lacking
 
 
 def dropped_of(calibration: Calibration) -> tuple[dict[str, int], int]:

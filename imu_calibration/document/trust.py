@@ -1,6 +1,6 @@
 """Applied parts of a calibration: the decision per sensor, and consent of the user."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -366,13 +366,16 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
             f'{first} {refused[first]}; calibrate again'
         )
         raise DocumentError(text, key='anyway' if consent else None, code='no_sensor_helps')
-    cautions = tuple(
+    applied = with_nominal(calibration, list(refused)) if refused else calibration
+    return Usable(applied, refused, cautions_of(calibration, refused))
+
+
+def cautions_of(calibration: Calibration, refused: Collection[str]) -> tuple[str, ...]:
+    """Return a line for each sensor, except those refused, on which the decision is not `helps`."""
+    return tuple(
         f'{sensor} {_text(calibration, sensor)}'
-        for sensor in calibration.sensors
-        if sensor not in refused and words[sensor] is not HELPS
-    )
-    return Usable(
-        with_nominal(calibration, list(refused)) if refused else calibration, refused, cautions
+        for sensor, word in calibration.decisions.items()
+        if sensor not in refused and word is not HELPS
     )
 
 

@@ -41,8 +41,8 @@ from imu_calibration.document.decision import (
 from imu_calibration.document.outcome import (
     ParameterCount,
     dropped_of,
-    is_complete,
     parameter_count,
+    shortcomings,
 )
 from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.rest_noise import motions_at_rest, moved_at_rest, swayed_at_rest
@@ -53,6 +53,7 @@ from imu_calibration.estimation.solution import (
     COMMON_SCALE,
     DETERMINED,
     DRIFT,
+    GRAVITY,
     HELD,
     MODEL_ERROR,
     MOVED_REMEDY,
@@ -502,6 +503,8 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
 
     """
     decisions = _decisions(calibration)
+    decided = replace(calibration, decision={each: str(word) for each, word in decisions.items()})
+    complete = not shortcomings(decided)
     count = parameter_count(calibration)
     counted = np.array([name in calibration.requested for name in calibration.param_names])
     share = np.where(counted, calibration.own_sd / tolerances, 0.0)
@@ -515,7 +518,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         )
     reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
     reasons += _absent(calibration)
-    reasons.append(_parameters(count, limiting, complete=is_complete(decisions, count)))
+    reasons.append(_parameters(count, limiting, complete=complete))
     reasons += (
         _undetermined(calibration)
         + _blind(calibration)
@@ -539,6 +542,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         count.determined,
         count.requested,
         limiting,
+        complete,
     )
 
 
@@ -795,9 +799,7 @@ def _undetermined(calibration: Calibration) -> list[Reason]:
                 ' it is not part of the other sds'
             )
             reasons.append(
-                Reason(
-                    PARAMETERS, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]
-                )
+                Reason(PARAMETERS, what, REMEDIES[GRAVITY,], key='gravity', sensors=SENSORS[:1])
             )
         for next_step, members in _by_need(calibration, names).items():
             reasons.append(

@@ -54,7 +54,7 @@ class WorkerState:
     verdict: str = ''
     """The more cautious decision; '' before the first solution."""
     lines: tuple = ()
-    """Reasons and next steps."""
+    """Reasons why it is not complete, then all statements and next steps."""
     trouble: str = ''
     """Why there is no new solution."""
     faults: tuple = ()
@@ -70,7 +70,7 @@ class WorkerState:
     judged: str = ''
     """The decisions in one phrase."""
     complete: bool = False
-    """Whether each sensor helps and every requested parameter is determined."""
+    """Whether nothing is missing (`outcome.shortcomings`)."""
 
     @property
     def is_gathering(self) -> bool:

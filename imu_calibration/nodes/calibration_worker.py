@@ -29,7 +29,7 @@ from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.outcome import missing, parameter_count
+from imu_calibration.document.outcome import missing, parameter_count, shortcomings
 from imu_calibration.nodes.calibration_status import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, return_freed_memory
 from imu_calibration.preprocessing.stream_watch import StreamWatch
@@ -510,12 +510,14 @@ class CalibrationWorker(threading.Thread):
         counts = self.live.counts
         self._watch.note_counts(counts, self._looked)
         result = self.live.result
-        lines = [] if result is None else summary(result, self.hints)
-        verdict, judged, complete = (
-            ('', '', False)
-            if result is None
-            else (str(result.verdict.word), result.verdict.text, result.verdict.complete)
-        )
+        lines: list[str] = []
+        verdict, judged, complete = '', '', False
+        if result is not None:
+            verdict, judged = str(result.verdict.word), result.verdict.text
+            complete = result.verdict.complete
+            # First what makes it incomplete: a status has room for three lines.
+            reasons = shortcomings(result.calibration)
+            lines = list(dict.fromkeys([*reasons, *summary(result, self.hints)]))
         values = {
             self.gathered: self.live.n_windows,
             'solutions': self._n_solutions,
@@ -576,4 +578,4 @@ class CalibrationWorker(threading.Thread):
         )
         if seen != self._covered:
             self._covered = seen
-            self.listeners.coverage(self.live.coverage().with_done(self.state.groups))
+            self.listeners.coverage(self.live.coverage())

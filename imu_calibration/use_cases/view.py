@@ -14,7 +14,6 @@ import numpy as np
 from imu_calibration.calibration.coverage import (
     Coverage,
     arrows_of,
-    group_states,
     label_of,
     seen_of,
     sphere_cells,
@@ -490,12 +489,10 @@ def _document_of(path):
 
 
 def _coverage(result: CalibrationResult) -> Coverage:
-    if result.data.table is None:
-        found = hand_coverage(
-            replace(EMPTY_SCAN, poses=result.applied.poses),
-            result,
-            HandOptions(tolerances=result.options.tolerances),
-        )
-    else:
-        found = table_coverage(result)
-    return found.with_done(group_states(result))
+    if result.data.table is not None:
+        return table_coverage(result)
+    return hand_coverage(
+        replace(EMPTY_SCAN, poses=result.applied.poses),
+        result,
+        HandOptions(tolerances=result.options.tolerances),
+    )

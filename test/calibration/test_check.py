@@ -64,6 +64,15 @@ def test_the_recording_that_a_file_was_made_from_is_noticed(pair, calibrated):
     )
 
 
+def test_a_sensor_without_readings_is_unproven_and_a_3(pair, calibrated):
+    imu = pair.second.imu
+    alone = replace(pair.second.block, imu=replace(imu, absent=('gyroscope',)))
+    found = check_recording(alone, calibrated.calibration, Table.from_mapping(pair.table))
+    assert list(found.helped) == ['accelerometer'] and not found.helps
+    assert found.decision('gyroscope') == 'unproven' and found.exit_code == 3
+    assert [line for line in found.reasons if 'gyroscope unproven' in line]
+
+
 def test_nothing_to_judge_on_is_no_proof():
     assert not CheckResult({}).helps and CheckResult({}).lines[0].startswith('unproven: ')
 

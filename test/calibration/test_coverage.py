@@ -6,6 +6,7 @@ A person who follows only the picture gets there.
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -35,6 +36,14 @@ from imu_calibration.calibration.live_poses import (
 )
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.outcome import parameter_count
+from imu_calibration.estimation.solution import (
+    DRIFT,
+    EXCESS_REMEDY,
+    MODEL_ERROR,
+    REJECTED,
+    REMEDIES,
+)
 from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.references.options import CalibrationOptions
@@ -219,6 +228,35 @@ def test_a_table_with_one_joint_is_told_no_seconds_of_motions_that_it_cannot_do(
     )
     shown = table_coverage(result)
     assert np.isnan(shown.seconds) and shown.next.text and 'left' not in label_of(shown)[2]
+
+
+def test_on_a_table_the_picture_shows_no_motion_for_an_error_of_the_model(begun):
+    """More motions do not help there; the gain of a rest is none."""
+    result = begun[1]
+    need = REMEDIES[MODEL_ERROR, DRIFT, REJECTED]
+    lacking = parameter_count(result.calibration).lacking
+    shown = table_coverage(replace(result, needed=dict.fromkeys(lacking, (need, np.nan))))
+    assert shown.next.text == need and shown.next.axis is None
+    assert not shown.worth.any() and not shown.done and 'left' not in label_of(shown)[2]
+
+
+def test_the_picture_is_done_without_the_parameters_of_the_table(begun):
+    calibration = begun[1].calibration
+    status = [
+        'weak' if name.startswith('reference.') else 'determined'
+        for name in calibration.param_names
+    ]
+    known = replace(begun[1], calibration=replace(calibration, status=tuple(status)), needed={})
+    assert 'weak' in status and table_coverage(known).done and not begun[0].coverage().done
+
+
+@pytest.mark.parametrize('need', [REMEDIES[MODEL_ERROR, DRIFT, REJECTED], EXCESS_REMEDY])
+def test_by_hand_the_picture_shows_no_attitude_that_does_not_help(need):
+    weak = {'gyroscope.matrix.xx': 'weak', 'gyroscope.bias.x': 'determined'}
+    undetermined = ({'parameters': {'gyroscope.matrix.xx': 2.0}, 'needs': need},)
+    calibration = SimpleNamespace(requested=weak, undetermined=undetermined)
+    shown = hand_coverage(EMPTY_SCAN, SimpleNamespace(calibration=calibration), OPTIONS)
+    assert shown.next.text == need and shown.next.up is None and not shown.worth.any()
 
 
 def picture(coverage):

@@ -22,7 +22,7 @@ from imu_calibration.cli.parser import VERBS, make_parser
 from imu_calibration.core.errors import ERROR_KEYS, InputError, with_hint
 from imu_calibration.core.errors import REMEDY_VERBS as PROGRAMS
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.estimation.solution import COMMON_SCALE
+from imu_calibration.estimation.solution import COMMON_SCALE, GRAVITY, REMEDIES
 from imu_calibration.nodes.lifecycle import HINTS
 from imu_calibration.preprocessing.joint_checks import check_force
 from msg_adapters.write import write_session
@@ -293,7 +293,5 @@ def test_the_live_session_by_hand_says_the_parameter_of_its_node():
         undetermined = ()
 
     found = PoseScan([slice(0, 9)] * 9, None, 9, 8, {}, 0.0)
-    assert hand_status(found, Solved, step='', hints=HINTS['calibration_node']).message.endswith(
-        'next: give the local gravity, which scales the accelerometer as a whole (parameter'
-        " 'gravity')"
-    )
+    message = hand_status(found, Solved, step='', hints=HINTS['calibration_node']).message
+    assert message.endswith(f"next: {REMEDIES[GRAVITY,]} (parameter 'gravity')")

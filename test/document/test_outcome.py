@@ -77,6 +77,21 @@ def test_a_contradiction_of_the_table_description_is_a_3_and_a_convention_is_not
     assert exit_code(proven(statistics={'preflight': [entry]})) == code
 
 
+@pytest.mark.parametrize(
+    'statistics',
+    [
+        {'dropped': {'imu spike': 170}, 'samples_used': {'all': 16_000}},
+        {'unusable_sensors': {'gyroscope': 'constant'}},
+        {'preflight': [CheckFinding('mount', WARNING, 'turned by 5 deg').to_mapping()]},
+    ],
+)
+def test_what_is_a_3_is_not_complete_and_its_next_step_is_not_to_compensate(statistics):
+    good, found = verdict_of(proven()), verdict_of(proven(statistics=statistics))
+    assert good.complete and any('compensate' in reason.next for reason in good.reasons)
+    assert exit_code(proven(statistics=statistics)) == 3 and not found.complete
+    assert not any('compensate' in reason.next for reason in found.reasons)
+
+
 def test_a_sensor_that_compensation_refuses_never_helps():
     good, bad = with_scale(1.02), with_scale(3.0)
     assert set(good.decisions.values()) == {HELPS} and not refused_sensors(good)

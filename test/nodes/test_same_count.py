@@ -48,6 +48,9 @@ def test_nodes_files_exports_and_reports_count_the_same(bench, tmp_path):
     exported = export_calibration(path, 'json', output=tmp_path / 'other.json')
     assert any(missing(calibration) in line for line in exported.lines)
 
+    # the status begins with what is missing: only its first lines are shown
+    bench.until(lambda: bench.shows(STATUS[0], missing(calibration)), 'the reason of the level')
+
     # as figures: /diagnostics of both nodes
     bench.start(CompensatorNode, {'calibration_file': str(path)})
     expected = [str(count.requested), str(len(count.lacking))]

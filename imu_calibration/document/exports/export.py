@@ -1,7 +1,7 @@
 """Export of a calibration to a target."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
@@ -37,7 +37,13 @@ from imu_calibration.document.exports.loss import (
     standard_motion,
 )
 from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
-from imu_calibration.document.trust import Usable, caveats, refused_sensors, usable
+from imu_calibration.document.trust import (
+    Usable,
+    cautions_of,
+    caveats,
+    refused_sensors,
+    usable,
+)
 from imu_calibration.effects.base import SENSORS, UNITS, Role
 
 
@@ -55,18 +61,23 @@ class Export:
     """Loss of the export."""
     lines: tuple[str, ...]
     """Notes: the same in the file and on the terminal."""
-    refused: Mapping[str, str] = field(default_factory=dict)
-    """Sensor whose numbers are those of a data sheet -> why."""
+    used: Usable
+    """The part of the calibration whose numbers these are."""
+
+    @property
+    def refused(self) -> Mapping[str, str]:
+        """Sensor whose numbers are those of a data sheet -> why."""
+        return self.used.refused
 
     @property
     def exit_code(self) -> int:
-        """0 written, 3 without the numbers of one sensor."""
+        """0 where the decision on each sensor is `helps`, otherwise 3, as of `compensate`."""
         return exit_code_of(self.reasons)
 
     @property
     def reasons(self) -> list[str]:
         """Why the exit code is 3, a line each."""
-        return [f'the {sensor} is not corrected: {why}' for sensor, why in self.refused.items()]
+        return self.used.lines
 
 
 def export(
@@ -109,7 +120,8 @@ def export(
     """
     if target.whole:
         # The file has the decisions too; a refused sensor is nevertheless a reason for exit code 3.
-        used = Usable(calibration, refused_sensors(calibration, anyway=anyway))
+        refused = refused_sensors(calibration, anyway=anyway)
+        used = Usable(calibration, refused, cautions_of(calibration, refused))
     elif target.only_noise:
         used = Usable(calibration)
     else:
@@ -146,7 +158,7 @@ def export(
         placement,
         loss,
         tuple(lines),
-        used.refused,
+        used,
     )
 
 
