@@ -6,7 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from imu_calibration.estimation.noise_model import BiasProcess, means_beside_middles
-from imu_calibration.estimation.whitening import RestrictedLikelihood, eliminate, profile
+from imu_calibration.estimation.whitening import (
+    RestrictedLikelihood,
+    eliminate,
+    profile,
+    profile_each,
+)
 
 FLICKER_MARK, FLICKER_TIMES = 0.0, (1.0, 5.0, 25.0, 125.0, 625.0)
 """
@@ -44,6 +49,9 @@ class NoiseLikelihood:
         Lengths of the windows, s.
     common : int
         The first parameters, which are part of every choice: eliminated once per shape.
+    choices : sequence of sequences of int, optional
+        Choices of parameters that are compared, counted after the common ones: of a new shape all
+        choices of one size are computed together.
 
     """
 
@@ -58,6 +66,7 @@ class NoiseLikelihood:
         known: tuple[BiasProcess, ...] = (),
         durations: np.ndarray | float = 0.0,
         common: int = 0,
+        choices: Sequence[Sequence[int]] = (),
     ):
         self.typical = float(np.sqrt(np.median(white)))
         """Noise of a typical window mean, in the unit of the rows."""
@@ -69,6 +78,7 @@ class NoiseLikelihood:
         self._likelihood = RestrictedLikelihood(rows, times, sessions, information=information)
         self._whitened: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
         self._profiles: dict[tuple, float] = {}
+        self._choices = [tuple(choice) for choice in choices]
 
     def loss(
         self,
@@ -83,15 +93,18 @@ class NoiseLikelihood:
         The parameters are counted after the common ones and are all parameters by default.
         """
         key = (*map(float, shape), float(session))
-        logs, normal = self._eliminated(key)
-        choice = (key, None if used is None else tuple(used))
-        if choice not in self._profiles:
-            chosen = normal
-            if used is not None:
-                at = np.array([*used, len(normal) - 1])
-                chosen = normal[at[:, None], at]
-            self._profiles[choice] = logs + profile(chosen)
-        return self._profiles[choice]
+        choice = None if used is None else tuple(used)
+        if (key, choice) not in self._profiles:
+            logs, normal = self._eliminated(key)
+            if choice is None:
+                self._profiles[key, choice] = logs + profile(normal)
+            elif choice not in self._choices:
+                self._profiles[key, choice] = logs + profile(_chosen(normal, [choice])[0])
+            else:
+                alike = [each for each in self._choices if len(each) == len(choice)]
+                for each, value in zip(alike, profile_each(_chosen(normal, alike)), strict=True):
+                    self._profiles[key, each] = logs + float(value)
+        return self._profiles[key, choice]
 
     def _eliminated(self, key: tuple[float, ...]) -> tuple[float, np.ndarray]:
         """Return (log determinants, normal equations without the common parameters), kept."""
@@ -143,3 +156,9 @@ class NoiseLikelihood:
         times = FLICKER_TIMES if time == FLICKER_MARK else (time,)
         share = sd / float(np.sqrt(len(times)))
         return (*self.known, *(BiasProcess(share, each) for each in times))
+
+
+def _chosen(normal: np.ndarray, choices: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """Return the normal equations of each choice of the same size, shape (k, m + 1, m + 1)."""
+    at = np.array([[*choice, len(normal) - 1] for choice in choices])
+    return normal[at[:, :, None], at[:, None, :]]

@@ -154,9 +154,8 @@ def solve_scaled(information: np.ndarray, right: np.ndarray) -> np.ndarray:
     Each information matrix is scaled to a unit diagonal first.
     """
     scale = 1 / np.sqrt(np.einsum('kii->ki', information))
-    scaled = information * scale[:, :, None] * scale[:, None, :] + JITTER * np.eye(
-        information.shape[1]
-    )
+    scaled = information * scale[:, :, None] * scale[:, None, :]
+    np.einsum('kii->ki', scaled)[:] += JITTER
     return np.linalg.solve(scaled, (scale * right)[:, :, None])[:, :, 0] * scale
 
 

@@ -49,11 +49,16 @@ class Whitening:
         processes = [process for process in processes if process.sd > 0]
         if processes:
             self._order = np.concatenate(sessions)
-            steps = np.diff(times[self._order], prepend=-np.inf)
-            steps[np.cumsum([len(index) for index in sessions])[:-1]] = np.inf
+            # Each session begins a new series.
+            steps = np.full(len(self._order), np.inf)
+            start = 0
+            for index in sessions:
+                own_times = times[index]
+                steps[start + 1 : start + len(index)] = own_times[1:] - own_times[:-1]
+                start += len(index)
             self._filter = _Filter(
                 self._chained(variance[:, :, None])[:, 0],
-                np.tile(steps, variance.shape[1]),
+                np.concatenate([steps] * variance.shape[1]),
                 processes,
             )
         if session_variance > 0:
@@ -374,3 +379,19 @@ def profile(normal: np.ndarray) -> float:
     """Return ``y'y - b' A^-1 b + log|A|`` of the normal matrix ``[[A, b], [b', y'y]]``."""
     logs, left = eliminate(normal, len(normal) - 1)
     return logs + float(left[0, 0])
+
+
+def profile_each(normal: np.ndarray) -> np.ndarray:
+    """
+    Return the `profile` of several small normal matrices, shape (k, m + 1, m + 1).
+
+    Of few parameters each, the calls for one after the other would take most of the time.
+    """
+    information, right = normal[:, :-1, :-1], normal[:, :-1, -1]
+    scale = np.sqrt(np.maximum(np.einsum('kii->ki', information), 1e-300))
+    scaled = information / (scale[:, :, None] * scale[:, None, :])
+    np.einsum('kii->ki', scaled)[:] += JITTER
+    factor = np.linalg.cholesky(scaled)
+    solved = np.linalg.solve(factor, (right / scale)[:, :, None])[:, :, 0]
+    logs = 2 * np.log(np.einsum('kii->ki', factor) * scale).sum(axis=1)
+    return logs + normal[:, -1, -1] - (solved**2).sum(axis=1)

@@ -183,7 +183,7 @@ class Evidence:
             matrix = normal[:, :-1, :-1] + np.diag(known)
             values = solve_scaled(matrix, normal[:, :-1, -1] + known * self._prior_mean[at])
             # A residual is the last column less the prediction.
-            self._predictions[used] = np.pad(-values, ((0, 0), (0, 1)), constant_values=1.0)
+            self._predictions[used] = np.column_stack([-values, np.ones(len(values))])
         return self._predictions[used]
 
 

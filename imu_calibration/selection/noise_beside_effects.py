@@ -322,6 +322,12 @@ class _WanderProblem:
         added = _columns_of_biases([*courses, *steps], len(self.rows))
         usual = max(self.natural, self.stable)
         sd = drift_prior(added, np.full(added.shape[2], np.inf), usual)
+        # A course has one parameter on each axis.
+        options = [list(option) for option in self.options]
+        n_smooth = len(self.prior_sd)
+        for first in range(n_smooth, n_smooth + len(sd), len(AXES)):
+            options.append([first, first + 1, first + 2])
+
         likelihood = NoiseLikelihood(
             np.concatenate([self.rows[:, :, :-1], added, self.rows[:, :, -1:]], axis=2),
             self.white,
@@ -331,16 +337,11 @@ class _WanderProblem:
             known=self.noise.known,
             durations=self.recording.duration,
             common=self.n_structural,
+            choices=options,
         )
         search = BiasProcessSearch(
             likelihood, 0.0 if self.noise.known else self.natural, self.stable
         )
-
-        # A course has one parameter on each axis.
-        options = [list(option) for option in self.options]
-        n_smooth = len(self.prior_sd)
-        for first in range(n_smooth, n_smooth + len(sd), len(AXES)):
-            options.append([first, first + 1, first + 2])
         first_step = len(options) - len(steps)
         # Each of the moments is as likely as the other ones.
         prices = np.zeros(len(options))

@@ -123,6 +123,9 @@ class RowEvidence(Evidence):
         n_folds = len(groups) if len(groups) <= ONE_BY_ONE else GROUP_FOLDS
         self.folds = [np.searchsorted(groups, block.group) % n_folds for block in blocks]
         self._white = self._whitened()
+        self._acting = [np.any(white != 0, axis=0) for white in self._white]
+        """Of each block, the columns that are not zero."""
+        self._sums: dict[tuple[int, tuple[int, ...]], float] = {}
         self._bases: dict[tuple[int, ...], np.ndarray] = {}
         total = self._products(self._white)
         without = [self._products(self._whitened(number)) for number in range(n_folds)]
@@ -205,6 +208,13 @@ class RowEvidence(Evidence):
     def _left(self, white: np.ndarray, used: Sequence[int]) -> np.ndarray:
         return white[:, -1] - white[:, list(used)] @ self.fit(used)[0]
 
+    def _squares_left(self, number: int, used: Sequence[int]) -> float:
+        """Return the sum of squares that a choice leaves in a block: it meets many larger ones."""
+        key = (number, tuple(used))
+        if key not in self._sums:
+            self._sums[key] = np.sum(self._left(self._white[number], used) ** 2)
+        return self._sums[key]
+
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """
         Return the p-value of `larger` against `smaller`.
@@ -215,12 +225,12 @@ class RowEvidence(Evidence):
         of_smaller = of_larger = 0.0
         n_rows = 0
         in_use = np.zeros(len(larger), bool)
-        for white in self._white:
-            if np.any(white[:, added]):
-                of_smaller += np.sum(self._left(white, smaller) ** 2)
-                of_larger += np.sum(self._left(white, larger) ** 2)
-                n_rows += len(white)
-                in_use |= np.any(white[:, list(larger)] != 0, axis=0)
+        for number, acting in enumerate(self._acting):
+            if np.any(acting[added]):
+                of_smaller += self._squares_left(number, smaller)
+                of_larger += self._squares_left(number, larger)
+                n_rows += len(self._white[number])
+                in_use |= acting[list(larger)]
         rank = max(self.rank(added, smaller), 1)
         spare = n_rows - int(in_use.sum())
         if spare < FEWEST_SPARE_ROWS or of_larger <= 0:
