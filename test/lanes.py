@@ -11,6 +11,7 @@ import multiprocessing.util
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -61,8 +62,9 @@ def _library_calls():
 
 
 def pytest_addoption(parser):
-    """Add the option of checks in which nothing may be left out."""
+    """Add the option of checks in which nothing may be left out, and that of all times."""
     parser.addoption('--fail-skipped', action='store_true', help='a skipped test fails')
+    parser.addoption('--processor-times', help='file for the times of all files and tests')
 
 
 def pytest_configure():
@@ -148,7 +150,10 @@ def pytest_runtest_logreport(report):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """List the tests that took most processor time."""
+    """List the tests that took most processor time, and write those of all where requested."""
+    file = terminalreporter.config.getoption('processor_times')
+    if file:
+        Path(file).write_text(_all_times())
     slowest = [
         item
         for item in sorted(_seconds.items(), key=lambda item: -item[1])[:SLOWEST]
@@ -162,3 +167,12 @@ def pytest_terminal_summary(terminalreporter):
     )
     for name, seconds in slowest:
         terminalreporter.write_line(f'{seconds:6.1f} s {name}')
+
+
+def _all_times():
+    """Return a line for each test, and before these one for each file with the sum of its tests."""
+    sums = Counter()
+    for name, seconds in _seconds.items():
+        sums[name.partition('::')[0]] += seconds
+    lines = [*sums.most_common(), *Counter(_seconds).most_common()]
+    return ''.join(f'{seconds:8.2f} {name}\n' for name, seconds in lines)
