@@ -10,6 +10,7 @@ from pathlib import Path
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import pytest
+import yaml
 from blank_canvas import BlankCanvas
 from hypothesis import HealthCheck, settings
 
@@ -18,6 +19,9 @@ settings.register_profile(
     'suite', derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile('suite')
+
+# Tests read whole documents by `yaml.safe_load`: libyaml gives the same, ten times as fast.
+yaml.SafeLoader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 pytest_plugins = ['lanes']
 MANIFEST = (Path(__file__).parents[1] / 'package.xml').read_text()

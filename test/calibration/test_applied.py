@@ -98,7 +98,7 @@ def test_check_reports_the_error_of_the_compensated_bag(name, tmp_path):
 def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
     samples, ranges, _ = simulate(6, n_poses=16)
     write_session(tmp_path / 'bag', samples)
-    known = spoiled(imu.calibrate(tmp_path / 'bag', gravity=GRAVITY).calibration)
+    known = spoiled(imu.calibrate(tmp_path / 'bag', gravity=GRAVITY, candidates=FEW).calibration)
     checked = imu.check(tmp_path / 'bag', known, gravity=GRAVITY)
     imu.compensate(tmp_path / 'bag', known, output=tmp_path / 'corrected', anyway=True)
     raw, corrected = (
@@ -342,7 +342,7 @@ def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
     time = 1e-9 * (samples.stamp_ns - samples.stamp_ns[0])
     course = -1.0 * DEG * np.expm1(-time / (0.3 * time[-1]))
     moved = SampleBlock(replace(samples, rate_s=samples.rate_s + course[:, None]))
-    calibration = imu.calibrate(moved, gravity=GRAVITY).calibration
+    calibration = imu.calibrate(moved, gravity=GRAVITY, candidates=FEW).calibration
     step = calibration.value('gyroscope', 'bias') - truth[9:12]
     np.testing.assert_allclose(step, course[-1], atol=0.05 * DEG)
     # Its columns are taken at a point, not at its prior.

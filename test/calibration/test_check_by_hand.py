@@ -12,6 +12,7 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from msg_adapters.write import write_session
 
+from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY
 from worlds.physics_hand import hold_and_turn, warmed_up
 
@@ -31,7 +32,7 @@ def second(first):
 
 @pytest.fixture(scope='module')
 def calibrated(first):
-    return calibrate_recordings(SampleBlock(first[0]), gravity=GRAVITY).calibration
+    return calibrate_recordings(SampleBlock(first[0]), gravity=GRAVITY, candidates=FEW).calibration
 
 
 def test_a_good_file_helps_at_rest_and_in_turns(second, calibrated):
@@ -117,7 +118,7 @@ def test_temperatures_reach_the_correction(first):
 def test_two_attitudes_tell_nothing():
     imu, ranges, _ = hold_and_turn(3, rate_hz=50.0, n_poses=2)
     good = calibrate_recordings(
-        SampleBlock(hold_and_turn(3, rate_hz=50.0)[0]), gravity=GRAVITY
+        SampleBlock(hold_and_turn(3, rate_hz=50.0)[0]), gravity=GRAVITY, candidates=FEW
     ).calibration
     found = check_recording(SampleBlock(imu), good)
     assert found.exit_code == 3 and not found.proof and '4 different attitudes' in str(found)

@@ -9,6 +9,7 @@ import pytest
 from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.cli.show import warn
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.table import Table
@@ -24,8 +25,10 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics
 
+from worlds.candidates import FEW
 from worlds.tables import joints_about
 
+OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(f'{FEW}+encoder_zero'))
 TABLE = Table.from_mapping(
     {
         'joints': joints_about('zxy'),
@@ -50,7 +53,7 @@ def session():
     )
 
 
-def inspected(block, options=CalibrationOptions()):
+def inspected(block, options=OPTIONS):
     """Return the summary of a recording on the table."""
     (summary,) = inspect_recording(block, [Topics()], TABLE, options=options)
     return summary
@@ -124,8 +127,8 @@ def test_an_added_delay_gives_the_result_of_a_requested_one(session):
     block = replace(session, imu=imu)
     results = []
     for options in (
-        CalibrationOptions(added=(('reference', 'time_offset'),)),
-        CalibrationOptions(reference_model='table_tilt+earth_rate+time_offset'),
+        replace(OPTIONS, added=(('reference', 'time_offset'),)),
+        replace(OPTIONS, reference_model='table_tilt+earth_rate+time_offset'),
     ):
         found = calibrate_on_table([lambda: iter([block])], TABLE, options).calibration
         results.append({n: (v, sd) for n, v, sd in zip(found.param_names, found.values, found.sd)})

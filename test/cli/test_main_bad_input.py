@@ -20,6 +20,8 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from msg_adapters.write import write_session
 
+from worlds.candidates import FEW
+
 JOINTS = [
     {'name': 'outer', 'axis': [0, 0, 1]},
     {'name': 'middle', 'axis': [0, 1, 0]},
@@ -61,6 +63,8 @@ def home(tmp_path_factory, session):
                 '--output',
                 str(folder / 'good'),
                 '--no-report',
+                '--candidates',
+                FEW,
             ]
         )
         == 0
@@ -310,6 +314,8 @@ def test_a_truncated_bag_gives_what_came_before_the_damage(capsys, tmp_path, hom
             '--output',
             str(tmp_path / 'out'),
             '--no-report',
+            '--candidates',
+            FEW,
         ]
     )
     printed = capsys.readouterr()

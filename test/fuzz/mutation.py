@@ -119,7 +119,8 @@ def mutated_document(data, others, rng, text=True):
     """
     if rng.random() < 0.3:
         return mutated(data, others, rng, text)
-    document = yaml.safe_load(data)
+    # libyaml, where it is there, is ten times as fast.
+    document = yaml.load(data, getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
     for _ in range(rng.choice((1, 1, 2, 3))):
         part, key = None, None
         inner = document
@@ -133,7 +134,8 @@ def mutated_document(data, others, rng, text=True):
             del part[key]
         else:
             part[key] = rng.choice(WRONG)
-    return yaml.safe_dump(document, default_flow_style=None, width=10**6).encode()
+    dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+    return yaml.dump(document, Dumper=dumper, default_flow_style=None, width=10**6).encode()
 
 
 def mutated_archive(data, others, rng):

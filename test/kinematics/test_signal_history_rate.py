@@ -17,6 +17,7 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.formulas import grammar
 
+from worlds.candidates import FEW
 from worlds.physics import make_session
 
 FOLLOWS = term(
@@ -74,7 +75,7 @@ def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
     options = CalibrationOptions(
         accelerometer_model='bias+matrix',
         gyroscope_model='bias+matrix+bias_while_warming',
-        catalogue=CATALOGUE.with_effects(FOLLOWS),
+        catalogue=CATALOGUE.with_effects(FOLLOWS).with_candidates(FEW),
     )
     result = calibrate_on_table([lambda: iter([block])], table, options)
     value = result.calibration.value('gyroscope', 'bias_while_warming')

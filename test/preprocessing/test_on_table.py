@@ -31,7 +31,7 @@ from worlds.misfit_worlds import make_pair
 
 @pytest.fixture(scope='module')
 def gimbals():
-    pair = make_pair(None, 1)
+    pair = make_pair(None, 1, imu_rate=50.0, joint_rate=50.0)
     return pair.first.block, Table.from_mapping(pair.table)
 
 

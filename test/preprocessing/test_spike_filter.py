@@ -12,11 +12,14 @@ import pytest
 from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
+from imu_calibration.references.options import CalibrationOptions
 
+from worlds.candidates import FEW
 from worlds.cleaning import clean_samples
 from worlds.hand_sessions import GRAVITY
 from worlds.physics import make_session
@@ -148,7 +151,9 @@ def test_one_per_cent_of_spikes_does_not_matter_on_the_table():
 
     def result(imu):
         return calibrate_on_table(
-            [lambda: iter([SampleBlock(imu, session.joints, session.temperature)])], table
+            [lambda: iter([SampleBlock(imu, session.joints, session.temperature)])],
+            table,
+            CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW)),
         ).calibration
 
     clean, spoiled = result(session.imu), result(with_spikes(session.imu, 0.01, 6))

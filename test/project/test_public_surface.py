@@ -5,6 +5,8 @@ Everything public says its types, and what comes after the third argument is nam
 import ast
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 XYZ = {'x', 'y', 'z', 'wx', 'wy', 'wz', 'fx', 'fy', 'fz'}
 """Components of one vector, as what is called for every sample takes them."""
@@ -48,29 +50,34 @@ def public_functions(path):
                 yield entry, [*entry.args.posonlyargs, *entry.args.args][bound:]
 
 
-def found_where(is_wrong):
+@pytest.fixture(scope='module')
+def surface():
+    """(path, function, its arguments) of every public function."""
+    return [(path, *function) for path in modules() for function in public_functions(path)]
+
+
+def found_where(is_wrong, surface):
     """Return 'file: function (line)' of the public functions whose arguments are wrong."""
     return [
         f'{path.relative_to(ROOT)}: {entry.name} (line {entry.lineno})'
-        for path in modules()
-        for entry, arguments in public_functions(path)
+        for path, entry, arguments in surface
         if is_wrong(path, entry, arguments)
     ]
 
 
-def test_every_public_function_says_its_types():
+def test_every_public_function_says_its_types(surface):
     def is_untyped(path, entry, arguments):
         every = arguments + entry.args.kwonlyargs
         if any(argument.annotation is None for argument in every):
             return True
         return entry.returns is None and (entry.name != '__init__' or not every)
 
-    assert found_where(is_untyped) == []
+    assert found_where(is_untyped, surface) == []
 
 
-def test_what_comes_after_the_third_argument_is_named():
+def test_what_comes_after_the_third_argument_is_named(surface):
     def takes_more_than_three(path, entry, arguments):
         counted = [argument for argument in arguments if argument.arg not in XYZ]
         return path.name not in POSITIONAL and len(counted) > 3
 
-    assert found_where(takes_more_than_three) == []
+    assert found_where(takes_more_than_three, surface) == []

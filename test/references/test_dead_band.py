@@ -9,6 +9,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.preprocessing.dead_band import dead_bands
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
+from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 
 BAND = 0.015
@@ -22,7 +23,11 @@ def found():
     hidden = np.array([0.004, -0.006, 0.002])
     rate = imu.rate_s - unpack(truth)[2] + hidden
     banded = replace(imu, rate_s=np.where(np.abs(rate) < BAND, 0.0, rate))
-    return calibrate_recordings(SampleBlock(banded), gravity=GRAVITY).calibration, truth, hidden
+    return (
+        calibrate_recordings(SampleBlock(banded), gravity=GRAVITY, candidates=FEW).calibration,
+        truth,
+        hidden,
+    )
 
 
 def test_the_band_is_named_with_its_threshold(found):
@@ -74,7 +79,7 @@ def test_rounding_of_slow_rates_is_in_the_standard_deviation(seed):
     step = np.radians(1.0)
     imu, _, truth = simulate(seed, n_poses=14, still=2.0, force_sd=0.02, rate_sd=0.2 * step)
     coarse = replace(imu, rate_s=np.round(imu.rate_s / step) * step)
-    found = calibrate_recordings(SampleBlock(coarse), gravity=GRAVITY).calibration
+    found = calibrate_recordings(SampleBlock(coarse), gravity=GRAVITY, candidates=FEW).calibration
     bias = found.model.slices['gyroscope', 'bias']
     z = (found.values[bias] - unpack(truth)[2]) / found.sd[bias]
     assert np.sqrt(np.mean(z**2)) < 1.3  # 1.9 and 1.5 without the allowance

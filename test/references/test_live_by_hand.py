@@ -19,9 +19,13 @@ from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.live_poses import FACE_DIRECTIONS, LiveByHand, unseen
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.references.options import CalibrationOptions
 
+from worlds.candidates import FEW
 from worlds.physics_table import stand_up
+
+OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW))
 
 
 def blocks(imu, seed=0, mean=20):
@@ -47,7 +51,7 @@ def run(live, imu, seed=0):
 def offline(imu, gravity=GRAVITY):
     """What the offline tool says."""
     return calibrate_without_table(
-        [lambda: iter([SampleBlock(imu)])], CalibrationOptions(gravity=gravity)
+        [lambda: iter([SampleBlock(imu)])], replace(OPTIONS, gravity=gravity)
     )
 
 
@@ -285,7 +289,7 @@ def test_an_effect_that_cannot_be_seen_live_is_refused_at_the_start(model, code)
 
 
 def test_further_effects_are_estimated_as_offline(session):
-    options = CalibrationOptions(accelerometer_model='bias+matrix+accel_quadratic')
+    options = replace(OPTIONS, accelerometer_model='bias+matrix+accel_quadratic')
     live = LiveByHand(
         options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0
     )

@@ -22,6 +22,7 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics
 
+from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate
 
 PERIOD_S = 0.01
@@ -50,7 +51,7 @@ def moved(seed, *, sway, shake, correlation_s):
 )
 def test_motion_at_rest_is_named_and_never_helps(sway, shake, correlation_s):
     imu = moved(4, sway=sway, shake=shake, correlation_s=correlation_s)
-    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY, candidates=FEW).calibration
     assert set(found.decisions.values()) <= {'unproven', 'harms'}
     for sensor in ('accelerometer', 'gyroscope'):
         text = moved_at_rest(found.by_hand, sensor)
@@ -67,7 +68,7 @@ def test_motion_at_rest_is_named_and_never_helps(sway, shake, correlation_s):
 
 def test_a_steady_hand_is_not_named():
     imu = moved(5, sway=0.002, shake=0.01, correlation_s=0.02)
-    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY, candidates=FEW).calibration
     assert set(found.decisions.values()) == {'helps'}
     for sensor, limit in MOVED_DENSITY.items():
         assert 0 < rest_density(found.by_hand, sensor) < 0.3 * limit
@@ -117,7 +118,7 @@ def test_the_tilt_of_a_sway_is_measured_and_noise_is_none():
 
 def test_a_sensor_without_a_determined_parameter_is_not_said_to_help():
     imu, _, _ = simulate(6, n_poses=14, still=2.0, force_sd=0.004, rate_sd=4e-4)
-    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY, candidates=FEW).calibration
     assert set(found.decisions.values()) == {'helps'}
     weak = tuple(
         'weak' if name.startswith('accelerometer') and status == 'determined' else status

@@ -18,6 +18,7 @@ from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import with_sd
 from imu_calibration.effects.base import Role
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics import strapdown
@@ -38,10 +39,12 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
+from worlds.candidates import FEW
 from worlds.tables import three_axis_table
 
 TABLE = three_axis_table(height=150.0)
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
+OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW))
 PROVENANCE = {'bags': [{'name': 'session <1>', 'sha256': '0123456789abcdef'}]}
 SECTIONS = (
     'parameters',
@@ -80,13 +83,15 @@ def quick():
 @pytest.fixture(scope='module')
 def on_table(quick):
     """Its calibration on the table."""
-    return calibrate_on_table([lambda: iter([quick])], TABLE, provenance=PROVENANCE)
+    return calibrate_on_table([lambda: iter([quick])], TABLE, OPTIONS, provenance=PROVENANCE)
 
 
 @pytest.fixture(scope='module')
 def by_hand(quick):
     """The same recording calibrated by hand."""
-    return calibrate_without_table([lambda: iter([SampleBlock(quick.imu)])], provenance=PROVENANCE)
+    return calibrate_without_table(
+        [lambda: iter([SampleBlock(quick.imu)])], OPTIONS, provenance=PROVENANCE
+    )
 
 
 @pytest.fixture(scope='module')
@@ -95,7 +100,7 @@ def demanding(quick):
     return calibrate_on_table(
         [lambda: iter([quick])],
         TABLE,
-        CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
+        replace(OPTIONS, tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
         provenance=PROVENANCE,
     )
 
@@ -297,7 +302,7 @@ def test_a_recording_with_an_unmodelled_effect_recommends_a_diagnosis(quick):
         quick.imu,
         rate_s=np.concatenate([np.repeat(quick.imu.rate_s[:1], 2, axis=0), quick.imu.rate_s[:-2]]),
     )
-    result = calibrate_on_table([lambda: iter([SampleBlock(late, quick.joints)])], TABLE)
+    result = calibrate_on_table([lambda: iter([SampleBlock(late, quick.joints)])], TABLE, OPTIONS)
     page = calibration_report(result)
     assert 'imu_calibration diagnose' in page
 

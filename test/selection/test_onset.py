@@ -21,7 +21,8 @@ SEED = 6
 
 
 def investigated(cause):
-    recording = record(SEED, None, 'realistic', through_bag=False, cause=cause)
+    rates = {'imu_rate': 50.0, 'joint_rate': 50.0}
+    recording = record(SEED, None, 'realistic', through_bag=False, cause=cause, **rates)
     model = with_candidates(recording.model, FEW)
     return recording, investigate(recording.windows, recording.table, model)
 

@@ -15,6 +15,7 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from imu_calibration.use_cases.compensate import compensate_recording
 
+from worlds.candidates import FEW
 from worlds.small_hand import ACCELEROMETER, GRAVITY, GYROSCOPE, hand_motion
 
 
@@ -38,7 +39,9 @@ def without(values):
 @pytest.fixture(scope='module')
 def accelerometer_only():
     time, force, rate = readings(31)
-    return calibrate_recordings([block(time, force, without(rate))], gravity=GRAVITY)
+    return calibrate_recordings(
+        [block(time, force, without(rate))], gravity=GRAVITY, candidates=FEW
+    )
 
 
 def test_an_accelerometer_alone_is_calibrated(accelerometer_only):
@@ -88,7 +91,9 @@ def test_readings_of_the_absent_sensor_pass_with_a_reason(accelerometer_only):
 
 def test_a_gyroscope_alone_has_its_bias():
     time, force, rate = readings(34)
-    result = calibrate_recordings([block(time, without(force), rate)], gravity=GRAVITY)
+    result = calibrate_recordings(
+        [block(time, without(force), rate)], gravity=GRAVITY, candidates=FEW
+    )
     found = result.calibration
     assert found.absent == ('accelerometer',)
     assert list(found.decisions) == ['gyroscope']

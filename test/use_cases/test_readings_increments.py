@@ -17,6 +17,7 @@ from imu_calibration.use_cases.inspect import imu_topics_of
 from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.csv_log import LogOptions
 
+from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 
 G, DEG = 9.80665, np.pi / 180
@@ -46,7 +47,9 @@ def test_increments_are_detected_stated_stored_and_applied(session):
     assert (caught.value.code, caught.value.key) == ('increments', 'increments')
     assert float(caught.value.value) == pytest.approx(per_second, rel=1e-3)
 
-    found = calibrate_recordings(raw, gravity=GRAVITY, increments=per_second).calibration
+    found = calibrate_recordings(
+        raw, gravity=GRAVITY, increments=per_second, candidates=FEW
+    ).calibration
     bias_f, _, _, matrix_w = unpack(values)
     np.testing.assert_allclose(parameters(found, 'accelerometer', 'bias'), bias_f, atol=5e-3)
     np.testing.assert_allclose(
@@ -116,7 +119,9 @@ def test_a_log_of_increments_names_the_option(tmp_path, session, header):
         calibrate_recordings(log, gravity=GRAVITY)
     assert (caught.value.code, caught.value.key) == ('increments', 'increments')
     assert len(imu_topics_of(log, Topics(log=LogOptions(raw=('force', 'rate'))))) == 1
-    found = calibrate_recordings(log, gravity=GRAVITY, increments=per_second).calibration
+    found = calibrate_recordings(
+        log, gravity=GRAVITY, increments=per_second, candidates=FEW
+    ).calibration
     np.testing.assert_allclose(
         parameters(found, 'accelerometer', 'bias'), unpack(values)[0], atol=5e-3
     )
