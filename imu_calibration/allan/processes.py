@@ -50,13 +50,19 @@ def mean_covariance(process: NoiseProcess, lag: np.ndarray, seconds: float) -> n
     """
     Return the generalised covariance of means over `seconds` whose beginnings are `lag` s apart.
 
-    For processes without a variance (random walk, flicker) it holds for combinations whose weights
-    sum to zero.
+    With the integral theta of the process and its kernel G::
+
+        m(t) = (theta(t + T) - theta(t)) / T                  mean over T seconds from t on
+        cov(m(t), m(t + lag)) = (2 G(lag) - G(lag + T) - G(lag - T)) / T^2
+
+    White noise, ``G = -|lag| / 2``: 1 / T at lag 0, and 0 from lag T on. Processes without a
+    variance (random walk, flicker): for combinations whose weights sum to zero.
     """
     lag = np.asarray(lag, float)
-    return (
-        2 * process.kernel(lag) - process.kernel(lag + seconds) - process.kernel(lag - seconds)
-    ) / seconds**2
+    same_ends = process.kernel(lag)  # start with start, and end with end
+    end_after_start = process.kernel(lag + seconds)
+    start_after_end = process.kernel(lag - seconds)
+    return (2 * same_ends - end_after_start - start_after_end) / seconds**2
 
 
 def _quantisation(lag):
@@ -164,18 +170,24 @@ class ScaleCovariance:
 
         Shape (n_scales, n_scales).
         """
-        if other.lattice:
-            one, other = other, one
-        if (one, other) not in self._products:
-            values = (
-                self._sum_at_spikes(other)
-                if one.lattice
-                else self._sum(self._correlation(one), self._correlation(other))
-            )
-            matrix = np.zeros((len(self.factors),) * 2)
-            matrix[self._first, self._second] = matrix[self._second, self._first] = values
-            self._products[one, other] = self._products[other, one] = matrix
-        return self._products[one, other]
+        if (one, other) in self._products:
+            return self._products[one, other]
+
+        # Spikes on the sampling instants are summed without interpolation.
+        if one.lattice:
+            of_pairs = self._sum_at_spikes(other)
+        elif other.lattice:
+            of_pairs = self._sum_at_spikes(one)
+        else:
+            of_pairs = self._sum(self._correlation(one), self._correlation(other))
+
+        # Symmetric in the scales, and in the processes.
+        matrix = np.zeros((len(self.factors), len(self.factors)))
+        matrix[self._first, self._second] = of_pairs
+        matrix[self._second, self._first] = of_pairs
+        self._products[one, other] = matrix
+        self._products[other, one] = matrix
+        return matrix
 
     def tensor(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
         """
@@ -193,9 +205,13 @@ class ScaleCovariance:
         Sum products of correlations over integer lags.
 
         Both correlations are interpolated linearly between the available lags, which is exact for
-        white noise.
+        white noise. With their values a, b and c, d at two lags that are h samples apart::
+
+            sum_k (a + (b - a) k / h) (c + (d - c) k / h),   k = 0 ... h, ends with weight 1/2
+            = h (2 a c + a d + b c + 2 b d) / 6 + (b - a) (d - c) / (6 h)
         """
-        (a, b), (c, d) = ((values[:, :-1], values[:, 1:]) for values in (first, second))
+        a, b = first[:, :-1], first[:, 1:]
+        c, d = second[:, :-1], second[:, 1:]
         inside = self._step * (2 * a * c + a * d + b * c + 2 * b * d) / 6
         corners = (b - a) * (d - c) / (6 * np.maximum(self._step, 1.0))
         return np.einsum('pg,pg->p', self._weight, inside + corners)
@@ -214,20 +230,22 @@ class ScaleCovariance:
         """
         Return the number of pairs of terms at distance `lag`, normalised.
 
-        The number is divided by twice the product of the numbers of terms.
+        The number is divided by twice the product of the numbers of terms: the covariance of two
+        Allan variances is the sum of the squared correlations of their terms with this weight.
         """
-        pairs, terms = np.zeros_like(lag), [np.zeros_like(self._short), np.zeros_like(self._long)]
-        for length, number in zip(*self._lengths):
-            here = [
-                np.maximum(length - 2 * factor + 1, 0.0) for factor in (self._short, self._long)
-            ]
-            pairs += (
-                number
-                * np.maximum(np.minimum(here[0], here[1] - lag) - np.maximum(-lag, 0.0), 0.0)
-                * (here[0] > 0)
-            )
-            terms = [total + number * more for total, more in zip(terms, here)]
-        return pairs / (2.0 * terms[0] * terms[1])
+        n_pairs = np.zeros_like(lag)
+        n_short = np.zeros_like(self._short)
+        n_long = np.zeros_like(self._long)
+        for length, n_stretches in zip(*self._lengths):
+            n_short_here = _n_terms(length, self._short)
+            n_long_here = _n_terms(length, self._long)
+            # Terms k of the short scale with a term k + lag of the long one.
+            first = np.maximum(-lag, 0.0)
+            last = np.minimum(n_short_here, n_long_here - lag)
+            n_pairs += n_stretches * np.maximum(last - first, 0.0) * (n_short_here > 0)
+            n_short = n_short + n_stretches * n_short_here
+            n_long = n_long + n_stretches * n_long_here
+        return n_pairs / (2.0 * n_short * n_long)
 
     def _correlation(self, process):
         """
@@ -302,15 +320,28 @@ def _lags(short, long, length):
     Dense where one difference begins or ends inside the other, and where the number of pairs of
     terms in the longest stretch bends.
     """
-    far = 3.0 * LAG_GROWTH ** np.arange(
-        1, int(np.log(MAX_LAG_RATIO * float((long / short).max())) / np.log(LAG_GROWTH)) + 2
-    )
+    # Around one end, in samples: dense near it, then growing by a factor.
+    largest_ratio = MAX_LAG_RATIO * float((long / short).max())
+    n_far = int(np.log(largest_ratio) / np.log(LAG_GROWTH)) + 1
+    far = 3.0 * LAG_GROWTH ** np.arange(1, n_far + 1)
     local = np.concatenate([-far[::-1], DENSE, far])[None, :] * short
     local = np.clip(local, -MAX_LAG_RATIO * long, MAX_LAG_RATIO * long)
-    first, last = (np.maximum(length - 2 * factor + 1, 0.0) for factor in (short, long))
-    bends = [share * end for end, share in product((-first, last - first, last), (0.25, 0.5, 1.0))]
-    points = np.concatenate([short - k * long + local for k in range(3)] + bends, axis=1)
-    return np.sort(np.rint(points), axis=1)
+    parts = []
+    for k in range(3):
+        parts.append(short - k * long + local)
+
+    # The number of pairs is linear between these lags; see `ScaleCovariance._share`.
+    n_short = _n_terms(length, short)
+    n_long = _n_terms(length, long)
+    for bend in (-n_short, n_long - n_short, n_long):
+        for share in (0.25, 0.5, 1.0):
+            parts.append(share * bend)
+    return np.sort(np.rint(np.concatenate(parts, axis=1)), axis=1)
+
+
+def _n_terms(length, factor):
+    """Return the number of second differences (of 2 `factor` samples) in `length` samples."""
+    return np.maximum(length - 2 * factor + 1, 0.0)
 
 
 def _sorted_lengths(lengths):
@@ -321,10 +352,10 @@ def _sorted_lengths(lengths):
     if len(lengths) <= MOST_LENGTHS:
         return lengths, np.ones(len(lengths))
     # Only the longest has terms at the longest scales.
-    classes = [
-        *np.array_split(lengths[:-1], MOST_LENGTHS - 1),
-        lengths[-1:],
-    ]
-    return np.array([part.mean() for part in classes]), np.array(
-        [float(len(part)) for part in classes]
-    )
+    classes = [*np.array_split(lengths[:-1], MOST_LENGTHS - 1), lengths[-1:]]
+    means = []
+    numbers = []
+    for part in classes:
+        means.append(part.mean())
+        numbers.append(float(len(part)))
+    return np.array(means), np.array(numbers)

@@ -203,15 +203,37 @@ class FaultSearch:
 
 
 def _excess_of_tails(readings, smallest_step):
-    """Return the bound of the `Excess` by errors of an axis, None within few steps."""
+    """
+    Return by how much heavy tails may raise the white noise of one axis.
+
+    The tails are those of the readings less the means of blocks. With the sd s of the noise alone
+    and that of the readings::
+
+        ratio = sd(readings) / s         upper bound, `excess_of_errors`
+
+    Parameters
+    ----------
+    readings : ndarray, shape (n_blocks READINGS_PER_MEAN,)
+    smallest_step : float
+        Step of the converter, in the unit of the readings.
+
+    Returns
+    -------
+    Excess or None
+        None where s is so few steps that the distribution is that of the steps.
+
+    """
     blocks = readings.reshape(-1, READINGS_PER_MEAN)
     deviation = (blocks - blocks.mean(axis=1, keepdims=True)).ravel()
     excess = excess_of_errors(deviation, READINGS_PER_MEAN)
-    noise_steps = float(np.sqrt(np.mean(deviation**2))) / excess.ratio / smallest_step
-    # The distribution within few steps is that of the steps.
+
+    readings_sd = float(np.sqrt(np.mean(deviation**2)))
+    noise_steps = readings_sd / excess.ratio / smallest_step
     if noise_steps < LEAST_STEPS_IN_SCATTER:
         return None
-    # Only errors that are there can be torn reads.
+
+    # Torn reads correlate with the readings: the noise of means exceeds by more than the readings.
+    # Without significant errors there are none.
     if excess.sds > NAMED_SDS:
         return Excess(excess_of_means(excess.ratio, noise_steps), excess.sds)
     return excess
