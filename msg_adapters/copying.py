@@ -285,17 +285,20 @@ def _propagated(propagate, pairs):
 
     Nine numbers of force, nine of rate.
     """
-    distinct, which = (
-        (pairs[:1], np.zeros(len(pairs), int))
-        if (pairs == pairs[0]).all()
-        else np.unique(pairs, axis=0, return_inverse=True)
-    )
-    known = [
-        [
-            None if not c.any() else c.reshape(3, 3)
-            for c in np.split(np.where(pair == -1.0, 0.0, pair), 2)
-        ]
-        for pair in distinct
-    ]
-    table = np.array([np.concatenate([c.ravel() for c in propagate(*pair)]) for pair in known])
-    return table[which.ravel()]
+    # Most drivers publish constants: each distinct pair once.
+    if (pairs == pairs[0]).all():
+        distinct = pairs[:1]
+        which = np.zeros(len(pairs), int)
+    else:
+        distinct, which = np.unique(pairs, axis=0, return_inverse=True)
+
+    corrected = []
+    for pair in distinct:
+        # -1 in a message: not available; all zero: not known.
+        force_cov, rate_cov = np.split(np.where(pair == -1.0, 0.0, pair), 2)
+        propagated = propagate(
+            force_cov.reshape(3, 3) if force_cov.any() else None,
+            rate_cov.reshape(3, 3) if rate_cov.any() else None,
+        )
+        corrected.append(np.concatenate([covariance.ravel() for covariance in propagated]))
+    return np.array(corrected)[which.ravel()]

@@ -111,16 +111,16 @@ class Packed:
         """Return the messages of all parts, one part after the other."""
         if len(parts) == 1:
             return parts[0]
-        start, n_bytes = [], 0
+        buffers = []
+        starts = []
+        sizes = []
+        n_bytes = 0
         for part in parts:
-            start.append(part.start + n_bytes)
+            buffers.append(part.buffer)
+            starts.append(part.start + n_bytes)
+            sizes.append(part.size)
             n_bytes += len(part.buffer)
-        return cls(
-            *(
-                np.concatenate(each)
-                for each in ([part.buffer for part in parts], start, [part.size for part in parts])
-            )
-        )
+        return cls(np.concatenate(buffers), np.concatenate(starts), np.concatenate(sizes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,19 +199,26 @@ def group_by_layout(
         Messages that are invalid.
 
     """
-    groups, n_broken, rest = [], 0, np.arange(len(packed))
-    while len(rest):
+    groups = []
+    n_broken = 0
+    remaining = np.arange(len(packed))
+    while len(remaining):
+        # The layout of the first message, then all messages that have it too.
         try:
-            layout = find_layout(packed.message(rest[0]))
+            layout = find_layout(packed.message(remaining[0]))
         except MessageError:
-            n_broken, rest = n_broken + 1, rest[1:]
+            n_broken += 1
+            remaining = remaining[1:]
             continue
+        # With many layouts a comparison of all messages with each one would take long.
         if len(groups) + n_broken < MAX_LAYOUTS:
-            same = layout.matches(packed.select(rest))
-            own, rest = rest[same], rest[~same]
+            same = layout.matches(packed.select(remaining))
+            of_layout = remaining[same]
+            remaining = remaining[~same]
         else:
-            own, rest = rest[:1], rest[1:]
-        groups.append((layout, own, packed.select(own)))
+            of_layout = remaining[:1]
+            remaining = remaining[1:]
+        groups.append((layout, of_layout, packed.select(of_layout)))
     return groups, n_broken
 
 

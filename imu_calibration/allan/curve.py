@@ -182,15 +182,26 @@ class _Level:
         self._shorten()
 
     def _with_holes(self, first, m):
-        """Return m times the differences of neighbouring means of the samples that are there."""
+        """
+        Return m times the differences of neighbouring means of the samples that are there.
+
+        With the cumulative sums S and numbers N of the samples, at each sample k from `first` on::
+
+            later mean   = (S(k) - S(k - m)) / (N(k) - N(k - m))
+            earlier mean = (S(k - m) - S(k - 2 m)) / (N(k - m) - N(k - 2 m))
+
+        """
         end = self.sums.shape[1]
-        last, middle, begin = (slice(first - k, end - k) for k in (0, m, 2 * m))
-        late = self.counts[last] - self.counts[middle]
-        early = self.counts[middle] - self.counts[begin]
-        usable = np.minimum(late, early) >= PRESENT * m
-        later_sum = (self.sums[:, last] - self.sums[:, middle])[:, usable]
-        earlier_sum = (self.sums[:, middle] - self.sums[:, begin])[:, usable]
-        return m * (later_sum / late[usable] - earlier_sum / early[usable])
+        middle = slice(first - m, end - m)
+        before = slice(first - 2 * m, end - 2 * m)
+        n_later = self.counts[..., first:end] - self.counts[..., middle]
+        n_earlier = self.counts[..., middle] - self.counts[..., before]
+        sum_later = self.sums[..., first:end] - self.sums[..., middle]
+        sum_earlier = self.sums[..., middle] - self.sums[..., before]
+        usable = np.minimum(n_later, n_earlier) >= PRESENT * m
+        later = sum_later[:, usable] / n_later[usable]
+        earlier = sum_earlier[:, usable] / n_earlier[usable]
+        return m * (later - earlier)
 
     def _shorten(self):
         """Keep the sums that later differences need, from the first sample kept."""

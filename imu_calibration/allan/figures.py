@@ -206,8 +206,15 @@ def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
 
 
 def _processes(axes):
-    """Return the bias processes whose variances are the means of those of the axes."""
-    flicker = walk = 0.0
+    """
+    Return the bias processes whose variances are the means of those of the axes.
+
+    Flicker noise has the two-sided power density B^2 / (2 pi f). It is a sum of exponential
+    correlations with the variance B^2 ln(ratio) / pi, one for each time of a geometric series with
+    this ratio. A random walk is the correlation of the longest time T, with the variance K^2 T / 2.
+    """
+    flicker = 0.0
+    walk = 0.0
     correlated: dict[float, float] = {}  # correlation time -> variance
     for axis in axes:
         for process, coefficient in axis.processes():
@@ -218,8 +225,8 @@ def _processes(axes):
             elif process.name == GAUSS_MARKOV:
                 correlated[process.time] = correlated.get(process.time, 0.0) + coefficient
     share = 1.0 / len(axes)
-    flicker, walk = share * flicker, share * walk
-    # Flicker noise is a sum of exponential correlations with equal variances, one for each time.
+    flicker *= share
+    walk *= share
     variances = {time: flicker * np.log(PROCESS_TIME_RATIO) / np.pi for time in PROCESS_TIMES}
     variances[PROCESS_TIMES[-1]] += walk * PROCESS_TIMES[-1] / 2.0
     for time, variance in correlated.items():

@@ -328,6 +328,7 @@ def read_rest(
 
     Arguments as for `identify_noise`.
     """
+    # First pass: pieces of the recording without motion.
     found = survey(source(), nominal)
     if found.period > LARGEST_STEP:
         raise InputError(
@@ -351,6 +352,8 @@ def read_rest(
             code='rest_too_short',
         )
     _require_no_tilt(found, parts)
+
+    # Trends, which are no noise, are subtracted in the second pass.
     clock = _Clock(found.epochs)
     search = TrendSearch(_blocks(found, parts, clock))
     skipped_sensors = {*found.absent, *found.unusable}
@@ -359,6 +362,8 @@ def read_rest(
     detrending = Detrending(trends, search.reference, clock.temperature(found))
     reader = RestReader(source, parts, found.period, detrending, clock.time, nominal)
     curve = reader.curve()
+
+    # Moments of the Allan variances of the axes with readings that scatter.
     unusable = found.unusable | _without_scatter(curve, skipped_sensors)
     skipped = _axes_of({*found.absent, *unusable})
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)

@@ -176,22 +176,26 @@ class TrendSearch:
 
         The significance is given the coefficients that are already selected.
         """
+        # Settling after turn-on is tried with several time constants.
         span = np.ptp(self.blocks.time) + self.blocks.seconds
+        settling_times = [share * span for share in SETTLING_SHARES]
         taken = {name for name, _ in chosen}
-        tried = []
+        trials = []
         for name in names:
             if name in taken:
                 continue
-            if name == TURN_ON_TREND:
-                tried += [(name, share * span) for share in SETTLING_SHARES]
-            else:
-                tried.append((name, 0.0))
+            for time_constant in settling_times if name == TURN_ON_TREND else [0.0]:
+                trials.append((name, time_constant))
+        if not trials:
+            return None
+
         scores = []
-        for trial in tried:
+        for trial in trials:
             values, sd, _ = self.regress(axis, [*chosen, trial])
             scores.append(abs(values[-1]) / sd[-1])
-        best = int(np.argmax(scores)) if scores else None
-        return None if best is None or scores[best] < MIN_TREND_SDS[tried[best][0]] else tried[best]
+        best = int(np.argmax(scores))
+        name, _ = trials[best]
+        return None if scores[best] < MIN_TREND_SDS[name] else trials[best]
 
     def columns(self, trends: list[tuple[str, float]]) -> np.ndarray:
         """Return the regressors of (name, time constant), shape (n_blocks, n_trends)."""

@@ -337,28 +337,27 @@ def _build_rows(a, b, rotation, delay):
 
     The rates are `delay` seconds later on their clocks.
     """
-    length, offset = window_length(a, b), rotation.offset
+    # Windows at the same true times on the clocks of both.
+    length = window_length(a, b)
+    offset = rotation.offset
     centres = window_centres(a, b, offset=offset, length=length)
-    force_a, force_b = (
-        make_windows(a.time, centres, length),
-        make_windows(b.time, centres + offset, length),
-    )
-    rate_a, rate_b = (
-        make_windows(a.time, centres + delay, length),
-        make_windows(b.time, centres + offset + delay, length),
-    )
-    free = ~(
-        force_a.touches(a.flagged)
-        | force_b.touches(b.flagged)
-        | rate_a.touches(a.flagged)
-        | rate_b.touches(b.flagged)
-    )
-    in_a = b.rate @ rotation.mat_ab.T
-    alpha_a, alpha_b = rate_a.slope(a.rate), rate_b.slope(in_a)
-    products = 0.5 * (_products(rate_a.mean, a.rate) + _products(rate_b.mean, in_a))
-    strength = np.sqrt(
-        0.25 * np.sum((alpha_a + alpha_b) ** 2, axis=1) + np.trace(products, axis1=1, axis2=2) ** 2
-    )
+    force_a = make_windows(a.time, centres, length)
+    force_b = make_windows(b.time, centres + offset, length)
+    rate_a = make_windows(a.time, centres + delay, length)
+    rate_b = make_windows(b.time, centres + offset + delay, length)
+    clipped = force_a.touches(a.flagged) | force_b.touches(b.flagged)
+    clipped |= rate_a.touches(a.flagged) | rate_b.touches(b.flagged)
+    free = ~clipped
+
+    # Windows of strong motion: angular acceleration alpha and products omega omega', from the mean
+    # of both gyroscopes in the axes of a.
+    rate_b_in_a = b.rate @ rotation.mat_ab.T
+    alpha_a = rate_a.slope(a.rate)
+    alpha_b = rate_b.slope(rate_b_in_a)
+    products = 0.5 * (_products(rate_a.mean, a.rate) + _products(rate_b.mean, rate_b_in_a))
+    alpha_squared = 0.25 * np.sum((alpha_a + alpha_b) ** 2, axis=1)
+    rate_squared = np.trace(products, axis1=1, axis2=2)
+    strength = np.sqrt(alpha_squared + rate_squared**2)
     moving = strength > MOTION_SHARE * np.quantile(strength, 0.99)
     keep = free & moving
     if keep.sum() < WINDOWS_LEAST:
@@ -367,12 +366,15 @@ def _build_rows(a, b, rotation, delay):
             f' {keep.sum()}; twist both IMUs together about all axes for 20 s or more, below the'
             ' range of the gyroscopes'
         )
-    lag = 0.1 * (centres[1] - centres[0])  # the second derivative, for the small delay column only
-    later, sooner = (
-        make_windows(a.time, centres[keep] + delay + s * lag, length).slope(a.rate) for s in (1, -1)
-    )
-    # half of the difference of two gyroscopes is the error of their mean, if their errors are
-    # independent
+
+    # The derivative of alpha, for the small column of the delay only.
+    lag = 0.1 * (centres[1] - centres[0])
+    kept = centres[keep] + delay
+    alpha_later = make_windows(a.time, kept + lag, length).slope(a.rate)
+    alpha_sooner = make_windows(a.time, kept - lag, length).slope(a.rate)
+
+    # Half of the difference of two gyroscopes is the error of their mean, if their errors are
+    # independent.
     noise = np.mean((alpha_b - alpha_a)[keep] ** 2) / 4
     force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
     return ArmRows(
@@ -380,7 +382,7 @@ def _build_rows(a, b, rotation, delay):
         force - force_a.select(keep).mean(a.force),
         0.5 * (alpha_a + alpha_b)[keep],
         products[keep],
-        (later - sooner) / (2 * lag),
+        (alpha_later - alpha_sooner) / (2 * lag),
         _products(rate_a.select(keep).slope, a.rate),
         force_a.select(keep).slope(a.force),
         force,

@@ -92,20 +92,25 @@ def _with_significant(
 
     """
     found, *others = searches
-    rivals = _named_elsewhere(found, others)
+    rivals = _findings_of_others_only(found, others)
     while True:
         # An effect of the requested model is judged with the added effects in the solution: the
         # misfit of a missing delay or encoder zero widens every standard deviation.
-        added = _beyond((*found.adopted, *rivals), first.model)
+        added = _missing_effects((*found.adopted, *rivals), first.model)
         solved = _solved_with(source, options, first, added, (*others, found))
 
-        # Possible rivals of the effects found in the largest recording are removed first.
-        is_faint = [_is_faint(solved.solution, rival, found.settings) for rival in rivals]
-        if any(is_faint):
-            rivals = [rival for rival, faint in zip(rivals, is_faint, strict=True) if not faint]
+        # Findings of other recordings first: they may be collinear with those of the largest one,
+        # which can become significant without them.
+        significant = []
+        for rival in rivals:
+            if not _is_insignificant(solved.solution, rival, found.settings):
+                significant.append(rival)
+        if len(significant) < len(rivals):
+            rivals = significant
             continue
-        found = _without_faint(found, solved.solution, first.model)
-        if len(_beyond((*found.adopted, *rivals), first.model)) == len(added):
+
+        found = _without_insignificant(found, solved.solution, first.model)
+        if len(_missing_effects((*found.adopted, *rivals), first.model)) == len(added):
             return solved, [found, *others]
 
 
@@ -152,14 +157,16 @@ def ask_kept(
     found = next(solved.data.searches(solution, options), None)
     if found is None:
         return replace(solved, extension=known)
-    found = _without_faint(found, solution, model)
-    # After a limit was found, the solution is that of the search.
-    lacking = [] if found.limits else _beyond(found.adopted, model)
+    found = _without_insignificant(found, solution, model)
+
+    # The columns of effects that the model lacks are not stored: they are reported, and widen the
+    # covariance. After a limit was found, the solution is that of the search.
+    missing = [] if found.limits else _missing_effects(found.adopted, model)
     changes = replace(
-        _changes([found], known.added), lacking=tuple(question.name for question in lacking)
+        _changes([found], known.added), lacking=tuple(question.name for question in missing)
     )
     extension = ModelExtension(
-        known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found)
+        known.added, known.point, changes, (*known.moves, *_moves(found, missing)), _clipped(found)
     )
     return replace(solved, solution=extension.applied(solution), extension=extension, found=found)
 
@@ -170,16 +177,14 @@ def _clipped(found: SelectedEffects) -> Solution | None:
 
     With only the saturated samples removed from its windows; else None.
     """
-    return (
-        extended_solution(
-            found.problem.space,
-            found.problem.noise,
-            found.problem.baseline,
-            chosen=found.adopted,
-            saturations=found.limits,
-        )
-        if found.limits
-        else None
+    if not found.limits:
+        return None
+    return extended_solution(
+        found.problem.space,
+        found.problem.noise,
+        found.problem.baseline,
+        chosen=found.adopted,
+        saturations=found.limits,
     )
 
 
@@ -189,31 +194,34 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
 
     The first search has priority.
     """
-    found, model = searches[0], searches[0].baseline_model
-    clipping = (
-        model.with_role(limit.sensor, Role.LIMIT).effect_of(limit.sensor, Role.LIMIT).name
-        for limit in found.limits
-    )
-    rests = {}
-    for each in reversed(searches):
-        for sensor, rest in each.unexplained_rests().items():
-            if rest.significant:
-                rests[sensor] = rest.entry
+    first = searches[0]
+    added_names = []
+    for limit in first.limits:
+        with_limit = first.baseline_model.with_role(limit.sensor, Role.LIMIT)
+        added_names.append(with_limit.effect_of(limit.sensor, Role.LIMIT).name)
+    for _, name in added:
+        added_names.append(name)
+
+    unexplained = {}
+    for search in reversed(searches):
+        for sensor, residual in search.unexplained_rests().items():
+            if residual.significant:
+                unexplained[sensor] = residual.entry
     return ModelChanges(
-        (*clipping, *(name for _, name in added)),
-        tuple(question.name for question in found.unstable),
-        _strange(searches),
-        unexplained=rests,
-        stamp_jitter=dict(found.jitter_entry),
+        tuple(added_names),
+        tuple(question.name for question in first.unstable),
+        _implausible_shares(searches),
+        unexplained=unexplained,
+        stamp_jitter=dict(first.jitter_entry),
     )
 
 
-def _beyond(named: Iterable[Question], model: SensorModel) -> list[Question]:
+def _missing_effects(named: Iterable[Question], model: SensorModel) -> list[Question]:
     """Return the findings that a model lacks."""
     return [question for question in named if question.effect.key not in model.slices]
 
 
-def _is_faint(
+def _is_insignificant(
     solution: Solution, question: Question, settings: SelectionSettings = SelectionSettings()
 ) -> bool:
     """Return whether an effect is in a solution but not significant."""
@@ -222,25 +230,26 @@ def _is_faint(
     return not stands_out(solution, question, joint_test=settings.joint_test)
 
 
-def _without_faint(
+def _without_insignificant(
     found: SelectedEffects, solution: Solution, requested: SensorModel
 ) -> SelectedEffects:
     """Return the search without findings that are in a solution but not significant."""
-    faint = []
+    significant = []
+    insignificant = []
     for question in found.named:
         is_judged = found.settings.judge_requested or question.effect.key not in requested.slices
-        if is_judged and _is_faint(solution, question, found.settings):
-            faint.append(question)
-    if not faint:
+        if is_judged and _is_insignificant(solution, question, found.settings):
+            insignificant.append(question)
+        else:
+            significant.append(question)
+    if not insignificant:
         return found
-    return replace(
-        found,
-        named=[question for question in found.named if question not in faint],
-        unstable=[*found.unstable, *faint],
-    )
+    return replace(found, named=significant, unstable=[*found.unstable, *insignificant])
 
 
-def _named_elsewhere(found: SelectedEffects, others: Sequence[SelectedEffects]) -> list[Question]:
+def _findings_of_others_only(
+    found: SelectedEffects, others: Sequence[SelectedEffects]
+) -> list[Question]:
     """
     Return the effects that the search found in other recordings only, larger recordings first.
     """
@@ -257,44 +266,52 @@ def stands_out(solution: Solution, question: Question, *, joint_test: bool = Tru
     """
     Return whether an effect belongs into the model of a solution.
 
-    With standard deviations that include all allowances.
+    Its size is plausible, one amplitude is significant, and so are all together (`joint_test`).
+    The covariance C of the amplitudes a includes all allowances. With the prior means m::
 
-    Its size is plausible, by the threshold that the verdict uses; it differs from its prior
-    significantly (`joint_test`), and so does one coefficient.
+        chi^2 = (a - m)^T C^+ (a - m),   degrees of freedom: rank of C
+
     """
-    effect, part = question.effect, solution.model.slices[question.sensor, question.name]
-    at = np.arange(part.start, part.start + effect.n_amplitudes)
-    if effect.surpasses(solution.values[at]):
+    effect = question.effect
+    first = solution.model.slices[effect.key].start
+    amplitudes = np.arange(first, first + effect.n_amplitudes)
+
+    # The threshold that the verdict of a diagnosis uses.
+    if effect.surpasses(solution.values[amplitudes]):
         return False
-    at = at[~solution.held[at]]
-    far = (solution.values - make_prior(solution.model).mean)[at]
-    if not one_significant(far, np.sqrt(np.diag(solution.covariance)[at])):
+
+    estimated = amplitudes[~solution.held[amplitudes]]
+    prior_mean = make_prior(solution.model).mean
+    change = solution.values[estimated] - prior_mean[estimated]
+    covariance = solution.covariance[np.ix_(estimated, estimated)]
+    if not one_significant(change, np.sqrt(np.diag(covariance))):
         return False
     if not joint_test:
         return True
-    sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
-    # The lever arms of three sensors sum to zero by convention.
-    known = sizes > CONVENTION_SHARE * sizes[-1]
-    return bool(
-        chi2_sf(((directions.T @ far)[known] ** 2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE
-    )
+
+    # The lever arms of three sensors sum to zero by convention: C may be singular.
+    variances, directions = np.linalg.eigh(covariance)
+    in_rank = variances > CONVENTION_SHARE * variances[-1]
+    along_directions = directions.T @ change
+    chi_squared = (along_directions[in_rank] ** 2 / variances[in_rank]).sum()
+    return bool(chi2_sf(chi_squared, in_rank.sum()) < FAMILY_WISE)
 
 
-def _strange(found: Sequence[SelectedEffects]) -> dict[str, float]:
+def _implausible_shares(searches: Sequence[SelectedEffects]) -> dict[str, float]:
     """
     Return implausible effect -> share of the excess variance that it explains.
 
-    The first of several investigations has priority.
+    The first of several searches has priority.
     """
     shares = {}
-    for each in reversed(found):
-        for question in each.implausible:
-            shares[question.name] = each.explained.share(each.named, question)
+    for search in reversed(searches):
+        for question in search.implausible:
+            shares[question.name] = search.explained.share(search.named, question)
     return shares
 
 
 def _moves(
-    found: SelectedEffects, lacking: Sequence[Question] = ()
+    found: SelectedEffects, missing: Sequence[Question] = ()
 ) -> tuple[tuple[Mapping[str, float], float], ...]:
     """
     Return (changes of parameters by other choices of effects, weight).
@@ -302,7 +319,7 @@ def _moves(
     Rejected, doubtful, implausible or missing effects, and what the search found besides.
     """
     moves = []
-    for question in (*found.unstable, *found.rejected, *found.implausible, *lacking):
+    for question in (*found.unstable, *found.rejected, *found.implausible, *missing):
         moves.append((found.search.moved_by(found.named, question, found.param_names), 1.0))
     return (*moves, *found.further_moves)
 
@@ -330,18 +347,19 @@ def extended_solution(
         Limits to write into the model.
 
     """
-    wide = space.recording.model
+    # Linearised where the rows of the recording are.
+    model_of_rows = space.recording.model
     model = replace(
         baseline,
-        point={**baseline.point, **wide.point},
-        temperature_ref_c=wide.temperature_ref_c,
-        folded_arms=wide.folded_arms,
+        point={**baseline.point, **model_of_rows.point},
+        temperature_ref_c=model_of_rows.temperature_ref_c,
+        folded_arms=model_of_rows.folded_arms,
     )
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    weighed = {
-        sensor: _in_trusted_band(noise[sensor], space.slow_only[sensor]) for sensor in space.sensors
-    }
+    weighed = {}
+    for sensor in space.sensors:
+        weighed[sensor] = _in_trusted_band(noise[sensor], space.slow_only[sensor])
     solution = solve(space.recording.accumulated(model), model, noise=weighed)
     solution = replace(solution, model=replace(model, folded_arms=None))
     for limit in saturations:
@@ -353,30 +371,28 @@ def _in_trusted_band(noise: NoiseModel, slow_only: np.ndarray) -> NoiseModel:
     """
     Return the noise with weight zero for fast parts on axes where only the slow part is compared.
     """
-    return replace(
-        noise,
-        moving={
-            kind: replace(
-                factors, every=np.where(slow_only, WEIGHTLESS * factors.every, factors.every)
-            )
-            for kind, factors in noise.moving.items()
-        },
-    )
+    moving = {}
+    for kind, factors in noise.moving.items():
+        every = np.where(slow_only, WEIGHTLESS * factors.every, factors.every)
+        moving[kind] = replace(factors, every=every)
+    return replace(noise, moving=moving)
 
 
 def _with_limit(solution: Solution, limit: Saturation) -> Solution:
+    """Return the solution with the level of a saturation as a further, independent parameter."""
     model = solution.model.with_role(limit.sensor, Role.LIMIT)
     place = model.part(limit.sensor, Role.LIMIT).start
 
-    def grown(matrix: np.ndarray, corner: float) -> np.ndarray:
-        matrix = np.insert(np.insert(matrix, place, 0.0, axis=0), place, 0.0, axis=1)
-        matrix[place, place] = corner
+    def grown(matrix: np.ndarray, variance: float) -> np.ndarray:
+        matrix = np.insert(matrix, place, 0.0, axis=0)
+        matrix = np.insert(matrix, place, 0.0, axis=1)
+        matrix[place, place] = variance
         return matrix
 
-    terms = {
-        name: grown(term, limit.level_sd**2 if name == SAMPLE_NOISE else 0.0)
-        for name, term in solution.terms.items()
-    }
+    # Its only uncertainty is the noise of the clipped samples.
+    terms = {}
+    for name, term in solution.terms.items():
+        terms[name] = grown(term, limit.level_sd**2 if name == SAMPLE_NOISE else 0.0)
     return replace(
         solution,
         model=model,

@@ -58,20 +58,27 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
         'accelerometer' or 'gyroscope'.
 
     """
-    matrix, bias = calibration.of(sensor, Role.LINEAR), calibration.of(sensor, Role.OFFSET)
-    linear, offset = (calibration.model.part(sensor, role) for role in (Role.LINEAR, Role.OFFSET))
+    # Row i of the matrix is scale_i axis_i, with a unit vector axis_i.
+    scale, axes = split(calibration.of(sensor, Role.LINEAR))
+    linear = calibration.model.part(sensor, Role.LINEAR)
     covariance = calibration.covariance[linear, linear]
-    scale, axes = split(matrix)
-    # d axes_i / d row_i.
+
+    # d scale_i / d row_i = axis_i,   d axis_i / d row_i = (1 - axis_i axis_i') / scale_i.
     tangent = (np.eye(3) - axes[:, :, None] * axes[:, None, :]) / scale[:, None, None]
-    blocks = [covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(3)]
-    scale_sd = np.array([np.sqrt(axes[i] @ blocks[i] @ axes[i]) for i in range(3)])
-    spread = [tangent[i] @ blocks[i] @ tangent[i] for i in range(3)]
-    angles_sd = np.empty((3, 3))
-    for i, j in np.ndindex(3, 3):
-        angles_sd[i, j] = _angle_sd(axes[i], j, spread[i])
-    between = np.array([_angle(axes[i], axes[j]) for i, j in AXIS_PAIRS])
-    between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in AXIS_PAIRS])
+    scale_sd = np.zeros(3)
+    angles_sd = np.zeros((3, 3))
+    for i, axis in enumerate(axes):
+        row_cov = covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        axis_cov = tangent[i] @ row_cov @ tangent[i]
+        scale_sd[i] = np.sqrt(axis @ row_cov @ axis)
+        for j in range(3):
+            angles_sd[i, j] = _angle_sd(axis, j, axis_cov)
+
+    between = np.zeros(3)
+    between_sd = np.zeros(3)
+    for k, (i, j) in enumerate(AXIS_PAIRS):
+        between[k] = _angle(axes[i], axes[j])
+        between_sd[k] = _between_sd(axes, tangent, covariance, i, j)
     return Derived(
         sensor,
         scale,
@@ -80,8 +87,8 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
         angles_sd,
         between,
         between_sd,
-        bias,
-        calibration.sd[offset],
+        calibration.of(sensor, Role.OFFSET),
+        calibration.sd[calibration.model.part(sensor, Role.OFFSET)],
     )
 
 
@@ -107,28 +114,36 @@ def angles_of(axes: np.ndarray) -> np.ndarray:
 
 
 def _angle(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the angle between two vectors, exact also near 0 and pi."""
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
 
 
-def _angle_sd(axis: np.ndarray, j: int, spread: np.ndarray) -> float:
+def _angle_sd(axis: np.ndarray, j: int, axis_cov: np.ndarray) -> float:
     """
     Return the sd of the angle to coordinate axis j.
 
     Near zero, where the angle has no slope, that of the tilt itself.
     """
+    # angle = atan2(s, a_j) with the sine s, the length of the part of the axis across j:
+    # d angle / d a_k = a_j a_k / s,   d angle / d a_j = -s
     others = [k for k in range(3) if k != j]
-    across, tilt = axis[others], spread[np.ix_(others, others)]
-    size = np.linalg.norm(across)
-    if size**2 <= np.trace(tilt):
-        return float(np.sqrt(np.trace(tilt) / 2))
-    slope = axis[j] * axis / size
-    slope[j] = -size
-    return float(np.sqrt(slope @ spread @ slope))
+    sine = np.linalg.norm(axis[others])
+    tilt_variance = np.trace(axis_cov[np.ix_(others, others)])
+    if sine**2 <= tilt_variance:
+        return float(np.sqrt(tilt_variance / 2))
+    slope = axis[j] * axis / sine
+    slope[j] = -sine
+    return float(np.sqrt(slope @ axis_cov @ slope))
 
 
 def _between_sd(
     axes: np.ndarray, tangent: np.ndarray, covariance: np.ndarray, i: int, j: int
 ) -> float:
+    """
+    Return the sd of the angle between the axes i and j, cos(angle) = axis_i . axis_j.
+
+    ``d angle = -(axis_j . d axis_i + axis_i . d axis_j) / sin(angle)``.
+    """
     slope = np.zeros(9)
     slope[3 * i : 3 * i + 3] = axes[j] @ tangent[i]
     slope[3 * j : 3 * j + 3] = axes[i] @ tangent[j]

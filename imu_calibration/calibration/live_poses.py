@@ -439,27 +439,30 @@ class LiveByHand:
             self.found = look_for_poses(imu, self.options.windows)
 
     def _newly_over(self) -> list[ImuSamples]:
-        imu, found = self._store.samples(), self.found
+        """Return the mean reading of each rest that has ended since the last call."""
+        imu = self._store.samples()
+        found = self.found
         if imu is None or found.poses is None:
             return []
-        over = found.rests if not found.resting else found.rests[:-1]
-        new = [
-            k
-            for k, rest in enumerate(over)
-            if self._reported_ns is None or imu.stamp_ns[rest.start] > self._reported_ns
-        ]
-        if new:
-            self._reported_ns = int(imu.stamp_ns[over[new[-1]].stop - 1])
-        middle = [(found.rests[k].start + found.rests[k].stop) // 2 for k in new]
-        return [
-            ImuSamples(
-                self._store.true_stamps(imu.stamp_ns[[m]]),
-                found.poses.force[[k]],
-                found.poses.rate[[k]],
-                imu.frame_id,
+
+        # Unless the last rest still lasts, it is over too.
+        ended = found.rests[:-1] if found.resting else found.rests
+        reported_ns = self._reported_ns
+        means = []
+        for k, rest in enumerate(ended):
+            if reported_ns is not None and imu.stamp_ns[rest.start] <= reported_ns:
+                continue
+            middle = (rest.start + rest.stop) // 2
+            means.append(
+                ImuSamples(
+                    self._store.true_stamps(imu.stamp_ns[[middle]]),
+                    found.poses.force[[k]],
+                    found.poses.rate[[k]],
+                    imu.frame_id,
+                )
             )
-            for k, m in zip(new, middle)
-        ]
+            self._reported_ns = int(imu.stamp_ns[rest.stop - 1])
+        return means
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> HandResult:
         """

@@ -23,7 +23,7 @@ from imu_calibration.calibration.result import (
     WindowErrors,
 )
 from imu_calibration.document.trust import Uncorrected
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import Role
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window, WindowKind
@@ -229,24 +229,24 @@ class PoseObservations:
 def _statistics(
     hand: HandCalibration, counts: Mapping[str, int], n_samples: int
 ) -> dict[str, dict[str, Any]]:
-    found = hand.statistics
+    """Return the statistics in the form of the document, with the names of a table's."""
+    by_hand = hand.statistics
     keys = {
         'accelerometer': ('force_noise_sd', 'pose_scatter_sd', 'pose_dof'),
         'gyroscope': ('rate_noise_sd', 'drift_scatter_sd', 'drift_dof'),
     }
-    per_sensor = {
-        s: {
-            'noise_sd': [float(v) for v in found[keys[s][0]]],
-            'between_window_sd': float(found[keys[s][1]]),
-            'between_window_dof': float(found[keys[s][2]]),
+    of_sensors = {}
+    for sensor, (noise, scatter, dof) in keys.items():
+        of_sensors[sensor] = {
+            'noise_sd': [float(sd) for sd in by_hand[noise]],
+            'between_window_sd': float(by_hand[scatter]),
+            'between_window_dof': float(by_hand[dof]),
             'wander_sd': 0.0,
         }
-        for s in SENSORS
-    }
     return {
-        **per_sensor,
-        'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)},
+        **of_sensors,
+        'windows': {'static': by_hand.get('poses', 0), 'turns': by_hand.get('turns', 0)},
         'samples_used': {'all': n_samples},
-        'by_hand': found,
+        'by_hand': by_hand,
         'dropped': {reason: int(count) for reason, count in sorted(counts.items())},
     }

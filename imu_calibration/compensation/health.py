@@ -319,22 +319,31 @@ class CalibrationHealth:
     def __init__(
         self, calibration: FittedErrors, transfer: Transfer | None, options: HealthOptions
     ):
-        self.options, self.n_stops = options, 0
-        found = [calibration.noise(sensor) for sensor in SENSORS]
-        turn = np.eye(3) if transfer is None else transfer.mat_ts
-        self.noise_sd = np.concatenate([np.sqrt(turn**2 @ np.square(sd)) for sd, _ in found])
-        wander = np.repeat([float(np.max(offset)) ** 2 for _, offset in found], 3)
-        self._known = Uncertainty(calibration, transfer).at().parameters + np.diag(wander)
-        given = options.gravity or calibration.conditions.get('gravity')
-        self._gravity, self._place = (
-            float(given or STANDARD_GRAVITY),
-            0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE,
-        )
-        self.update = (
-            GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time)
-            if options.update
-            else None
-        )
+        self.options = options
+        self.n_stops = 0
+
+        # White noise in the axes of the output: variances are rotated with squared cosines. The
+        # drift of a bias is as likely in each direction.
+        mat_ts = np.eye(3) if transfer is None else transfer.mat_ts
+        noise_sds = []
+        drift_variances = []
+        for sensor in SENSORS:
+            white_sd, bias_sd = calibration.noise(sensor)
+            noise_sds.append(np.sqrt(mat_ts**2 @ np.square(white_sd)))
+            drift_variances += [float(np.max(bias_sd)) ** 2] * 3
+        self.noise_sd = np.concatenate(noise_sds)
+        of_parameters = Uncertainty(calibration, transfer).at().parameters
+        self._known = of_parameters + np.diag(drift_variances)
+
+        # Gravity at the place of calibration differs from that here, unless it is given.
+        stated = options.gravity or calibration.conditions.get('gravity')
+        self._gravity = float(stated or STANDARD_GRAVITY)
+        self._place = 0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE
+
+        self.update = None
+        if options.update:
+            bias_sd = np.sqrt(np.diag(self._known)[3:])
+            self.update = GyroBiasUpdate(bias_sd, options.bias_time)
         self._judged: float | None = None
         self._last: tuple | None = None
         """Arguments of `_evaluated`; replaced as a whole, so that another thread may read it."""

@@ -89,26 +89,26 @@ class CompensationStream:
         A reading that is NaN, absent or broken remains NaN and does not affect its neighbours or
         the other sensor.
         """
+        # The first block determines how the samples are stamped.
         if self.slope.line is None and len(imu):
             first = imu.stamp_ns[:10_000]
-            self.slope.settle(
-                describe_stamps(first) or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01))
-            )
+            line = describe_stamps(first)
+            self.slope.settle(line or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01)))
+
+        # Inputs besides the readings: temperature, derivative of the rate, vibration.
         temperature, branch = self._warmth_at(imu.stamp_ns)
-        has_force, has_rate = (
-            np.isfinite(values).all(axis=1) for values in (imu.force_s, imu.rate_s)
-        )
+        has_force = np.isfinite(imu.force_s).all(axis=1)
+        has_rate = np.isfinite(imu.rate_s).all(axis=1)
         self.measured['accelerometer'] |= bool(has_force.any())
         self.measured['gyroscope'] |= bool(has_rate.any())
         slope = np.zeros_like(imu.rate_s)
         slope[has_rate] = self.slope.push_block(imu.stamp_ns[has_rate], imu.rate_s[has_rate])
-        force_s, rate_s = (
-            np.where(given[:, None], values, self.calibration.of(sensor, Role.OFFSET))
-            for sensor, values, given in (
-                ('accelerometer', imu.force_s, has_force),
-                ('gyroscope', imu.rate_s, has_rate),
-            )
-        )
+
+        # A missing reading is computed as that of zero input, and is NaN again in the result.
+        no_force = self.calibration.of('accelerometer', Role.OFFSET)
+        no_rate = self.calibration.of('gyroscope', Role.OFFSET)
+        force_s = np.where(has_force[:, None], imu.force_s, no_force)
+        rate_s = np.where(has_rate[:, None], imu.rate_s, no_rate)
         vibration = self._vibration_of(imu.force_s, has_force)
         corrected = compensated_samples(
             self.calibration,
@@ -122,11 +122,13 @@ class CompensationStream:
         )
         corrected.force[~has_force] = np.nan
         corrected.rate[~has_rate] = np.nan
-        self.count, self.frame_id = self.count + len(imu), imu.frame_id
+
+        # Counts, and the last complete sample, for the state of the stream.
+        self.count += len(imu)
+        self.frame_id = imu.frame_id
         self.flagged += int(corrected.flagged.sum())
-        self._fastest = max(
-            self._fastest, float(np.sqrt((imu.rate_s[has_rate] ** 2).sum(axis=1).max(initial=0.0)))
-        )
+        squares = (imu.rate_s[has_rate] ** 2).sum(axis=1)
+        self._fastest = max(self._fastest, float(np.sqrt(squares.max(initial=0.0))))
         usable = np.flatnonzero(has_force & has_rate)
         if len(usable):
             k = usable[-1]

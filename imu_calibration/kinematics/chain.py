@@ -38,12 +38,17 @@ def with_axis_places(table: Table, errors: np.ndarray) -> Table:
         chain moves with it.
 
     """
-    shifts, joints, first = iter(np.reshape(errors, (-1, 2))), [], True
+    of_axes = iter(np.reshape(errors, (-1, 2)))
+    joints = []
+    is_first_turning = True
     for joint in table.joints:
-        if joint.turns and not first:
-            step = joint.mat_before @ (next(shifts) @ axis_error_directions(np.array(joint.axis)))
-            joint = replace(joint, xyz=tuple((np.array(joint.xyz) + step).tolist()))
-        first &= not joint.turns
+        if joint.turns and not is_first_turning:
+            # Across the axis in the frame of the joint, then in the frame of the link before.
+            shift = next(of_axes) @ axis_error_directions(np.array(joint.axis))
+            xyz = np.array(joint.xyz) + joint.mat_before @ shift
+            joint = replace(joint, xyz=tuple(xyz.tolist()))
+        if joint.turns:
+            is_first_turning = False
         joints.append(joint)
     return replace(table, joints=tuple(joints))
 
@@ -63,37 +68,38 @@ def with_axis_angles(table: Table, errors: np.ndarray) -> Table:
     vectors = np.zeros((len(table.joints), 3))
     for angle, error in zip(axis_angles(table.joints), errors, strict=True):
         vectors[angle.joint] += error * angle.direction
-    joints = [
-        (
-            joint
-            if not vector.any()
-            else replace(joint, axis=tuple((rotation(vector) @ np.array(joint.axis)).tolist()))
-        )
-        for joint, vector in zip(table.joints, vectors, strict=True)
-    ]
+    joints = []
+    for joint, vector in zip(table.joints, vectors, strict=True):
+        if vector.any():
+            axis = rotation(vector) @ np.array(joint.axis)
+            joint = replace(joint, axis=tuple(axis.tolist()))
+        joints.append(joint)
     return replace(table, joints=tuple(joints))
 
 
 def tilt(table: Table, angles: np.ndarray) -> Table:
     """
-    Return the table with its true `up` turned.
+    Return the table with a levelling error of its base.
 
-    It is turned by the rotation vector (tx, ty, 0) of the level frame.
+    The level frame n, with up and north, is rotated relative to the base b by (tx, ty, 0) rad::
 
-    A levelling error: ``up_true = exp((tx, ty, 0) x) up``, rad. North turns with it, so that the
-    Earth's rate is the same vector of n turned alike; `azimuth_deg` changes where the convention of
-    n requires it.
+        mat_bn_tilted = mat_bn exp((tx, ty, 0) x),   up_b = mat_bn_tilted e_z
+
+    The direction of north in b is rotated with it.
     """
     mat_bn = table.mat_nb.T @ rotation(np.array([angles[0], angles[1], 0.0]))
     tilted = replace(table, up=tuple(mat_bn[:, 2].tolist()))
     if table.azimuth_deg is None:
         return tilted
+
+    # A table takes the level frame with the shortest rotation to `up`, which may have another
+    # heading than that of mat_bn: north is expressed in the frame of the tilted table.
     azimuth = np.radians(table.azimuth_n_deg)  # type: ignore[arg-type]
-    north = tilted.mat_nb @ mat_bn @ np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    azimuth_n_deg = np.degrees(np.arctan2(north[1], north[0]))
-    return replace(
-        tilted, azimuth_deg=float((azimuth_n_deg - base_heading_deg(tilted.mat_nb)) % 360.0)
-    )
+    mat_nn = tilted.mat_nb @ mat_bn
+    north_n = mat_nn @ np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    azimuth_n_deg = np.degrees(np.arctan2(north_n[1], north_n[0]))
+    azimuth_deg = (azimuth_n_deg - base_heading_deg(tilted.mat_nb)) % 360.0
+    return replace(tilted, azimuth_deg=float(azimuth_deg))
 
 
 WOBBLES = (-1, 2)
@@ -120,17 +126,12 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
 
     """
     of_joint = dict(zip(table.joint_names.turning[1:], angles, strict=True))
-    return replace(
-        table,
-        joints=tuple(
-            (
-                replace(joint, sag=of_joint[joint.source])
-                if joint.turns and of_joint.get(joint.source)
-                else joint
-            )
-            for joint in table.joints
-        ),
-    )
+    joints = []
+    for joint in table.joints:
+        if joint.turns and of_joint.get(joint.source):
+            joint = replace(joint, sag=of_joint[joint.source])
+        joints.append(joint)
+    return replace(table, joints=tuple(joints))
 
 
 def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
@@ -150,15 +151,17 @@ def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
     parts = np.reshape(amplitudes, (len(table.joint_names.turning), len(WOBBLES), 2))
     of_joint = {}
     for name, amplitudes_of_joint in zip(table.joint_names.turning, parts, strict=True):
-        pairs = zip(WOBBLES, amplitudes_of_joint, strict=True)
-        of_joint[name] = tuple((order, complex(*each)) for order, each in pairs if each.any())
-    return replace(
-        table,
-        joints=tuple(
-            replace(joint, wobble=of_joint[joint.source]) if joint.turns else joint
-            for joint in table.joints
-        ),
-    )
+        wobble = []
+        for order, (cosine, sine) in zip(WOBBLES, amplitudes_of_joint, strict=True):
+            if cosine or sine:
+                wobble.append((order, complex(cosine, sine)))
+        of_joint[name] = tuple(wobble)
+    joints = []
+    for joint in table.joints:
+        if joint.turns:
+            joint = replace(joint, wobble=of_joint[joint.source])
+        joints.append(joint)
+    return replace(table, joints=tuple(joints))
 
 
 def wobble_at(
@@ -168,21 +171,26 @@ def wobble_at(
     *,
     acceleration: np.ndarray,
 ) -> np.ndarray:
-    """Return z of `with_wobble` and its first two derivatives in time, complex, shape (3, n)."""
-    found = np.zeros((3, len(angle)), complex)
+    """
+    Return z of `with_wobble` and its first two derivatives in time, complex, shape (3, n).
+
+    For each term ``z = A exp(i m q)``::
+
+        z' = i m q' z,   z'' = (i m q'' - (m q')^2) z
+
+    """
+    total = np.zeros((3, len(angle)), complex)
     for order, amplitude in wobble:
-        turn = amplitude * np.exp(1j * order * angle)
-        found += np.stack(
-            [
-                turn,
-                1j * order * rate * turn,
-                (1j * order * acceleration - (order * rate) ** 2) * turn,
-            ]
-        )
-    return found
+        z = amplitude * np.exp(1j * order * angle)
+        first_derivative = 1j * order * rate * z
+        second_derivative = (1j * order * acceleration - (order * rate) ** 2) * z
+        total += np.stack([z, first_derivative, second_derivative])
+    return total
 
 
 _CHAIN_BLOCK_SAMPLES = 1024  # samples whose intermediates fit in the processor's cache
+UP, RATE, ALPHA, FORCE = -4, -3, -2, -1
+"""Columns of the recursion (`_base_columns`): direction up, rate, angular acceleration, force."""
 
 
 class _Link(NamedTuple):
@@ -258,26 +266,24 @@ def reference_motion(
     """
     n_samples = len(motion.time)
     mat_sn = np.empty((n_samples, 3, 3)) if attitude else np.broadcast_to(np.nan, (n_samples, 3, 3))
-    force_s, rate_s, alpha_s = (
-        np.empty((n_samples, 3)),
-        np.empty((n_samples, 3)),
-        np.empty((n_samples, 3)),
-    )
+    force_s = np.empty((n_samples, 3))
+    rate_s = np.empty((n_samples, 3))
+    alpha_s = np.empty((n_samples, 3))
     constants = _constants(table)
     steps = _chain_steps(constants, motion)
-    # The last columns are up, which a sag needs, the rate, the angular acceleration and the force.
-    needed = 6 if attitude else 3 + any(link.joint.sag for link in constants.links)
+    # Rate, angular acceleration and force are the last columns. Up, which a sag needs, is before
+    # them: the last column of the attitude.
+    sags = any(link.joint.sag for link in constants.links)
+    needed = 6 if attitude else 3 + sags
     base = constants.base[:, -needed:]
     for start in range(0, n_samples, _CHAIN_BLOCK_SAMPLES):
         part = slice(start, min(start + _CHAIN_BLOCK_SAMPLES, n_samples))
         columns = _run_chain(base, motion, steps, part)
         if attitude:
             mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
-        rate_s[part], alpha_s[part], force_s[part] = (
-            columns[:, -3].T,
-            columns[:, -2].T,
-            columns[:, -1].T,
-        )
+        rate_s[part] = columns[:, RATE].T
+        alpha_s[part] = columns[:, ALPHA].T
+        force_s[part] = columns[:, FORCE].T
     return Reference(
         time=motion.time,
         mat_sn=mat_sn,
@@ -299,35 +305,47 @@ def _chain_steps(constants, motion):
 
     Joints at rest are merged into the constant matrix and the offset of the next one.
     """
-    steps, matrix, offset = [], np.eye(3), np.zeros(3)
+    steps = []
+    # Since the last joint that moves: rotation, and offset in the frame before that rotation.
+    matrix = np.eye(3)
+    offset = np.zeros(3)
     for link in constants.links:
         offset = offset + matrix.T @ link.xyz
         matrix = link.mat_in @ matrix
+
+        # A joint at rest is a constant rotation or offset.
         if not link.joint.leans and not _moves(motion, link.column):
-            at = link.plus + (
-                link.multiplier * motion.position[0, link.column] if len(motion.time) else 0.0
-            )
+            position = link.plus
+            if len(motion.time):
+                position = link.plus + link.multiplier * motion.position[0, link.column]
             if link.joint.turns:
-                matrix = rotation(-at * link.axis) @ matrix
+                matrix = rotation(-position * link.axis) @ matrix
             else:
-                offset = offset + matrix.T @ (at * link.axis)
+                offset = offset + matrix.T @ (position * link.axis)
             continue
-        before, sense, third = (
-            _to_coordinate_axis(link.axis) if link.joint.turns else (np.eye(3), 1.0, 2)
-        )
-        steps.append(_Step(offset, before @ matrix, link, sense, third, link.across @ before.T))
-        matrix, offset = before.T, np.zeros(3)
-    return [*steps, _Step(offset + matrix.T @ constants.mount_xyz, constants.mat_sl @ matrix, None)]
+
+        # Turns are computed about a coordinate axis; the way back begins the next step.
+        before, sense, third = np.eye(3), 1.0, 2
+        if link.joint.turns:
+            before, sense, third = _to_coordinate_axis(link.axis)
+        across = link.across @ before.T
+        steps.append(_Step(offset, before @ matrix, link, sense, third, across))
+        matrix = before.T
+        offset = np.zeros(3)
+
+    # From the last joint to the sensor.
+    offset = offset + matrix.T @ constants.mount_xyz
+    return [*steps, _Step(offset, constants.mat_sl @ matrix, None)]
 
 
 def _moves(motion, column):
+    """Return whether a joint has a motion."""
     position = motion.position[:, column]
-    still = len(position) == 0 or (
-        np.all(position == position[0])
-        and not motion.rate[:, column].any()
-        and not motion.acceleration[:, column].any()
-    )
-    return not still
+    if len(position) == 0:
+        return False
+    if np.any(position != position[0]):
+        return True
+    return bool(motion.rate[:, column].any() or motion.acceleration[:, column].any())
 
 
 def _to_coordinate_axis(axis):
@@ -408,9 +426,11 @@ def _run_chain(columns, motion, steps, part):
     Shape (3, k, n).
     """
     for step in steps:
+        # force += alpha x r + omega x (omega x r), then the constant rotation, then the joint.
         if step.offset.any():
             columns = columns.copy()
-            columns[:, -1] += _arm_force(columns[:, -3], columns[:, -2], step.offset[:, None])
+            arm = step.offset[:, None]
+            columns[:, FORCE] += _arm_force(columns[:, RATE], columns[:, ALPHA], arm)
         if not np.array_equal(step.matrix, np.eye(3)):
             columns = np.tensordot(step.matrix, columns, 1)
         if step.link is not None:
@@ -420,46 +440,55 @@ def _run_chain(columns, motion, steps, part):
 
 def _move(columns, step, motion, part):
     """Bring `columns` past a joint that moves."""
+    # About the coordinate axis of the step; the joint's own sense is that of `step.sense`.
     link = step.link
     factor = step.sense * link.multiplier
-    position, rate, acceleration = (
-        factor * values[part, link.column]
-        for values in (motion.position, motion.rate, motion.acceleration)
-    )
+    position = factor * motion.position[part, link.column]
     position += step.sense * link.plus
-    if link.joint.turns:
-        if link.joint.leans:
-            columns = _lean(
-                columns, step, *(step.sense * values for values in (position, rate, acceleration))
-            )
-        return _turn(columns, step.third, position, rate, acceleration)
-    return _slide(columns, link.axis[:, None], position, rate, acceleration)
+    rate = factor * motion.rate[part, link.column]
+    acceleration = factor * motion.acceleration[part, link.column]
+    if not link.joint.turns:
+        return _slide(columns, link.axis[:, None], position, rate, acceleration)
+    if link.joint.leans:
+        columns = _lean(
+            columns, step, step.sense * position, step.sense * rate, step.sense * acceleration
+        )
+    return _turn(columns, step.third, position, rate, acceleration)
 
 
 def _lean(columns, step, angle, rate, acceleration):
     """
     Bring `columns` into the frame of a joint whose axis sags and wobbles.
 
-    By two small turns across it; the joint is at `angle`.
+    The lean is the small rotation vector v, across the axis a. With z of `with_wobble` at the
+    angle of the joint, the direction up u in the frame of the link, and the link's rate omega::
+
+        v = Re(z) across_1 + Im(z) across_2 + sag (u x a)
+        u' = u x omega,   u'' = u' x omega + u x alpha
+
+    The derivatives of u hold because up is fixed in space; the rotation of the Earth is negligible
+    relative to the sag.
     """
-    joint, first, second = step.link.joint, (step.third + 1) % 3, (step.third + 2) % 3
-    vector = np.zeros((3, 3, len(angle)))  # derivative, direction, sample
+    joint = step.link.joint
+    lean = np.zeros((3, 3, len(angle)))  # v, v', v''; coordinate; sample
     if joint.wobble:
-        lean = wobble_at(joint.wobble, angle, rate, acceleration=acceleration)
-        vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum(
-            'dn,k->dkn', lean.imag, step.across[1]
-        )
+        z = wobble_at(joint.wobble, angle, rate, acceleration=acceleration)
+        along_first = np.einsum('dn,k->dkn', z.real, step.across[0])
+        along_second = np.einsum('dn,k->dkn', z.imag, step.across[1])
+        lean += along_first + along_second
     if joint.sag:
-        up, spin, alpha = columns[:, -4], columns[:, -3], columns[:, -2]
-        # Up is fixed in space; the rotation of the Earth is negligible relative to the sag.
-        moves = cross(up, spin)
-        axis = np.zeros((3, 1))
-        axis[step.third] = step.sense * joint.sag
-        vector += np.stack(
-            [cross(each, axis) for each in (up, moves, cross(moves, spin) + cross(up, alpha))]
-        )
-    for which in (first, second):
-        columns = _turn(columns, which, *vector[:, which])
+        up = columns[:, UP]
+        omega = columns[:, RATE]
+        up_rate = cross(up, omega)
+        up_acceleration = cross(up_rate, omega) + cross(up, columns[:, ALPHA])
+        sag = np.zeros((3, 1))
+        sag[step.third] = step.sense * joint.sag
+        lean += np.stack([cross(up, sag), cross(up_rate, sag), cross(up_acceleration, sag)])
+
+    # Two small turns about the coordinate axes across the joint.
+    for across in ((step.third + 1) % 3, (step.third + 2) % 3):
+        position, velocity, acceleration = lean[:, across]
+        columns = _turn(columns, across, position, velocity, acceleration)
     return columns
 
 
@@ -469,12 +498,16 @@ def _arm_force(rate, alpha, arm):
 
 
 def _slide(columns, axis, position, rate, acceleration):
-    """Bring `columns` into the link that slides along `axis`, shape (3, 1)."""
+    """
+    Bring `columns` into the link that slides along `axis`, shape (3, 1).
+
+    The equation is that of `reference_motion`.
+    """
     slid = np.array(np.broadcast_to(columns, columns.shape[:2] + (len(position),)))
-    spin, alpha = slid[:, -3], slid[:, -2]
-    slid[:, -1] += (
-        _arm_force(spin, alpha, axis * position)
-        + 2 * rate * cross(spin, axis)
+    omega = slid[:, RATE]
+    slid[:, FORCE] += (
+        _arm_force(omega, slid[:, ALPHA], axis * position)
+        + 2 * rate * cross(omega, axis)
         + axis * acceleration
     )
     return slid
@@ -484,18 +517,25 @@ def _turn(columns, third, angle, rate, acceleration):
     """
     Bring `columns` into the link of a joint and add the joint's own motion.
 
-    The link turns about coordinate axis `third`.
+    The link turns about coordinate axis `third`, with the unit vector e. With C of the turn::
+
+        column -> C column,   omega += q' e,   alpha += q'' e + (C omega) x q' e
+
     """
-    first, second = (third + 1) % 3, (third + 2) % 3
-    cos, sin = np.cos(angle), np.sin(angle)
+    first = (third + 1) % 3
+    second = (third + 2) % 3
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     turned = np.empty(columns.shape[:2] + (len(angle),))
     turned[first] = cos * columns[first]
     turned[first] += sin * columns[second]
     turned[second] = cos * columns[second]
     turned[second] -= sin * columns[first]
     turned[third] = columns[third]
-    turned[first, -2] += turned[second, -3] * rate
-    turned[second, -2] -= turned[first, -3] * rate
-    turned[third, -3] += rate
-    turned[third, -2] += acceleration
+
+    # The cross product before the rate of the joint is added to omega.
+    turned[first, ALPHA] += turned[second, RATE] * rate
+    turned[second, ALPHA] -= turned[first, RATE] * rate
+    turned[third, RATE] += rate
+    turned[third, ALPHA] += acceleration
     return turned

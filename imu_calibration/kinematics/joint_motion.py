@@ -59,32 +59,45 @@ def with_encoder_harmonics(
         Amplitudes c and s, rad.
 
     """
-    cos_amplitude, sin_amplitude = (
-        np.broadcast_to(np.asarray(a, float), motion.position.shape[1:])
-        for a in (cos_amplitude, sin_amplitude)
-    )
+    shape = motion.position.shape[1:]
+    cos_amplitude = np.broadcast_to(np.asarray(cos_amplitude, float), shape)
+    sin_amplitude = np.broadcast_to(np.asarray(sin_amplitude, float), shape)
     wrong = np.flatnonzero((cos_amplitude != 0) | (sin_amplitude != 0))
     if not len(wrong):
         return motion
-    phase, rate, acceleration = (
-        order * motion.position[:, wrong],
-        motion.rate[:, wrong],
-        motion.acceleration[:, wrong],
-    )
-    cos, sin = np.cos(phase), np.sin(phase)
+
+    # The error e(q) and its derivatives with respect to q.
+    phase = order * motion.position[:, wrong]
+    cos = np.cos(phase)
+    sin = np.sin(phase)
     error = cos_amplitude[wrong] * cos + sin_amplitude[wrong] * sin
     slope = order * (sin_amplitude[wrong] * cos - cos_amplitude[wrong] * sin)
-    curvature, third = -(order**2) * error, -(order**2) * slope
-    moved = {
-        name: getattr(motion, name).copy() for name in ('position', 'rate', 'acceleration', 'jerk')
-    }
-    moved['position'][:, wrong] += error
-    moved['rate'][:, wrong] *= 1 + slope
-    moved['acceleration'][:, wrong] = acceleration * (1 + slope) + curvature * rate**2
-    moved['jerk'][:, wrong] = (
+    curvature = -(order**2) * error
+    third = -(order**2) * slope
+
+    # With e1, e2, e3 for these derivatives:
+    # rate -> (1 + e1) rate
+    # acceleration -> (1 + e1) acceleration + e2 rate^2
+    # jerk -> (1 + e1) jerk + 3 e2 rate acceleration + e3 rate^3
+    rate = motion.rate[:, wrong]
+    acceleration = motion.acceleration[:, wrong]
+    true_position = motion.position.copy()
+    true_position[:, wrong] += error
+    true_rate = motion.rate.copy()
+    true_rate[:, wrong] *= 1 + slope
+    true_acceleration = motion.acceleration.copy()
+    true_acceleration[:, wrong] = acceleration * (1 + slope) + curvature * rate**2
+    true_jerk = motion.jerk.copy()
+    true_jerk[:, wrong] = (
         motion.jerk[:, wrong] * (1 + slope) + 3 * curvature * rate * acceleration + third * rate**3
     )
-    return replace(motion, **moved)
+    return replace(
+        motion,
+        position=true_position,
+        rate=true_rate,
+        acceleration=true_acceleration,
+        jerk=true_jerk,
+    )
 
 
 def encoder_step(position: np.ndarray) -> float:

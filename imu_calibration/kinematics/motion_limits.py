@@ -243,37 +243,47 @@ def limits_of(table: Table) -> MotionLimits:
     """
     names = table.joint_names
     turns = np.ones(len(names), bool)
-    lower, upper, fastest = (
-        np.full(len(names), -np.inf),
-        np.full(len(names), np.inf),
-        np.full((2, len(names)), np.inf),
-    )
-    origins = [[DEFAULT_ORIGIN] * 3 for _ in names]
+    lower = np.full(len(names), -np.inf)
+    upper = np.full(len(names), np.inf)
+    fastest = np.full((2, len(names)), np.inf)  # speed, acceleration
+    origins = [[DEFAULT_ORIGIN] * 3 for _ in names]  # of range, speed, acceleration
     # A joint's own entry is last, so that a follower does not determine its type.
     for joint in sorted(table.joints, key=lambda joint: joint.mimic is None):
-        column, limits = names.index(joint.source), joint.limits
+        column = names.index(joint.source)
+        limits = joint.limits
         turns[column] = joint.turns
-        factor, offset = (
-            (1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)
-        )
+
+        # A follower is at factor * position + offset of the joint that is read.
+        factor = 1.0
+        offset = 0.0
+        if joint.mimic is not None:
+            factor = joint.mimic.multiplier
+            offset = joint.mimic.offset
+
+        # The smallest common range.
         if factor and limits.lower is not None and limits.upper is not None:
             ends = sorted(((limits.lower - offset) / factor, (limits.upper - offset) / factor))
             if ends[0] > lower[column] or ends[1] < upper[column]:
                 origins[column][0] = _origin(joint, 'lower')
-            lower[column], upper[column] = max(lower[column], ends[0]), min(upper[column], ends[1])
+            lower[column] = max(lower[column], ends[0])
+            upper[column] = min(upper[column], ends[1])
         elif limits.endless and joint.mimic is None and not np.isfinite(lower[column]):
             origins[column][0] = _origin(joint, 'endless')
-        given = [
-            np.inf if value is None or not factor else value / abs(factor)
-            for value in (limits.speed, limits.acceleration)
-        ]
-        for row, (value, key) in enumerate(zip(given, ('speed', 'acceleration'), strict=True)):
-            if value < fastest[row, column]:
-                fastest[row, column], origins[column][row + 1] = value, _origin(joint, key)
+
+        # The lowest speed and acceleration.
+        stated = {'speed': limits.speed, 'acceleration': limits.acceleration}
+        for row, (key, value) in enumerate(stated.items()):
+            if value is None or not factor:
+                continue
+            if value / abs(factor) < fastest[row, column]:
+                fastest[row, column] = value / abs(factor)
+                origins[column][row + 1] = _origin(joint, key)
+
     usual = np.array([USUAL[bool(turning)] for turning in turns]).T
-    stuck = ~turns & ~np.isfinite(lower)
-    lower[stuck] = upper[stuck] = 0.0
     speed, acceleration = np.where(np.isfinite(fastest), fastest, usual)
+    without_range = ~turns & ~np.isfinite(lower)
+    lower[without_range] = 0.0
+    upper[without_range] = 0.0
     return MotionLimits(
         lower, upper, speed, acceleration, turns, tuple((a, b, c) for a, b, c in origins)
     )

@@ -426,47 +426,36 @@ class MotionLibrary:
 
     def _swing(self, place, shares, frequency, seconds):
         """Swing with the largest amplitude within range, speed and acceleration."""
+        # Largest position, rate and acceleration of a swing of unit amplitude.
         frequency = np.broadcast_to(frequency, place.shape).astype(float)
         unit = np.where(shares, 1.0, 0.0)
-        swung = self._builder(np.zeros(len(place))).swing(unit, frequency, seconds).segments
-        motion = motion_at(swung, np.linspace(0.0, seconds, int(60 * seconds)))
-        most = [
-            np.maximum(np.abs(values).max(axis=0), 1e-9)
-            for values in (motion.position, motion.rate, motion.acceleration)
-        ]
+        unit_swing = self._builder(np.zeros(len(place))).swing(unit, frequency, seconds).segments
+        motion = motion_at(unit_swing, np.linspace(0.0, seconds, int(60 * seconds)))
+        largest_position = np.maximum(np.abs(motion.position).max(axis=0), 1e-9)
+        largest_rate = np.maximum(np.abs(motion.rate).max(axis=0), 1e-9)
+        largest_acceleration = np.maximum(np.abs(motion.acceleration).max(axis=0), 1e-9)
+
+        # The largest amplitude within all limits, less 1 %: the largest values are between the
+        # instants of `motion`.
         lower, upper = reachable(self.limits)
         room = np.where(self.limits.endless, np.inf, 0.48 * (upper - lower))
         reach = [
-            room / most[0],
-            self.limits.speed / most[1],
-            self.limits.acceleration / most[2],
+            room / largest_position,
+            self.limits.speed / largest_rate,
+            self.limits.acceleration / largest_acceleration,
             np.array([MAX_SWING[bool(turning)] for turning in self.limits.turns]),
         ]
-        # The largest values are between the instants of `motion`
         amplitude = 0.99 * unit * np.minimum.reduce(reach)
         middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))
-        far = ', '.join(
-            (
-                f'{name} by {value:.0f}° at {hertz:.2g} Hz'
-                if turning
-                else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'
-            )
-            for name, size, value, hertz, turning, on in zip(
-                self.names,
-                amplitude,
-                np.degrees(amplitude),
-                frequency,
-                self.limits.turns,
-                unit,
-                strict=True,
-            )
-            if on
-        )
-        return (
-            middle,
-            self._builder(middle).swing(amplitude, frequency, seconds).segments,
-            f'swing {far} for {seconds:g} s',
-        )
+        swing = self._builder(middle).swing(amplitude, frequency, seconds).segments
+
+        sizes = []
+        for k in np.flatnonzero(unit):
+            size = f'{1000 * amplitude[k]:.0f} mm'
+            if self.limits.turns[k]:
+                size = f'{np.degrees(amplitude[k]):.0f}°'
+            sizes.append(f'{self.names[k]} by {size} at {frequency[k]:.2g} Hz')
+        return middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s'
 
     def _rate_words(self, rates: Sequence[float]) -> str:
         return ' and '.join(

@@ -109,35 +109,35 @@ class PathWatch:
     def observe(self, time: float, position: np.ndarray, *, now: float) -> None:
         """Process joint positions at `time`, s of their clock, and `now`, s of a steady clock."""
         elapsed = 0.0 if self._last is None else max(time - self._last, 0.0)
-        self._last, place = time, position / self.tolerance
+        self._last = time
+        place = position / self.tolerance
         self._remember(time, place)
+
+        # The part of the path that may be reached by now. Joints may end a rest before the
+        # scheduled time, so its end is evaluated as well.
         rests = self._rests[self._at]
-        # Joints may end a rest before the scheduled time, so its end is evaluated as well.
-        stop = np.searchsorted(
-            self._time,
-            self._time[self._rest_end[self._at]] + elapsed + MAX_LEAD_SECONDS,
-            side='right',
-        )
+        latest = self._time[self._rest_end[self._at]] + elapsed + MAX_LEAD_SECONDS
+        stop = np.searchsorted(self._time, latest, side='right')
         ahead = slice(self._at, max(stop, self._at + 1))
-        away = np.max(np.abs(self._path[ahead] - place), axis=1)
-        fits = np.flatnonzero(away <= max(DEAD_BAND, np.min(away)))
+
+        # Of the points that fit the position, the one nearest to the expected time.
+        distance = np.max(np.abs(self._path[ahead] - place), axis=1)
+        fits = np.flatnonzero(distance <= max(DEAD_BAND, np.min(distance)))
         # The remainder below a step is kept; otherwise a slow pace would never end a rest.
         expected = self.progress + self._remainder + elapsed * (self.pace if rests else 1.0)
-        before, self._at = (
-            self._at,
-            self._at + int(fits[np.argmin(np.abs(self._time[ahead][fits] - expected))]),
-        )
-        self._remainder = float(
-            np.clip(expected - self.progress, -PATH_STEP_SECONDS, PATH_STEP_SECONDS)
-        )
+        before = self._at
+        self._at += int(fits[np.argmin(np.abs(self._time[ahead][fits] - expected))])
+        remainder = expected - self.progress
+        self._remainder = float(np.clip(remainder, -PATH_STEP_SECONDS, PATH_STEP_SECONDS))
         self.deviation = np.abs(self._path[self._at] - place)
-        further = self._at > before or self.at_end
-        if further and not rests and self.has_begun:
-            self._came, self._took = (
-                self._came + float(self._time[self._at] - self._time[before]),
-                self._took + elapsed + self.waited,
-            )
-        self.waited, self._now = 0.0 if further else self.waited + elapsed, now
+
+        # Scheduled and elapsed time in motion give the pace.
+        advances = self._at > before or self.at_end
+        if advances and not rests and self.has_begun:
+            self._came += float(self._time[self._at] - self._time[before])
+            self._took += elapsed + self.waited
+        self._now = now
+        self.waited = 0.0 if advances else self.waited + elapsed
         if self.waited == 0.0:
             self._further = now
 

@@ -396,22 +396,26 @@ class Planner:
             self.problem.goal.leave_out_of_reach(self.problem.best_covariance(seconds))
 
     def _plan_of(self, sequence, start, place, bound):
-        problem, coordinates = self.problem, self.problem.coordinates
-        covariance, cautious = (
-            problem.covariance_after(sequence, place, cautious=each)[0] for each in (False, True)
-        )
-        steps = [
-            problem.covariance_after(sequence[:count], place) for count in range(len(sequence) + 1)
-        ]
+        """Return the Plan of a sequence of motions, with its covariance after each of them."""
+        problem = self.problem
+        coordinates = problem.coordinates
+        covariance, _ = problem.covariance_after(sequence, place, cautious=False)
+        cautious, _ = problem.covariance_after(sequence, place, cautious=True)
+        covariances = []
+        ends = []
+        for count in range(len(sequence) + 1):
+            covariance_then, seconds = problem.covariance_after(sequence[:count], place)
+            covariances.append(covariance_then)
+            ends.append(seconds)
         self._visited.clear()
         return Plan(
             coordinates.model,
             tuple(self._named(number) for number in sequence),
-            np.array([seconds for _, seconds in steps[1:]]),
+            np.array(ends[1:]),
             coordinates.sd(covariance),
             coordinates.tolerances,
             coordinates.wanted,
-            coordinates.excess(np.array([step for step, _ in steps])),
+            coordinates.excess(np.array(covariances)),
             problem.goal.missing(cautious),
             start,
             bound,

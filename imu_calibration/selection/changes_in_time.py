@@ -91,16 +91,16 @@ class WindowRows:
     @classmethod
     def of(cls, space: ParameterSpace, noise: dict[str, NoiseModel]) -> 'WindowRows':
         """Return the rows of all windows."""
-        moving, kind = space.recording.moving, space.recording.kind
+        moving = space.recording.moving
+        kind = space.recording.kind
         axes = []
         for number, sensor in enumerate(space.sensors):
             whitenings = mean_whitening(space, noise, sensor)
             for axis, (whitening, mean) in enumerate(zip(whitenings, space.mean[sensor])):
                 within = np.zeros((len(kind), mean.shape[1], mean.shape[1]))
                 if moving.any():
-                    variance = np.array(
-                        [noise[sensor].row_variance(name)[axis] for name in kind[moving]]
-                    )
+                    variances = [noise[sensor].row_variance(name)[axis] for name in kind[moving]]
+                    variance = np.array(variances)
                     products = np.concatenate(list(space.within_each(sensor, axis, moving)))
                     within[moving] = products / variance[:, None, None]
                 places = space.places(sensor, axis)
@@ -160,47 +160,75 @@ class WindowRows:
         """
         axes = []
         for rows in self.axes:
-            own = np.flatnonzero(np.isin(rows.places[:-1], at))
-            if len(own):
-                order = np.searchsorted(at, rows.places[own])
-                within = rows.within[:, :, own]
-                axes.append(
-                    _ChangingOfAxis(rows, order, rows.mean[:, None, own], within, within[:, own])
-                )
+            columns = np.flatnonzero(np.isin(rows.places[:-1], at))
+            if not len(columns):
+                continue
+            order = np.searchsorted(at, rows.places[columns])
+            mean = rows.mean[:, None, columns]
+            within = rows.within[:, :, columns]
+            axes.append(_ChangingOfAxis(rows, order, mean, within, within[:, columns]))
         return ChangingColumns(len(self.expected), self.space.size + 1, len(at), tuple(axes))
 
     def fit(self, own: np.ndarray, changes: Changes | None = None) -> ChangeFit:
-        """Return the ChangeFit of the parameters `own`, with their priors, and of some changes."""
+        """
+        Return the least squares fit of the parameters `own`, with their priors, and of changes.
+
+        With the columns A of the parameters, B of the changes and the residual r, all white, the
+        prior mean m and its information W = diag(1 / sd^2)::
+
+            [A'A + W  A'B] [x]   [A'r + W m]
+            [B'A      B'B] [c] = [B'r      ]
+            loss = r'r + m'W m - right' [x; c]
+
+        Parameters
+        ----------
+        own : ndarray of int, shape (p,)
+        changes : Changes, optional
+            Their products with the columns, B'A, and with one another, B'B; no prior.
+
+        """
         information = 1 / self.space.prior_sd[own] ** 2
-        prior = self.space.prior_mean[own]
+        prior_mean = self.space.prior_mean[own]
+        # The last row and column of `self.normal` belong to the residual.
         normal = self.normal[np.ix_(own, own)] + np.diag(information)
-        right = self.normal[own, -1] + prior * information
+        right = self.normal[own, -1] + prior_mean * information
         if changes is not None:
             cross = changes.cross.sum(axis=0)
-            normal = np.block([[normal, cross[own]], [cross[own].T, changes.squares.sum(axis=0)]])
+            squares = changes.squares.sum(axis=0)
+            normal = np.block([[normal, cross[own]], [cross[own].T, squares]])
             right = np.concatenate([right, cross[-1]])
+
+        # Scaled to a unit diagonal, because the units differ; collinear columns share their value.
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         scales = np.outer(scale, scale)
-        inverse = np.linalg.pinv(normal / scales, rcond=1e-12, hermitian=True) / scales
-        values = inverse @ right
-        loss = self.normal[-1, -1] + (prior**2 * information).sum() - right @ values
-        sd = np.sqrt(np.diag(inverse))
+        covariance = np.linalg.pinv(normal / scales, rcond=1e-12, hermitian=True) / scales
+        values = covariance @ right
+        prior_squares = (prior_mean**2 * information).sum()
+        loss = self.normal[-1, -1] + prior_squares - right @ values
+        sd = np.sqrt(np.diag(covariance))
         count = len(own)
         return ChangeFit(float(loss), values[:count], values[count:], sd[count:])
 
     def excess(
         self, own: np.ndarray, fit: ChangeFit, changes: Changes | None = None
     ) -> SignificantExcess:
-        """Return the SignificantExcess at a ChangeFit of the parameters `own` and of changes."""
-        residual = self.space.reduced(own.tolist(), fit.values)
-        squares = np.einsum('i,kij,j->k', residual, self.part_normals, residual)
+        """
+        Return the SignificantExcess at a ChangeFit of the parameters `own` and of changes.
+
+        With the vector v = (-x, 1) of parameters and residual, and the changes c, in each part::
+
+            squares = v'N v - 2 v'C c + c'S c,   expected = n, variance 2 n
+
+        """
+        weights = self.space.reduced(own.tolist(), fit.values)
+        squares = np.einsum('i,kij,j->k', weights, self.part_normals, weights)
         if changes is not None:
-            squares -= 2 * residual @ changes.cross @ fit.change
+            squares -= 2 * weights @ changes.cross @ fit.change
             squares += fit.change @ changes.squares @ fit.change
-        beyond = squares - self.expected
-        significant = beyond > SIGNIFICANT_REST * np.sqrt(2 * self.expected)
+        excess = squares - self.expected
+        significant = excess > SIGNIFICANT_REST * np.sqrt(2 * self.expected)
         limit = SIGNIFICANT_REST * np.sqrt(2 * self.expected[significant].sum())
-        return SignificantExcess(float(beyond[significant].sum()), float(limit))
+        return SignificantExcess(float(excess[significant].sum()), float(limit))
 
 
 @dataclass(frozen=True, eq=False)

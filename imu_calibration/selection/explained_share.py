@@ -60,12 +60,10 @@ class Explained:
         *,
         least_part: float = SHOWS,
     ):
-        self.search, self.losses, self.numbers, self.least_part = (
-            search,
-            losses,
-            numbers,
-            least_part,
-        )
+        self.search = search
+        self.losses = losses
+        self.numbers = numbers
+        self.least_part = least_part
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """
@@ -73,11 +71,11 @@ class Explained:
 
         Shape (n_parts, n_axes).
         """
-        losses = self.losses(self.search.indices(chosen))
-        return {
-            sensor: parts - self.numbers[sensor][:, None] / parts.shape[1]
-            for sensor, parts in losses.items()
-        }
+        excess = {}
+        for sensor, losses in self.losses(self.search.indices(chosen)).items():
+            n_axes = losses.shape[1]
+            excess[sensor] = losses - self.numbers[sensor][:, None] / n_axes
+        return excess
 
     def sigma(self, sensor: str, excess: np.ndarray) -> np.ndarray:
         """
@@ -93,13 +91,11 @@ class Explained:
         """
         Return the same of all axes together, shape (n_parts,), and of each axis.
 
-        Shape (n_parts, n_axes).
+        Shape (n_parts, n_axes). A sum of n squares of unit noise has the variance 2 n.
         """
         sd = np.sqrt(2 * np.maximum(self.numbers[sensor], 1.0))
-        return (
-            excess.sum(axis=1) / sd,
-            excess / (sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE)[:, None],
-        )
+        sd_of_axis = sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE
+        return excess.sum(axis=1) / sd, excess / sd_of_axis[:, None]
 
     def rest(self, chosen: Sequence[Question]) -> float:
         """
@@ -107,15 +103,17 @@ class Explained:
 
         It covers all sensors and parts in which it is significant.
         """
-        return float(
-            sum(self._rest(sensor, excess).sum() for sensor, excess in self.excess(chosen).items())
-        )
+        total = 0.0
+        for sensor, excess in self.excess(chosen).items():
+            total += self._rest(sensor, excess).sum()
+        return float(total)
 
     def _rest(self, sensor: str, excess: np.ndarray) -> np.ndarray:
         """Return the same of each part, shape (n_parts,)."""
         together, alone = self._sigmas(sensor, excess)
-        left = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
-        return np.where(together > SIGNIFICANT_REST, np.maximum(excess.sum(axis=1), left), left)
+        of_axes = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
+        of_all = np.maximum(excess.sum(axis=1), of_axes)
+        return np.where(together > SIGNIFICANT_REST, of_all, of_axes)
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
         """
@@ -126,13 +124,10 @@ class Explained:
         In each sensor only the parts with the effect count (means of windows, within windows, or
         both): an unexplained excess in the other part does not hide it.
         """
-        return min(
-            (
-                removed / (removed + rest)
-                for removed, rest in self._where_it_shows(chosen, question)
-            ),
-            default=0.0,
-        )
+        shares = []
+        for removed, remaining in self._where_it_shows(chosen, question):
+            shares.append(removed / (removed + remaining))
+        return min(shares, default=0.0)
 
     def rest_beside(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the excess over noise of the choice, in the parts where the effect shows."""
@@ -146,19 +141,22 @@ class Explained:
 
         Both refer to the parts where the effect shows.
         """
-        with_it, without = (
-            self.excess(chosen),
-            self.excess([q for q in chosen if q is not question]),
-        )
-        removed = {s: (without[s] - with_it[s]).sum(axis=1) for s in question.effect.sensors}
-        strongest = max(parts.sum() for parts in removed.values())
+        excess_with = self.excess(chosen)
+        excess_without = self.excess([q for q in chosen if q is not question])
+        removed_of = {}  # sensor -> of each part
+        for sensor in question.effect.sensors:
+            removed_of[sensor] = (excess_without[sensor] - excess_with[sensor]).sum(axis=1)
+
         # A cause in the table acts on both sensors; a sensor with a weak signal is no evidence.
-        sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]
-        shown = {s: removed[s] >= self.least_part * removed[s].max() for s in sensors}
-        return [
-            (float(removed[s][shown[s]].sum()), float(self._rest(s, with_it[s])[shown[s]].sum()))
-            for s in sensors
-        ]
+        strongest = max(removed.sum() for removed in removed_of.values())
+        shows = []
+        for sensor, removed in removed_of.items():
+            if not removed.sum() >= SHOWS * strongest > 0:
+                continue
+            in_part = removed >= self.least_part * removed.max()
+            remaining = self._rest(sensor, excess_with[sensor])
+            shows.append((float(removed[in_part].sum()), float(remaining[in_part].sum())))
+        return shows
 
 
 class ExplainedWindows(Explained):
@@ -179,19 +177,17 @@ class ExplainedWindows(Explained):
     def __init__(self, evidence: WindowEvidence, search: Search):
         recording = evidence.space.recording
         duration = float(np.ptp(recording.time))
-        noise = {
-            sensor: own.at_rest_only(
-                *plausible_processes(own, recording.period, sensor=sensor, duration=duration)
+        noise = {}
+        for sensor, of_sensor in evidence.noise.items():
+            processes = plausible_processes(
+                of_sensor, recording.period, sensor=sensor, duration=duration
             )
-            for sensor, own in evidence.noise.items()
-        }
-        every = range(evidence.space.size)
-        scatter = scatter_of_each(evidence.space, evidence.noise, evidence.fit(every)[0])
+            noise[sensor] = of_sensor.at_rest_only(*processes)
+        values, _ = evidence.fit(range(evidence.space.size))
+        scatter = scatter_of_each(evidence.space, evidence.noise, values)
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
-        self.n_means, self.n_within = (
-            3.0 * len(recording.windows),
-            3.0 * (recording.count - 1)[recording.moving].sum(),
-        )
+        self.n_means = 3.0 * len(recording.windows)
+        self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
         super().__init__(
             search,
             self.floor.unpredicted,

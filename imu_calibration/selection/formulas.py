@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain, combinations, combinations_with_replacement, product
+from itertools import combinations, combinations_with_replacement, product
 
 import numpy as np
 from scipy.linalg import svd
@@ -68,7 +68,8 @@ class Formula:
         quantities = set()
         for column in self.columns:
             for text in (column,) if isinstance(column, str) else column:
-                quantities.update(QUANTITY_OF[name] for name in names_in(read(text)))
+                for name in names_in(read(text)):
+                    quantities.add(QUANTITY_OF[name])
         return frozenset(quantities) - {'reference temperature'}
 
     @property
@@ -80,17 +81,18 @@ class Formula:
     def complexity(self) -> tuple[int, int]:
         """Measure of complexity: columns; factors and functions."""
         text = str(self.columns[0])
-        return len(self.columns), len(self.factors) + sum(
-            text.count(f'{name}(') for name in FUNCTIONS
-        )
+        n_functions = sum(text.count(f'{name}(') for name in FUNCTIONS)
+        return len(self.columns), len(self.factors) + n_functions
 
     def unit(self, output: str) -> str:
         """Return the unit of an amplitude, with `output` that of the sensor."""
-        per = Counter(UNIT_OF[factor] for factor in self.factors if factor in UNIT_OF)
-        powers = ((f'({unit})' if '/' in unit else unit, power) for unit, power in per.items())
-        return output + ''.join(
-            f'/{unit}' if power == 1 else f'/{unit}^{power}' for unit, power in powers
-        )
+        powers = Counter(UNIT_OF[factor] for factor in self.factors if factor in UNIT_OF)
+        text = output
+        for unit, power in powers.items():
+            text += f'/({unit})' if '/' in unit else f'/{unit}'
+            if power > 1:
+                text += f'^{power}'
+        return text
 
 
 @lru_cache(maxsize=16)
@@ -113,77 +115,94 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
         Length of the recording, s, to two digits: texts hold time constants.
 
     """
-    found = [
-        Formula((text,), factors) for text, factors in (*_of_motion(), *_slow(thermal, duration))
-    ]
-    found += [
-        *_harmonics(n_joints, thermal),
-        *_of_joint_rates(n_joints),
-        *_with_the_table(n_joints, thermal),
-    ]
-    return tuple(found)
+    formulas = []
+    for text, factors in (*_of_motion(), *_slow(thermal, duration)):
+        formulas.append(Formula((text,), factors))
+    formulas += _harmonics(n_joints, thermal)
+    formulas += _of_joint_rates(n_joints)
+    formulas += _with_the_table(n_joints, thermal)
+    return tuple(formulas)
 
 
 def _atoms(*letters: str) -> list[Product]:
-    kinds = {'f': 'force', 'w': 'rate', 'alpha': 'angular acceleration'}
-    return [(f'{letter}_{a}', (kinds[letter],)) for letter, a in product(letters, AXES)]
+    """Return the components of the motion: of force (f), rate (w), angular acceleration (alpha)."""
+    quantities = {'f': 'force', 'w': 'rate', 'alpha': 'angular acceleration'}
+    return [(f'{letter}_{axis}', (quantities[letter],)) for letter in letters for axis in AXES]
 
 
 def _sense(text: str) -> str:
+    """Return the sign of a quantity; of a rate a smooth one."""
     return SOFT_SIGN.format(text) if text.startswith('w') else f'sign({text})'
 
 
 def _times(*parts: Product) -> Product:
-    """Return (text, factors) of a product, powers gathered."""
-    powers: Counter[str] = Counter()
-    factors: list[str] = []
-    for text, own in parts:
-        powers[text] += 1
-        factors += own
-    written = [text if power == 1 else f'{text} ** {power}' for text, power in powers.items()]
-    return ' * '.join(written), tuple(factors)
+    """Return (text, factors) of a product, powers gathered: f_x, f_x, w_y is f_x ** 2 * w_y."""
+    powers: dict[str, int] = {}
+    factors: tuple[str, ...] = ()
+    for text, factors_of_text in parts:
+        powers[text] = powers.get(text, 0) + 1
+        factors += factors_of_text
+    texts = []
+    for text, power in powers.items():
+        texts.append(text if power == 1 else f'{text} ** {power}')
+    return ' * '.join(texts), factors
 
 
-def _monomials(atoms: Sequence[Product], highest: int) -> Iterator[Product]:
-    """Yield the products of up to so many atoms, repetition allowed."""
-    for degree in range(1, highest + 1):
-        for parts in combinations_with_replacement(atoms, degree):
-            yield _times(*parts)
+def _monomials(degree: int) -> list[Product]:
+    """Return the products of `degree` components of force and rate."""
+    return [_times(*parts) for parts in combinations_with_replacement(_atoms('f', 'w'), degree)]
 
 
 def _of_motion() -> Iterator:
-    felt = _atoms('f', 'w')
-    yield from _monomials(felt, 3)
+    """Yield the formulas of force, rate and angular acceleration."""
+    components = _atoms('f', 'w')
+    for degree in (1, 2, 3):
+        yield from _monomials(degree)
     yield from _atoms('alpha')
-    yield from (_times(*pair) for pair in product(_atoms('alpha'), felt))
-    for text, own in felt:
-        for part in ((f'abs({text})', own), (_sense(text), ())):
-            yield part
-            yield from (_times(part, other) for other in felt if other[0] != text or part[1])
+    for pair in product(_atoms('alpha'), components):
+        yield _times(*pair)
+
+    # Magnitude and sign, alone and with one more factor; the sign times its own quantity is the
+    # magnitude.
+    for text, factors in components:
+        magnitude = (f'abs({text})', factors)
+        yield magnitude
+        for component in components:
+            yield _times(magnitude, component)
+        sign: Product = (_sense(text), ())
+        yield sign
+        for component in components:
+            if component[0] != text:
+                yield _times(sign, component)
+
     for letter, name in (('f', 'force'), ('w', 'rate')):
-        yield ' + '.join(f'{letter}_{a} ** 2' for a in AXES), (name, name)
-        yield 'sqrt(' + ' + '.join(f'{letter}_{a} ** 2' for a in AXES) + ')', (name,)
+        squares = ' + '.join(f'{letter}_{axis} ** 2' for axis in AXES)
+        yield squares, (name, name)
+        yield f'sqrt({squares})', (name,)
 
 
 def _slow(thermal: bool, duration: float) -> Iterator:
-    felt, warm = _atoms('f', 'w'), (TEMPERATURE_FACTOR, ('temperature',))
+    """Yield the formulas with temperature or time, alone and times motion."""
+    warm: Product = (TEMPERATURE_FACTOR, ('temperature',))
+    slow: list[Product] = []
     if thermal:
         yield 'temperature_rate', ('temperature rate',)
-    settles = [(f'(1 - exp(-time / {share * duration:.3g}))', ()) for share in CONSTANTS] + [
-        ('time', ('time',))
-    ]
-    if thermal:
         for power in (2, 3):
             yield f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power
-    for slow in ([warm] if thermal else []) + settles:
-        for entry in _monomials(felt, 2):
-            yield _times(slow, entry)
-        for text, own in felt:
-            yield _times(slow, (f'abs({text})', own))
-            yield _times(slow, (_sense(text), ()))
+        slow.append(warm)
+    for share in CONSTANTS:
+        slow.append((f'(1 - exp(-time / {share * duration:.3g}))', ()))
+    slow.append(('time', ('time',)))
+
+    for factor in slow:
+        for entry in (*_monomials(1), *_monomials(2)):
+            yield _times(factor, entry)
+        for text, factors in _atoms('f', 'w'):
+            yield _times(factor, (f'abs({text})', factors))
+            yield _times(factor, (_sense(text), ()))
     if thermal:
-        for atom in felt:
-            yield _times(warm, warm, atom)
+        for entry in _monomials(1):
+            yield _times(warm, warm, entry)
 
 
 def _turn(joint: int, order: int, before: str = '') -> tuple[str, str, str]:
@@ -193,51 +212,59 @@ def _turn(joint: int, order: int, before: str = '') -> tuple[str, str, str]:
 
 
 def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
+    """Yield cosine and sine of the angle of one joint, and their products for two joints."""
     joints = range(1, n_joints + 1)
     for joint, order in product(joints, JOINT_ORDERS):
-        befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))]
+        prefixes = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))]
         if thermal:
-            befores.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
+            prefixes.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
         if order in FEW_ORDERS:
-            befores += [(f'{text} * ', own) for text, own in _atoms('f', 'w')]
-        for before, factors in befores:
-            cosine, sine, phased = _turn(joint, order, before)
+            prefixes += [(f'{text} * ', factors) for text, factors in _atoms('f', 'w')]
+        for prefix, factors in prefixes:
+            cosine, sine, phased = _turn(joint, order, prefix)
             yield Formula((cosine, sine), factors, phased)
-    for (first, second), orders in product(
-        combinations(joints, 2), product(PAIR_ORDERS, PAIR_ORDERS)
-    ):
-        halves = [_turn(joint, order)[:2] for joint, order in zip((first, second), orders)]
-        yield Formula(tuple(f'{a} * {b}' for a, b in product(*halves)), ())
+
+    # cos a cos b, cos a sin b, sin a cos b, sin a sin b: any phase of both.
+    for first, second in combinations(joints, 2):
+        for first_order, second_order in product(PAIR_ORDERS, PAIR_ORDERS):
+            of_first = _turn(first, first_order)[:2]
+            of_second = _turn(second, second_order)[:2]
+            yield Formula(tuple(f'{a} * {b}' for a, b in product(of_first, of_second)), ())
 
 
 def _of_joint_rates(n_joints: int) -> Iterator[Formula]:
+    """Yield magnitude, sign, signed square of a joint's rate, and products of up to two rates."""
     rates = [(f'joint_rate_{joint}', ('joint rate',)) for joint in range(1, n_joints + 1)]
-    for text, own in rates:
-        yield Formula((f'abs({text})',), own)
+    for text, factors in rates:
+        yield Formula((f'abs({text})',), factors)
         yield Formula((SOFT_SIGN.format(text),), ())
-        yield Formula((f'{text} * abs({text})',), own * 2)
-    for text, own in _monomials(rates, 2):
-        yield Formula((text,), own)
+        yield Formula((f'{text} * abs({text})',), factors * 2)
+    for degree in (1, 2):
+        for parts in combinations_with_replacement(rates, degree):
+            text, factors = _times(*parts)
+            yield Formula((text,), factors)
 
 
 def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
     """Yield vectors fixed to the level frame while the sensor turns."""
     joints = range(1, n_joints + 1)
-    vectors = [tuple(f'c_{axis}{level}' for axis in AXES) for level in AXES]
-    befores: list[tuple[str, tuple[str, ...]]] = [('', ())]
+    # The components of a level axis along the axes of the sensor: elements of the attitude.
+    vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
+    prefixes: list[tuple[str, tuple[str, ...]]] = [('', ())]
     if thermal:
-        befores.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
-    befores += [(f'joint_rate_{joint} * ', ('joint rate',)) for joint in joints]
-    for before, factors in befores:
-        yield Formula(tuple(_prefixed(before, vector) for vector in vectors), factors)
+        prefixes.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
+    for joint in joints:
+        prefixes.append((f'joint_rate_{joint} * ', ('joint rate',)))
+    for prefix, factors in prefixes:
+        yield Formula(tuple(_each_times(prefix, vector) for vector in vectors), factors)
     for vector, joint, order in product(vectors, joints, FEW_ORDERS):
         cosine, sine, _ = _turn(joint, order)
-        waves = _prefixed(f'{cosine} * ', vector), _prefixed(f'{sine} * ', vector)
-        yield Formula(waves, ())
+        columns = (_each_times(f'{cosine} * ', vector), _each_times(f'{sine} * ', vector))
+        yield Formula(columns, ())
 
 
-def _prefixed(before: str, vector: Sequence[str]) -> tuple[str, ...]:
-    return tuple(before + text for text in vector)
+def _each_times(prefix: str, vector: Sequence[str]) -> tuple[str, ...]:
+    return tuple(prefix + text for text in vector)
 
 
 NEW = 1e-3
@@ -289,32 +316,45 @@ class FormulaSearch:
         *,
         reference_temperature: float,
     ):
-        self.blocks, self.formulas = blocks, formulas
-        self._place: dict[str, int] = {}  # text -> its number, in the order of first use
+        self.blocks = blocks
+        self.formulas = formulas
+        # Text -> its column; many formulas have the same ones.
+        self._place: dict[str, int] = {}
         for formula in formulas:
-            for text in chain.from_iterable(map(_three, formula.columns)):
-                self._place.setdefault(text, len(self._place))
+            for column in formula.columns:
+                for text in _three(column):
+                    self._place.setdefault(text, len(self._place))
         self.means = self._worked_out(tuple(self._place), reference_temperature)
+
+        # Independent rows of the catalogue's columns and residual of each axis, then of the texts.
         whiten = blocks.white[0]
-        every = whiten(np.concatenate([*blocks.design, self.means], axis=1))
+        white = whiten(np.concatenate([*blocks.design, self.means], axis=1))
         ends = np.cumsum([0, *(part.shape[1] for part in blocks.design)])
-        self._rest, self._free, self.known = [], [], []
+        self._rest = []
+        self._free = []
+        self.known = []
         for axis in range(3):
-            part = every[:, ends[axis] : ends[axis + 1]] / whiten.scale[axis]
-            left, sizes = svd(
-                part[:, :-1] @ plausible[blocks.index[axis]],
+            catalogue_and_residual = white[:, ends[axis] : ends[axis + 1]] / whiten.scale[axis]
+            residual = catalogue_and_residual[:, -1]
+            columns = white[:, ends[3] :] / whiten.scale[axis]
+
+            # Plausible contributions A p of the catalogue, cov(p) = P P', count as noise of unit
+            # variance more: with A P = U S V' the rows are multiplied by (1 + U S^2 U')^(-1/2)
+            # = 1 - U diag(1 - 1 / sqrt(1 + S^2)) U'.
+            basis, sizes, _ = svd(
+                catalogue_and_residual[:, :-1] @ plausible[blocks.index[axis]],
                 full_matrices=False,
                 lapack_driver='gesdd',
-            )[:2]
-            # Plausible contributions of the catalogue count as noise: a direction keeps the excess
-            # over its plausible size.
-            basis, damped = left, (1.0 - 1.0 / np.sqrt(1.0 + sizes**2))[:, None]
-            columns = every[:, ends[3] :] / whiten.scale[axis]
-            self._rest.append(part[:, -1] - basis @ (damped[:, 0] * (basis.T @ part[:, -1])))
-            free = columns - basis @ (damped * (basis.T @ columns))
-            size = np.einsum('bt,bt->t', columns, columns)
-            new = np.einsum('bt,bt->t', free, free) > NEW**2 * np.maximum(size, 1e-300)
-            self._free.append(np.where(new, free, 0.0))
+            )
+            damped = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)
+            self._rest.append(residual - basis @ (damped * (basis.T @ residual)))
+            free = columns - basis @ (damped[:, None] * (basis.T @ columns))
+
+            # A column that the catalogue contains is no formula beyond it.
+            square = np.einsum('bt,bt->t', columns, columns)
+            free_square = np.einsum('bt,bt->t', free, free)
+            is_new = free_square > NEW**2 * np.maximum(square, 1e-300)
+            self._free.append(np.where(is_new, free, 0.0))
             self.known.append(int((sizes > 1.0).sum()))
 
     def _worked_out(self, texts: Sequence[str], reference_temperature: float) -> np.ndarray:
@@ -389,31 +429,41 @@ class FormulaSearch:
     def _at(self, column: Column) -> list[int]:
         return [self._place[text] for text in _three(column)]
 
-    def _places(self, formula: Formula, axis: int) -> list[int]:
-        return [self._at(column)[axis] for column in formula.columns]
-
     def _gains(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (fall of chi-square, number of amplitudes) of each formula, shape (n,) both."""
-        gains, counts = np.zeros(len(self.formulas)), np.zeros(len(self.formulas))
+        """
+        Return (fall of chi-square, number of amplitudes) of each formula, shape (n,) both.
+
+        With the columns X of a formula, scaled to unit length, and the residual r of an axis::
+
+            fall = (X'r)' (X'X)^-1 (X'r)
+
+        """
+        gains = np.zeros(len(self.formulas))
+        counts = np.zeros(len(self.formulas))
+        # All formulas with the same number of columns at once.
         for width in {len(formula.columns) for formula in self.formulas}:
             chosen = [k for k, formula in enumerate(self.formulas) if len(formula.columns) == width]
+            places = []  # of the columns on each axis, (n_chosen, width, 3)
+            for k in chosen:
+                places.append([self._at(column) for column in self.formulas[k].columns])
             for axis in range(3):
-                at = np.array([self._places(self.formulas[k], axis) for k in chosen])
+                at = np.array(places)[:, :, axis]
                 free = self._free[axis]
                 size = np.sqrt(np.maximum(np.einsum('bt,bt->t', free, free), 1e-300))
                 slopes = (free.T @ self._rest[axis]) / size
                 gram = np.eye(width) * np.ones((len(chosen), 1, 1))
                 for i in range(width):
                     for j in range(i):
-                        inner = np.einsum('bg,bg->g', free[:, at[:, i]], free[:, at[:, j]]) / (
-                            size[at[:, i]] * size[at[:, j]]
-                        )
-                        gram[:, i, j] = gram[:, j, i] = np.clip(inner, -1.0, 1.0)
-                gram += 1e-6 * np.eye(width)
+                        first = at[:, i]
+                        second = at[:, j]
+                        inner = np.einsum('bg,bg->g', free[:, first], free[:, second])
+                        cosine = np.clip(inner / (size[first] * size[second]), -1.0, 1.0)
+                        gram[:, i, j] = cosine
+                        gram[:, j, i] = cosine
+                gram += 1e-6 * np.eye(width)  # collinear columns
                 right = slopes[at]
-                gains[chosen] += np.einsum(
-                    'gk,gk->g', right, np.linalg.solve(gram, right[..., None])[..., 0]
-                )
+                amplitudes = np.linalg.solve(gram, right[..., None])[..., 0]
+                gains[chosen] += np.einsum('gk,gk->g', right, amplitudes)
                 counts[chosen] += (size[at] > 1e-100).sum(axis=1)
         return gains, counts
 

@@ -54,10 +54,9 @@ class Gain:
     @property
     def beyond_noise(self) -> tuple[float, float]:
         """Rms before and after without the noise at rest, ``sqrt(max(rms^2 - noise^2, 0))``."""
-        before, after = (
-            float(np.sqrt(max(rms**2 - self.noise_rms**2, 0.0)))
-            for rms in (self.heldout_rms_before, self.heldout_rms_after)
-        )
+        noise_square = self.noise_rms**2
+        before = float(np.sqrt(max(self.heldout_rms_before**2 - noise_square, 0.0)))
+        after = float(np.sqrt(max(self.heldout_rms_after**2 - noise_square, 0.0)))
         return before, after
 
     @property
@@ -72,11 +71,9 @@ class Gain:
     @property
     def reduction(self) -> float:
         """1 - after / before."""
-        return (
-            1.0 - self.heldout_rms_after / self.heldout_rms_before
-            if self.heldout_rms_before > 0
-            else 0.0
-        )
+        if not self.heldout_rms_before > 0:
+            return 0.0
+        return 1.0 - self.heldout_rms_after / self.heldout_rms_before
 
 
 def heldout_gain(
@@ -102,14 +99,15 @@ def heldout_gain(
         Sensors that the difference acts on; the one with the larger reduction is reported.
 
     """
-    gain = gain_in_turn(problem, before, after, sensors=sensors)
-    used = map(problem.search.indices, (before, after))
-    values = [problem.space.reduced(some, problem.evidence.fit(some)[0])[None] for some in used]
-    return gain_of(
-        gain.sensor,
-        gain.measure,
-        [_squares(problem.locked_samples, each, gain.sensor)[gain.measure] for each in values],
-    )
+    chosen = gain_in_turn(problem, before, after, sensors=sensors)
+    pair = []
+    for choice in (before, after):
+        used = problem.search.indices(choice)
+        values, _ = problem.evidence.fit(used)
+        weights = problem.space.reduced(used, values)[None]
+        squares = _squares(problem.locked_samples, weights, chosen.sensor)
+        pair.append(squares[chosen.measure])
+    return gain_of(chosen.sensor, chosen.measure, pair)
 
 
 def gain_in_turn(
@@ -126,36 +124,45 @@ def gain_in_turn(
     surest: a small lag may reduce window means by a tenth through noise, and samples by a certain
     half percent. For a quiet sensor moving windows show the encoder, rests the sensor.
     """
-    found, fold = [], problem.evidence.fold
+    fold = problem.evidence.fold
+    gains = []
+    certainties = []
     for sensor in sensors:
-        pair = []
-        for used in map(problem.search.indices, (before, after)):
-            values = np.array(
-                [
-                    problem.space.reduced(used, problem.evidence.fit(used, number)[0])
-                    for number in range(fold.max() + 1)
-                ]
-            )
-            pair.append(_squares(problem.all_samples, values[fold], sensor))
+        # Each window is predicted by a fit to the other folds.
+        squares_of_choices = []
+        for choice in (before, after):
+            used = problem.search.indices(choice)
+            weights_of_folds = []
+            for number in range(fold.max() + 1):
+                values, _ = problem.evidence.fit(used, number)
+                weights_of_folds.append(problem.space.reduced(used, values))
+            weights = np.array(weights_of_folds)[fold]
+            squares_of_choices.append(_squares(problem.all_samples, weights, sensor))
         for measure in MEASURES:
-            each = [squares[measure] for squares in pair]
-            found.append((gain_of(sensor, measure, each), _certainty(each)))
-    most = max(
-        (gain for gain, _ in found if gain.measure != REST_MEASURE), key=lambda gain: gain.least
+            pair = [squares[measure] for squares in squares_of_choices]
+            gains.append(gain_of(sensor, measure, pair))
+            certainties.append(_certainty(pair))
+
+    largest = max(
+        (gain for gain in gains if gain.measure != REST_MEASURE), key=lambda gain: gain.least
     )
-    if most.least > 0:
-        return most
-    return max(found, key=lambda entry: (not np.isinf(entry[0].least), entry[1]))[0]
+    if largest.least > 0:
+        return largest
+    # Gains with an interval first, then the surest.
+    ranks = [(not np.isinf(gain.least), certainty) for gain, certainty in zip(gains, certainties)]
+    return gains[ranks.index(max(ranks))]
 
 
 def gain_of(
     sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]], *, of: str = OF_MODEL
 ) -> Gain:
     """Return the Gain from (sums of squares, numbers) of each group of rows, before and after."""
-    before, after = (
-        float(np.sqrt(squares.sum() / max(number.sum(), 1))) for squares, number in pair
-    )
-    return Gain(sensor, measure, before, after, reduction_interval(pair), len(pair[0][0]), of)
+    rms = []
+    for squares, number in pair:
+        rms.append(float(np.sqrt(squares.sum() / max(number.sum(), 1))))
+    before, after = rms
+    n_groups = len(pair[0][0])
+    return Gain(sensor, measure, before, after, reduction_interval(pair), n_groups, of)
 
 
 def _squares(
@@ -166,32 +173,31 @@ def _squares(
 
     They are taken at vectors of `ParameterSpace.reduced`, one or many.
     """
+    # Squares of the mean residual and of the residual about it, sums over the axes.
     recording = space.recording
-    means, within = np.zeros(len(recording.windows)), np.zeros(len(recording.windows))
+    n_windows = len(recording.windows)
+    of_mean = np.zeros(n_windows)
+    about_mean = np.zeros(n_windows)
     for axis in range(3):
-        weights = np.broadcast_to(
-            values[:, space.places(sensor, axis)], (len(means), len(space.places(sensor, axis)))
-        )
-        means += np.einsum('kq,kq->k', space.mean[sensor][axis], weights) ** 2
-        within += space.squares_within(sensor, axis, weights)
+        places = space.places(sensor, axis)
+        weights = np.broadcast_to(values[:, places], (n_windows, len(places)))
+        of_mean += np.einsum('kq,kq->k', space.mean[sensor][axis], weights) ** 2
+        about_mean += space.squares_within(sensor, axis, weights)
+
+    # At rest the samples about the mean are noise.
     rest = ~recording.moving
-    at_rest = np.array(
-        [window.sensors[sensor].noise_variance.sum() for window in recording.windows]
+    variances = [window.sensors[sensor].noise_variance.sum() for window in recording.windows]
+    about_mean[rest] = np.array(variances)[rest] * (recording.count[rest] - 1)
+
+    of_samples = about_mean + recording.count * of_mean
+    three_axes = np.full(n_windows, 3.0)
+    squares = (
+        (of_samples, 3 * recording.count),
+        (of_mean, three_axes),
+        (about_mean, 3 * (recording.count - 1)),
+        (of_mean[rest], three_axes[rest]),
     )
-    within[rest] = at_rest[rest] * (recording.count[rest] - 1)
-    three = np.full(len(means), 3.0)
-    every = (within + recording.count * means, 3 * recording.count)
-    return dict(
-        zip(
-            MEASURES,
-            (
-                every,
-                (means, three),
-                (within, 3 * (recording.count - 1)),
-                (means[rest], three[rest]),
-            ),
-        )
-    )
+    return dict(zip(MEASURES, squares, strict=True))
 
 
 def _certainty(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:

@@ -113,57 +113,67 @@ def investigate(
         When there are too few windows to hold any out.
 
     """
+    # Windows of the search without clipped samples, the locked ones, and the effects under test.
     used = [window for window in windows if window.kind != 'unused']
     if len(used) < MIN_FOLD_WINDOWS:
         raise too_few_windows(len(used))
     model = replace(model, joint_names=table.joint_names)
     used, locked, limits = without_clipping(used, table, model)
-    effects, not_testable = testable_effects(model, table, windows_at(used, ~locked))
-    asked = without_saturation(effects)
+    testable, not_testable = testable_effects(model, table, windows_at(used, ~locked))
+    effects = without_saturation(testable)
     linearised_at = partial(
         LinearisedProblem,
         used,
         table,
         model,
-        effects=asked,
+        effects=effects,
         locked=locked,
         bias_processes=bias_processes,
     )
-    problem = linearised_at()
-    outcome, rivals, again = _explained(problem, linearised_at)
-    onset = (
-        find_onset(outcome.problem, outcome.explained, outcome.named, windows=used, table=table)
-        if outcome.rest
-        else None
-    )
-    step = next((effect for effect in effects if effect.located), None)
+
+    # Search for constant parameters.
+    outcome, rivals, linearised_again = _explained(linearised_at(), linearised_at)
+
+    # An excess remains: do parameters change at one moment?
+    onset = None
+    if outcome.rest:
+        onset = find_onset(
+            outcome.problem, outcome.explained, outcome.named, windows=used, table=table
+        )
+
+    # A step of the clock is an effect: the search is repeated with it, from the values of the
+    # onset, and counts if it removes most of the excess.
+    step = next((effect for effect in testable if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
-        stepped = partial(linearised_at, effects=[*asked, step])
+        stepped_at = partial(linearised_at, effects=[*effects, step])
         ((name, before),) = onset.before.items()
-        values = {
-            name: before,
-            **dict(zip(step.param_names(), (onset.after[name] - before, onset.time))),
-        }
-        there = stepped(point=point_with(model, [*asked, step], values))
-        other, others, beside = _explained(
-            there, stepped, [question for question in there.questions if question.name == step.name]
-        )
-        if other.rest < LEFT * outcome.rest:
-            outcome, rivals, again, onset = other, others, beside, None
+        size_and_time = (onset.after[name] - before, onset.time)
+        values = {name: before, **dict(zip(step.param_names(), size_and_time))}
+        problem = stepped_at(point=point_with(model, [*effects, step], values))
+        start = [question for question in problem.questions if question.name == step.name]
+        with_step, rivals_with_step, stepped_again = _explained(problem, stepped_at, start)
+        if with_step.rest < LEFT * outcome.rest:
+            outcome = with_step
+            rivals = rivals_with_step
+            linearised_again = stepped_again
+            onset = None
+
+    # Any other change: the longer part alone.
     if onset is not None:
-        longer = max(
-            [w for w in used if w.time[-1] < onset.time],
-            [w for w in used if w.time[0] >= onset.time],
-            key=len,
-        )
-        return replace(
-            investigate(longer, table, model, bias_processes=bias_processes), onset=onset
-        )
-    linearised_at = again
+        before_onset = [window for window in used if window.time[-1] < onset.time]
+        after_onset = [window for window in used if window.time[0] >= onset.time]
+        longer = max(before_onset, after_onset, key=len)
+        of_part = investigate(longer, table, model, bias_processes=bias_processes)
+        return replace(of_part, onset=onset)
+
+    # Once more where an excess remains: with plausible sizes, then with any size.
     tried = {_labels(outcome.chosen)}
     for any_size in (False, True):
-        outcome = _looked_again(outcome, partial(linearised_at, any_size=any_size), any_size, tried)
-    problem, named, unstable = outcome.problem, outcome.named, outcome.unstable
+        at_any_size = partial(linearised_again, any_size=any_size)
+        outcome = _looked_again(outcome, at_any_size, any_size, tried)
+
+    named = outcome.named
+    unstable = outcome.unstable
     names = {question.name for question in named}
     rivals = [
         rival for rival in rivals if rival.question.name in names and rival.other.name not in names
@@ -171,7 +181,7 @@ def investigate(
     rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
     return Investigation(
         used=used,
-        problem=problem,
+        problem=outcome.problem,
         explained=outcome.explained,
         named=named,
         not_testable=not_testable,
@@ -203,11 +213,9 @@ def _explained(
         linearised_at = partial(linearised_at, resolved=FAMILY)
         return *_with_lags(explanations, linearised_at), linearised_at
     settled, rivals = settle_rivals(problem, chosen, linearised_at)
-    return (
-        _settled(linearised_at, settled, chosen if settled is problem else settled.search.run()),
-        rivals,
-        linearised_at,
-    )
+    if settled is not problem:
+        chosen = settled.search.run()
+    return _settled(linearised_at, settled, chosen), rivals, linearised_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +246,9 @@ class _Trial:
     @property
     def rank(self) -> tuple[int, int, int]:
         """Numbers of its lags that are named and chosen, then the order of the trials."""
-        named = sum(question.name in self.lags for question in self.outcome.named)
-        chosen = sum(question.name in self.lags for question in self.outcome.chosen)
-        return named, chosen, -self.number
+        named = {question.name for question in self.outcome.named}
+        chosen = {question.name for question in self.outcome.chosen}
+        return len(self.lags & named), len(self.lags & chosen), -self.number
 
     @property
     def helps(self) -> bool:
@@ -316,14 +324,16 @@ def _looked_again(
     problem = outcome.problem.asking_any_size() if any_size else outcome.problem
     search = problem.search
     lags = _resolved(problem, outcome.chosen)
-    found = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
-    best = min(found, key=search.cost)
-    if (
-        _labels(best) in tried
-        or outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest
-        or (not any_size and search.cost(best) >= search.cost(outcome.chosen))
-    ):
+    choices = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
+    best = min(choices, key=search.cost)
+    if _labels(best) in tried:
         return outcome
+    if outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest:
+        return outcome
+    # Implausible sizes have a price; without them the better choice has the lower cost.
+    if not any_size and search.cost(best) >= search.cost(outcome.chosen):
+        return outcome
+
     tried.add(_labels(best))
     other = _settled(linearised_at, problem, best)
     return other if other.rest < LEFT * outcome.rest else outcome
@@ -357,13 +367,12 @@ def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
     explained = ExplainedWindows(problem.evidence, problem.search)
-    first = simpler(problem, explained, pruned(chosen, explained.share))
-    return _Outcome(
-        problem,
-        explained,
-        chosen,
-        *_agreed(problem, explained, _that_help(problem, explained, first)),
-    )
+
+    # Enough share of the unexplained, no simpler alternative, better prediction, equal halves.
+    with_share = simpler(problem, explained, pruned(chosen, explained.share))
+    helpful = _that_help(problem, explained, with_share)
+    named, unstable = _agreed(problem, explained, helpful)
+    return _Outcome(problem, explained, chosen, named, unstable)
 
 
 def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
@@ -377,16 +386,13 @@ def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
             break
         problem = linearised_at(point=outcome.problem.point(outcome.named))
         explained = ExplainedWindows(problem.evidence, problem.search)
-        named, unstable, chosen = (
-            same_questions(problem, some)
-            for some in (outcome.named, outcome.unstable, outcome.chosen)
-        )
+        named = pruned(same_questions(problem, outcome.named), explained.share)
         outcome = _Outcome(
             problem,
             explained,
-            chosen,
-            _that_help(problem, explained, pruned(named, explained.share)),
-            unstable,
+            same_questions(problem, outcome.chosen),
+            _that_help(problem, explained, named),
+            same_questions(problem, outcome.unstable),
         )
     return outcome
 
@@ -423,12 +429,9 @@ def _agreed(
     """
     unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
     kept = [question for question in named if question not in unstable]
-    return (
-        problem.search.drop_insignificant(
-            _that_help(problem, explained, kept) if unstable else kept
-        ),
-        unstable,
-    )
+    if unstable:
+        kept = _that_help(problem, explained, kept)
+    return problem.search.drop_insignificant(kept), unstable
 
 
 def _that_help(
@@ -450,15 +453,19 @@ def _that_help(
         if problem.search.allowed(named, question) and problem.windows_agree(named, question)
     ]
     while kept:
-        least = [_sure_reduction(problem, kept, each) for each in kept]
-        # A NaN is not sure.
-        short = [
-            not paid > _needed_reduction(problem, explained, kept, each)
-            for paid, each in zip(least, kept)
-        ]
-        if not any(short):
+        # The finding with the least reduction among those with too little; NaN is not sure.
+        least_helpful = None
+        least_reduction = np.inf
+        for place, question in enumerate(kept):
+            reduction = _sure_reduction(problem, kept, question)
+            if not reduction > _needed_reduction(problem, explained, kept, question):
+                rank = -np.inf if np.isnan(reduction) else reduction
+                if least_helpful is None or rank < least_reduction:
+                    least_helpful = place
+                    least_reduction = rank
+        if least_helpful is None:
             break
-        del kept[int(np.argmin(np.where(short, np.nan_to_num(least, nan=-np.inf), np.inf)))]
+        del kept[least_helpful]
     return kept
 
 
@@ -484,9 +491,6 @@ def _sure_reduction(
     """
     Return the lower end of the interval of an effect's reduction of the cross-validated residual.
     """
-    return gain_in_turn(
-        problem,
-        [q for q in chosen if q is not question],
-        chosen,
-        sensors=question.effect.sensors,
-    ).ci95[0]
+    others = [q for q in chosen if q is not question]
+    gain = gain_in_turn(problem, others, chosen, sensors=question.effect.sensors)
+    return gain.ci95[0]

@@ -413,23 +413,31 @@ def _rivals(
 
     Members of explanations with no more effects.
     """
-    asked, found = {question.name: question for question in settled.questions}, {}
+    question_of = {question.name: question for question in settled.questions}
+    rivals: dict[str, Rival] = {}
     for other in sorted(near, key=lambda explanation: explanation.cost):
-        gone, come = (
-            sorted(set(selected.lags) - set(other.lags)),
-            sorted(set(other.lags) - set(selected.lags)),
-        )
-        if len(other.lags) > len(selected.lags) or not gone:
+        removed = sorted(set(selected.lags) - set(other.lags))
+        added = sorted(set(other.lags) - set(selected.lags))
+        if len(other.lags) > len(selected.lags) or not removed:
             continue
         moves = {name: other.values[name] - selected.values[name] for name in selected.values}
-        for name in come:
-            place = next(
-                (each for each in gone if asked[each].sensor == asked[name].sensor),
-                CLOCK if CLOCK in gone else gone[0],
+        for name in added:
+            if name in rivals:
+                continue
+
+            # It replaces a lag of its own sensor; otherwise that of the clock, or the first one.
+            replaced = CLOCK if CLOCK in removed else removed[0]
+            for lag in removed:
+                if question_of[lag].sensor == question_of[name].sensor:
+                    replaced = lag
+                    break
+
+            # The change of the parameters counts once for each replaced lag.
+            known = {rival.question.name for rival in rivals.values()}
+            rivals[name] = Rival(
+                question_of[replaced],
+                question_of[name],
+                other.cost - selected.cost,
+                {} if replaced in known else moves,
             )
-            if name not in found:
-                first = place not in {rival.question.name for rival in found.values()}
-                found[name] = Rival(
-                    asked[place], asked[name], other.cost - selected.cost, moves if first else {}
-                )
-    return list(found.values())
+    return list(rivals.values())

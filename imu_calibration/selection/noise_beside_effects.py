@@ -40,22 +40,35 @@ def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
     reduces the ripple. The fast part is replaced by white noise of the slow part's variance, so
     that all counts of samples hold.
     """
-    recording, moving = space.recording, space.recording.moving
-    slow_only, slow_variance = {}, {}
-    n_slow = np.maximum(recording.slow_rows - 1.0, 0.0)
+    recording = space.recording
+    moving = recording.moving
+    n_rows = (recording.count[moving] - 1).sum()
+    n_slow_rows = np.maximum(recording.slow_rows - 1.0, 0.0)[moving].sum()
+    slow_only = {}
+    slow_variance = {}
     for sensor in space.sensors:
-        rest = white_noise(recording.windows, sensor)
-        at_rest = np.zeros(3) if rest is None else rest[0] * np.maximum(rest[1], 1.0)
-        slow_only[sensor], slow_variance[sensor] = np.zeros(3, bool), np.zeros(3)
+        noise = white_noise(recording.windows, sensor)
+        variance_at_rest = np.zeros(3)
+        if noise is not None:
+            variance, inflation = noise
+            variance_at_rest = variance * np.maximum(inflation, 1.0)
+        slow_only[sensor] = np.zeros(3, bool)
+        slow_variance[sensor] = np.zeros(3)
         for axis in range(3):
-            (left, rank), (left_slow, rank_slow) = (
-                least_misfit(space.within_sum(sensor, axis, moving, part=part))
-                for part in ('within', 'slow')
+            # The best fit of all candidate effects together: what remains, no effect explains.
+            squares, rank = least_misfit(space.within_sum(sensor, axis, moving, part='within'))
+            slow_squares, slow_rank = least_misfit(
+                space.within_sum(sensor, axis, moving, part='slow')
             )
-            dofs = (recording.count[moving] - 1).sum() - rank, n_slow[moving].sum() - rank_slow
-            found = band_misfit(np.full(3, left), dofs[0], np.full(3, left_slow), dof_slow=dofs[1])
-            if found.apart[0] and found.fast[0] >= 2.0 * at_rest[axis]:
-                slow_only[sensor][axis], slow_variance[sensor][axis] = True, found.slow[axis]
+            misfit = band_misfit(
+                np.full(3, squares),
+                n_rows - rank,
+                np.full(3, slow_squares),
+                dof_slow=n_slow_rows - slow_rank,
+            )
+            if misfit.apart[0] and misfit.fast[0] >= 2.0 * variance_at_rest[axis]:
+                slow_only[sensor][axis] = True
+                slow_variance[sensor][axis] = misfit.slow[axis]
     return replace(space, slow_only=slow_only, slow_variance=slow_variance)
 
 

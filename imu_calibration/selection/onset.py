@@ -333,12 +333,15 @@ def _onset_of(
     candidate: _Candidate, problem: LinearisedProblem, *, windows: Sequence[Window], table: Table
 ) -> Onset:
     """Return the Onset of a _Candidate, with its moment refined to a sample."""
-    model, group, fit = problem.recording.model, candidate.group, candidate.fit
-    change, sd = fit.change, fit.change_sd
+    model = problem.recording.model
+    group = candidate.group
+    change = candidate.fit.change
+    sd = candidate.fit.change_sd
 
     # Both states of all parameters; the change is added to the first.
-    values, changed = np.zeros(problem.space.size), np.zeros(problem.space.size)
-    values[candidate.own] = fit.values
+    values = np.zeros(problem.space.size)
+    values[candidate.own] = candidate.fit.values
+    changed = np.zeros(problem.space.size)
     changed[group.parameters] = change
     first_state = problem.absolute(values)
     states = [first_state, first_state + changed]
@@ -350,7 +353,8 @@ def _onset_of(
     for effect in model.effects:
         for k, label in enumerate(effect.param_names()):
             units[label] = effect.unit_of(k)
-    before, after = (dict(zip(names, state[group.parameters].tolist())) for state in states)
+    before = dict(zip(names, states[0][group.parameters].tolist()))
+    after = dict(zip(names, states[1][group.parameters].tolist()))
     sensor_axes: dict[str, tuple[str, ...]] = {}
     if group.role is not None:
         # Of each sensor of the group three biases, or the nine elements of a matrix row by row.
@@ -360,8 +364,8 @@ def _onset_of(
         squares = np.maximum((change / unit) ** 2 - (sd / unit) ** 2, 0.0)
         squares = squares.reshape(-1, 3, per_row).sum(axis=2)
         sensors = dict.fromkeys(name.partition('.')[0] for name in names)
-        for sensor, own in zip(sensors, squares, strict=True):
-            sensor_axes[sensor] = largest_axes(own)
+        for sensor, squares_of_axes in zip(sensors, squares, strict=True):
+            sensor_axes[sensor] = largest_axes(squares_of_axes)
     return Onset(
         moment,
         moment_sd,
@@ -392,14 +396,21 @@ def _refined(
     """
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
     noise = dict(zip(SENSORS, np.median([w.noise_sd for w in near], axis=0)))
-    squares = []  # of each state, in noise: one sum for each sample
+    squares = []  # of each state, at each sample
     for state in states:
-        rests = residuals(near, table, model, values=state[: len(model.param_names)])
+        residual_of = residuals(near, table, model, values=state[: len(model.param_names)])
         squares.append(
-            sum(((rest / noise[sensor]) ** 2).sum(axis=1) for sensor, rest in rests.items())
+            sum(((rest / noise[sensor]) ** 2).sum(axis=1) for sensor, rest in residual_of.items())
         )
-    time, cost = np.concatenate([w.time for w in near]), np.cumsum(squares[0] - squares[1])[:-1]
-    gap, weight = np.diff(time), np.exp((cost.min() - cost) / 2) * np.diff(time)
+
+    # S up to a constant, for a moment between each sample and the next one.
+    cost = np.cumsum(squares[0] - squares[1])[:-1]
+    time = np.concatenate([window.time for window in near])
+    gap = np.diff(time)
+    probability = np.exp((cost.min() - cost) / 2) * gap
     middle = time[:-1] + gap / 2
-    mean = weight @ middle / weight.sum()
-    return float(mean), float(np.sqrt(weight @ ((middle - mean) ** 2 + gap**2 / 12) / weight.sum()))
+    mean = probability @ middle / probability.sum()
+    # The moment is uniform within its gap: variance gap^2 / 12.
+    squared_deviation = (middle - mean) ** 2 + gap**2 / 12
+    variance = probability @ squared_deviation / probability.sum()
+    return float(mean), float(np.sqrt(variance))

@@ -6,7 +6,6 @@ Search, test on held-out windows, description and a term for a model.
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -259,33 +258,50 @@ def _proposal_of(
     plain: BlockFit,
     choices: Sequence[FormulaChoice],
 ) -> Proposal:
-    shapes = chain.from_iterable(_shapes(fits, choices, choice) for choice in choices)
-    terms = list(shapes)[:MOST_TERMS]
+    """Return the chosen formulas as effects with their amplitudes, fitted together."""
+    terms = []
+    for choice in choices:
+        terms += _shapes(fits, choices, choice)
+    terms = terms[:MOST_TERMS]
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)
-    share = share_removed(plain, after)
-    alike = [
-        _joined_text(f.columns[0]) + (' in any phase' if len(f.columns) > 1 else '')
-        for f in choices[0].alike[:SHOWN_ALIKE]
-    ]
+
+    # Names that the catalogue has not.
     taken = {name for _, name in problem.baseline.catalogue.effects(problem.baseline.joint_names)}
-    effects = tuple(
-        _effect(blocks.sensor, number, text, formula, after.amplitudes[number], taken)
-        for number, (_, text, formula) in enumerate(terms)
-    )
-    seen = np.abs(after.amplitudes) > CONCERNED_SDS * after.sd
+    families: set[str] = set()
+    effects = []
+    for number, (_, text, formula) in enumerate(terms):
+        amplitudes = after.amplitudes[number]
+        effects.append(_effect(blocks.sensor, number, text, formula, amplitudes, taken))
+        families |= formula.family
+
+    # Formulas of the same evidence, of which these are the simplest.
+    alike = []
+    for formula in choices[0].alike[:SHOWN_ALIKE]:
+        phase = ' in any phase' if len(formula.columns) > 1 else ''
+        alike.append(_joined_text(formula.columns[0]) + phase)
+
+    # Axes with a significant amplitude and at least a tenth of the largest output.
+    significant = np.abs(after.amplitudes) > CONCERNED_SDS * after.sd
     rms = np.sqrt((columns**2).mean(axis=0))
-    strong = (np.abs(after.amplitudes) * rms).sum(axis=0)
-    axes = tuple(
-        axis for k, axis in enumerate(AXES) if seen[:, k].any() and strong[k] > 0.1 * strong.max()
-    )
+    output = (np.abs(after.amplitudes) * rms).sum(axis=0)
+    axes = []
+    for k, axis in enumerate(AXES):
+        if significant[:, k].any() and output[k] > 0.1 * output.max():
+            axes.append(axis)
+    rms_of_terms = []
+    for k, amplitudes in enumerate(after.amplitudes):
+        rms_of_terms.append(float(np.sqrt((rms[k] ** 2 * amplitudes**2).sum())))
+
+    # The excess is a sum of squares; its reduction as a root mean square.
+    share = share_removed(plain, after)
     return Proposal(
         blocks.sensor,
-        effects,
+        tuple(effects),
         tuple(after.amplitudes),
         tuple(after.sd),
-        frozenset().union(*(formula.family for _, _, formula in terms)),
-        axes,
+        frozenset(families),
+        tuple(axes),
         share,
         share_interval(plain, after, np.random.default_rng(1)),
         1.0 - float(np.sqrt(max(1.0 - share, 0.0))),
@@ -293,10 +309,7 @@ def _proposal_of(
         tuple(alike),
         _nearest(fits, plain, problem),
         _motion(effects),
-        tuple(
-            float(np.sqrt((rms[k] ** 2 * amplitude**2).sum()))
-            for k, amplitude in enumerate(after.amplitudes)
-        ),
+        tuple(rms_of_terms),
     )
 
 
@@ -308,32 +321,33 @@ def _shapes(
 
     They are the one or two shapes that hold a choice's amplitudes.
     """
-    formula, columns = choice.formula, choice.columns
+    formula = choice.formula
+    columns = choice.columns
     if len(formula.columns) == 1:
         return [(columns, formula.columns[0], formula)]
+
+    # Amplitudes (k columns, 3 axes) in units of output: A = U S V'. A column of U is a combination
+    # of columns that all axes have in common, with the amplitudes S V'.
     first = sum(other.columns.shape[1] for other in choices[: choices.index(choice)])
     amplitudes = fits.fit(_joined(choices)).amplitudes[first : first + columns.shape[1]]
     scale = np.sqrt((columns**2).mean(axis=(0, 2)))
-    left, sizes = np.linalg.svd(amplitudes * scale[:, None])[:2]
+    left, sizes, _ = np.linalg.svd(amplitudes * scale[:, None])
     count = 1 if sizes[0] ** 2 > ONE_SHAPE * (sizes**2).sum() else 2
-    found = []
+    shapes = []
     for weights in (left[:, :count] / scale[:, None]).T:
+        # Rounded as the text has them, so that the text reproduces the fit.
         weights = weights / weights[np.argmax(np.abs(weights))]
         if formula.phased:
             phase = float(f'{np.arctan2(weights[1], weights[0]):.4g}')
-            weights, text = (
-                np.array([np.cos(phase), np.sin(phase)]),
-                formula.phased.format(phase=phase).replace('- -', '+ '),
-            )
+            weights = np.array([np.cos(phase), np.sin(phase)])
+            text: Column = formula.phased.format(phase=phase).replace('- -', '+ ')
         else:
-            weights = np.where(
-                np.abs(weights) * scale > 0.03 * np.max(np.abs(weights) * scale),
-                np.array([float(f'{w:.4g}') for w in weights]),
-                0.0,
-            )
+            output = np.abs(weights) * scale
+            rounded = np.array([float(f'{weight:.4g}') for weight in weights])
+            weights = np.where(output > 0.03 * np.max(output), rounded, 0.0)
             text = _summed(formula.columns, weights)
-        found.append((np.einsum('bka,k->ba', columns, weights)[:, None], text, formula))
-    return found
+        shapes.append((np.einsum('bka,k->ba', columns, weights)[:, None], text, formula))
+    return shapes
 
 
 def _summed(columns: Sequence[Column], weights: Sequence[float] | np.ndarray) -> Column:

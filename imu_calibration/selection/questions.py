@@ -66,23 +66,22 @@ def testable_effects(
         The recording.
 
     """
+    # Range of the temperature and of the thermal branch, which both may be unknown.
+    temperatures = []
+    branches = []
+    for window in windows:
+        if window.temperature_c is not None:
+            temperatures.append(float(np.mean(window.temperature_c)))
+        if window.motion.thermal_branch is not None:
+            branches.append(float(window.motion.thermal_branch.mean()))
+    span = None
+    if temperatures and len(temperatures) == len(windows):
+        span = max(temperatures) - min(temperatures)
+    turned = bool(branches) and max(branches) - min(branches) >= BRANCHES_APART
+
     kinds = {window.kind for window in windows}
-    means = [
-        float(np.mean(window.temperature_c))
-        for window in windows
-        if window.temperature_c is not None
-    ]
-    span = max(means) - min(means) if means and len(means) == len(windows) else None
-    have = {e.key for e in model.effects}
-    branches = [
-        float(window.motion.thermal_branch.mean())
-        for window in windows
-        if window.motion.thermal_branch is not None
-    ]
-    turned, shaken = (
-        bool(branches) and max(branches) - min(branches) >= BRANCHES_APART,
-        _vibrates(windows),
-    )
+    have = {effect.key for effect in model.effects}
+    shaken = _vibrates(windows)
     return sort_effects(
         model,
         lambda effect: _why_not(

@@ -7,7 +7,6 @@ Permutation test, and comparison with smooth curves and formulas.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import combinations
 
 import numpy as np
 
@@ -288,13 +287,17 @@ class RegimeSearch:
     def __init__(
         self, sensor: str, time: np.ndarray, variables: Sequence[Variable], *, exchange: np.ndarray
     ):
-        self.sensor, self.time, self._exchange, self._ranges = sensor, time, exchange, []
+        self.sensor = sensor
+        self.time = time
+        self._exchange = exchange
+        # Ranges with neither too few nor too many of the blocks.
+        self._ranges: list[_Ranges] = []
         for variable in variables:
-            marks, member = variable.marks, variable.ranges
-            inside = member @ marks.sum(axis=0)
-            allowed = (inside >= min(FEWEST, len(marks) / 8)) & (
-                inside <= MAX_REGIME_SHARE * len(marks)
-            )
+            marks = variable.marks
+            member = variable.ranges
+            n_inside = member @ marks.sum(axis=0)
+            allowed = n_inside >= min(FEWEST, len(marks) / 8)
+            allowed &= n_inside <= MAX_REGIME_SHARE * len(marks)
             if allowed.any():
                 self._ranges.append(_Ranges(variable, marks, member[allowed]))
 
@@ -312,7 +315,12 @@ class RegimeSearch:
 
         Without those that a smooth curve or a formula describes as well.
 
-        The statistic is the largest share of the squares that one offset explains.
+        The statistic is the largest share of the squares that one offset explains. With the
+        residual r and the indicator x of a range, both white and without the model::
+
+            share = (x'r)^2 / (x'x r'r)
+
+        Its distribution by chance is that of residuals whose blocks are exchanged.
 
         Parameters
         ----------
@@ -327,34 +335,32 @@ class RegimeSearch:
 
         """
         exchanged = np.column_stack([rest.values, rest.free(rest.values[self._exchange].T)])
-        energy, shares = (exchanged**2).sum(axis=0), []
+        energy = (exchanged**2).sum(axis=0)
+        shares = []
         for each in self._ranges:
             marks = white(each.marks)
-            size = np.einsum('rk,kl,rl->r', each.member, marks.T @ rest.free(marks), each.member)
-            shares.append(
-                (each.member @ (marks.T @ exchanged)) ** 2
-                / np.maximum(size, TINY)[:, None]
-                / energy
-            )
+            products = marks.T @ rest.free(marks)  # of the bins; a range is a sum of bins
+            size = np.einsum('rk,kl,rl->r', each.member, products, each.member)
+            projection = each.member @ (marks.T @ exchanged)
+            shares.append(projection**2 / np.maximum(size, TINY)[:, None] / energy)
         p_value, likely = self._tested(shares)
         if p_value > level:
             return []
-        curves = [each.variable.curves for each in self._ranges if len(each.variable.edges)] + (
-            [] if formula is None else [formula]
-        )
-        limit = (
-            _cost(
-                min([energy[0], *(rest.energy(white(columns)) for columns in curves)]),
-                len(self.time),
-            )
-            - SURE
-        )
-        found = []
+
+        # A regime must fit clearly better than any smooth curve of a variable, and the formula.
+        smooth = [each.variable.curves for each in self._ranges if len(each.variable.edges)]
+        if formula is not None:
+            smooth.append(formula)
+        least_energy = min([energy[0], *(rest.energy(white(columns)) for columns in smooth)])
+        limit = _cost(least_energy, len(self.time)) - SURE
+        regimes = []
         for each, number in likely:
             mark, bounds, words, size, after = self._refined(rest, white, each, number)
-            share = 1.0 - max(after - len(mark), 0.0) / max(energy[0] - len(mark), TINY)
+            # Share of the excess over noise, which is 1 for each block.
+            excess = max(energy[0] - len(mark), TINY)
+            share = 1.0 - max(after - len(mark), 0.0) / excess
             if share >= MOST_OF_IT and _cost(after, len(mark)) < limit:
-                found.append(
+                regimes.append(
                     RestRegime(
                         self.sensor,
                         axis,
@@ -370,7 +376,7 @@ class RegimeSearch:
                         each.variable.is_rate,
                     )
                 )
-        return _largest_share_first(found)
+        return _largest_share_first(regimes)
 
     def _refined(
         self, rest: AxisResidual, white: Callable, each: _Ranges, number: int
@@ -380,19 +386,26 @@ class RegimeSearch:
 
         It is (share of each block inside, bounds, words, offset, residual sum of squares).
         """
-        variable, chosen = each.variable, each.variable.chosen(each.member[number])
-        bounds, mark = variable.bounds(chosen), each.marks[:, chosen].sum(axis=1)
+        variable = each.variable
+        chosen = variable.chosen(each.member[number])
+        bounds = variable.bounds(chosen)
+        mark = each.marks[:, chosen].sum(axis=1)
+
+        # Each end in turn where the residual is least, between the edges of the bins too.
         for end in (0, 1):
             if not bounds:
                 break
             low, high = bounds
-            options = [
-                (place, high) if end == 0 else (low, place) for place in variable.near(chosen, end)
-            ]
-            if options:
-                tried = np.stack([variable.inside(*option) for option in options], axis=1)
-                best = int(np.argmin(rest.offsets(white(tried))[1]))
-                bounds, mark = options[best], tried[:, best]
+            options = []
+            for place in variable.near(chosen, end):
+                options.append((place, high) if end == 0 else (low, place))
+            if not options:
+                continue
+            inside = np.stack([variable.inside(*option) for option in options], axis=1)
+            _, squares = rest.offsets(white(inside))
+            best = int(np.argmin(squares))
+            bounds = options[best]
+            mark = inside[:, best]
         (size,), (after,) = rest.offsets(white(mark[:, None]))
         return mark, bounds, variable.words(chosen, bounds), size, after
 
@@ -418,42 +431,46 @@ class RegimeSearch:
             Largest probability of a regime by chance.
 
         """
-        usual = float(np.median(rough))
-        if usual <= 0 or not any(
-            gain.any() for gain in self._falls(rough[:, None] / usual, weight)
-        ):
+        # In units of the median; without a louder range no exchange has to be computed.
+        median = float(np.median(rough))
+        if median <= 0:
             return []
-        rough = rough / usual
-        p_value, likely = self._tested(
-            self._falls(np.column_stack([rough, rough[self._exchange].T]), weight)
-        )
+        rough = rough / median
+        if not any(fall.any() for fall in self._falls(rough[:, None], weight)):
+            return []
+
+        # By chance: with the blocks exchanged.
+        exchanged = np.column_stack([rough, rough[self._exchange].T])
+        p_value, likely = self._tested(self._falls(exchanged, weight))
         if p_value > level:
             return []
-        smooth = [
-            _smooth_scatter(each.variable.curves, rough, weight)
-            for each in self._ranges
-            if len(each.variable.edges)
-        ]
-        (limit, dispersion), found = (
-            min(smooth, default=(_cost(weight @ rough, weight.sum()), 1.0)),
-            [],
-        )
+
+        # A regime must fit clearly better than a variance that follows a smooth curve.
+        smooth = []
+        for each in self._ranges:
+            if len(each.variable.edges):
+                smooth.append(_smooth_scatter(each.variable.curves, rough, weight))
+        one_variance = (_cost(weight @ rough, weight.sum()), 1.0)
+        smooth_cost, dispersion = min(smooth, default=one_variance)
+        regimes = []
         for each, number in likely:
             variable = each.variable
-            chosen = _tightened(
-                variable.chosen(each.member[number]),
-                np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0),
-            )
-            mark = each.marks[:, chosen].sum(axis=1)
-            energy, count = (
-                np.array([(mark * part).sum(), ((1.0 - mark) * part).sum()])
-                for part in (weight * rough, weight)
-            )
-            excess, means = np.maximum(energy - count, 0.0), energy / np.maximum(count, 1.0)
+            excess_of_bins = np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0)
+            chosen = _tightened(variable.chosen(each.member[number]), excess_of_bins)
+            inside = each.marks[:, chosen].sum(axis=1)
+            outside = 1.0 - inside
+
+            # Inside and outside: sums of squares, degrees of freedom, and their ratio.
+            squares = weight * rough
+            energy = np.array([(inside * squares).sum(), (outside * squares).sum()])
+            count = np.array([(inside * weight).sum(), (outside * weight).sum()])
+            variance = energy / np.maximum(count, 1.0)
+            excess = np.maximum(energy - count, 0.0)
             share = excess[0] / max(excess.sum(), TINY)
-            if share >= MOST_OF_IT and np.sum(_cost(energy, count)) < limit - SURE * dispersion:
+            cost = np.sum(_cost(energy, count))
+            if share >= MOST_OF_IT and cost < smooth_cost - SURE * dispersion:
                 bounds = variable.bounds(chosen)
-                found.append(
+                regimes.append(
                     RestRegime(
                         self.sensor,
                         axis,
@@ -461,40 +478,51 @@ class RegimeSearch:
                         variable.words(chosen, bounds) + ', by larger scatter',
                         float(share),
                         p_value,
-                        float(np.sqrt(usual * max(means[0] - means[1], 0.0))),
-                        mark > 0.5,
+                        float(np.sqrt(median * max(variance[0] - variance[1], 0.0))),
+                        inside > 0.5,
                         self.time,
                         False,
                         bounds,
                         variable.is_rate,
                     )
                 )
-        return _largest_share_first(found)
+        return _largest_share_first(regimes)
 
     def _falls(self, rough: np.ndarray, weight: np.ndarray) -> list[np.ndarray]:
         """
         Return per variable the fall of the cost by a separate variance in each range.
 
-        It is zero where the variance is hardly larger, and the shape is (r, m).
+        It is zero where the variance is hardly larger, and the shape is (r, m). With the sums of
+        squares E and the degrees of freedom n of all blocks, and those inside the range::
+
+            fall = cost(E, n) - cost(E_in, n_in) - cost(E - E_in, n - n_in)
+            louder: E_in / n_in > LOUDER max((E - E_in) / (n - n_in), 1)
+
         """
-        squares, count, gains = rough * weight[:, None], weight.sum(), []
+        squares = rough * weight[:, None]
+        count = weight.sum()
         energy = squares.sum(axis=0)
+        falls = []
         for each in self._ranges:
-            inside, within = (
-                (each.member @ (each.marks.T @ weight))[:, None],
-                each.member @ (each.marks.T @ squares),
-            )
-            louder = (
-                within * (count - inside)
-                > LOUDER * np.maximum(energy - within, count - inside) * inside
-            )
+            count_inside = (each.member @ (each.marks.T @ weight))[:, None]
+            energy_inside = each.member @ (each.marks.T @ squares)
+            count_outside = count - count_inside
+            least_outside = np.maximum(energy - energy_inside, count_outside)
+            louder = energy_inside * count_outside > LOUDER * least_outside * count_inside
+
+            # Logarithms only where they are needed.
             row, column = np.nonzero(louder)
-            own, part, whole = inside[row, 0], within[louder], energy[column]
-            gains.append(np.zeros(within.shape))
-            gains[-1][louder] = (
-                _cost(whole, count) - _cost(part, own) - _cost(whole - part, count - own)
+            whole = energy[column]
+            inside = energy_inside[louder]
+            n_inside = count_inside[row, 0]
+            fall = np.zeros(energy_inside.shape)
+            fall[louder] = (
+                _cost(whole, count)
+                - _cost(inside, n_inside)
+                - _cost(whole - inside, count - n_inside)
             )
-        return gains
+            falls.append(fall)
+        return falls
 
     def _tested(self, gains: Sequence[np.ndarray]) -> tuple[float, list[tuple[_Ranges, int]]]:
         """
@@ -504,11 +532,13 @@ class RegimeSearch:
         """
         if not gains:
             return 1.0, []
-        largest = np.max([each.max(axis=0) for each in gains], axis=0)
-        order = np.argsort([-each[:, 0].max() for each in gains], kind='stable')[:REPORTED]
-        return float((largest >= largest[0]).mean()), [
-            (self._ranges[k], int(np.argmax(gains[k][:, 0]))) for k in sorted(order)
-        ]
+        # Column 0 is the recording, the others are exchanges of its blocks.
+        largest = np.max([gain.max(axis=0) for gain in gains], axis=0)
+        p_value = float((largest >= largest[0]).mean())
+        of_recording = [gain[:, 0] for gain in gains]
+        order = np.argsort([-gain.max() for gain in of_recording], kind='stable')[:REPORTED]
+        likeliest = [(self._ranges[k], int(np.argmax(of_recording[k]))) for k in sorted(order)]
+        return p_value, likeliest
 
 
 def _largest_share_first(found: Iterable[RestRegime]) -> list[RestRegime]:
@@ -520,13 +550,14 @@ def _largest_share_first(found: Iterable[RestRegime]) -> list[RestRegime]:
 def _tightened(chosen: Sequence[int], excess: np.ndarray) -> Sequence[int]:
     """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
     sums = np.append(0.0, np.cumsum(excess[chosen]))
-    parts = [
-        (first, last)
-        for first, last in combinations(range(len(sums)), 2)
-        if sums[last] - sums[first] >= NEARLY_ALL * sums[-1]
-    ]
-    first, last = min(parts, key=lambda part: (part[1] - part[0], sums[part[0]] - sums[part[1]]))
-    return chosen[first:last]
+    parts = []  # (length, minus the excess in it, first): the shortest, then the largest excess
+    for first in range(len(chosen)):
+        for last in range(first + 1, len(chosen) + 1):
+            inside = sums[last] - sums[first]
+            if inside >= NEARLY_ALL * sums[-1]:
+                parts.append((last - first, -inside, first))
+    length, _, first = min(parts)
+    return chosen[first : first + length]
 
 
 def _cost(energy: float | np.ndarray, count: float | np.ndarray) -> float | np.ndarray:
@@ -548,15 +579,18 @@ def _smooth_scatter(
     The dispersion is 1 where the variances scatter about the curve as those of Gaussian noise with
     `weight` degrees of freedom.
     """
-    design, root = np.column_stack([np.ones(len(columns)), columns]), np.sqrt(weight)
+    design = np.column_stack([np.ones(len(columns)), columns])
+    root = np.sqrt(weight)
     values = np.zeros(design.shape[1])
     for _ in range(SCORINGS):
-        ratio = np.minimum(variance * np.exp(-np.maximum(design @ values, 0.0)), MAX_VARIANCE_RATIO)
-        values = (
-            values + np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]
-        )
-    logs = np.maximum(design @ values, 0.0)
-    ratio = variance * np.exp(-logs)
-    return float((weight * (logs + ratio)).sum()), max(
-        float((weight * (ratio - 1.0) ** 2).mean()) / 2, 1.0
-    )
+        # d(log likelihood) / d(log variance) = n (ratio - 1) / 2, information n / 2.
+        log_variance = np.maximum(design @ values, 0.0)
+        ratio = np.minimum(variance * np.exp(-log_variance), MAX_VARIANCE_RATIO)
+        step = np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]
+        values = values + step
+    log_variance = np.maximum(design @ values, 0.0)
+    ratio = variance * np.exp(-log_variance)
+    cost = float((weight * (log_variance + ratio)).sum())
+    # The variance of a ratio is 2 / n.
+    dispersion = float((weight * (ratio - 1.0) ** 2).mean()) / 2
+    return cost, max(dispersion, 1.0)

@@ -346,34 +346,39 @@ def _done_without(found: ResidualAnalysis, question: Question) -> bool:
 
     The residual is that of the finding's sensors, and the substitute is in some of them.
     """
+    # Sensors in which a substitute is possible.
     sensors = question.effect.sensors
-    warm = 'temperature' in question.effect.needs
-    asked = [
-        sensor
-        for sensor in sensors
-        if warm or found.rests[sensor].significant or found.proposals[sensor]
-    ]
-    if not asked:
+    thermal = 'temperature' in question.effect.needs
+    with_substitute = []
+    for sensor in sensors:
+        if thermal or found.rests[sensor].significant or found.proposals[sensor]:
+            with_substitute.append(sensor)
+    if not with_substitute:
         return False
+
+    # Fall of the excess by the finding without a substitute.
     others = [other for other in found.named if other is not question]
-    kept = {sensor: found.fits(sensor, found.named) for sensor in sensors}
-    left_out = {sensor: found.fits(sensor, others) for sensor in sensors}
-    alone = {
-        sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors
-    }
-    for stand_in in (
+    with_finding = {sensor: found.fits(sensor, found.named) for sensor in sensors}
+    without_finding = {sensor: found.fits(sensor, others) for sensor in sensors}
+    fall = {}
+    for sensor in sensors:
+        fall[sensor] = without_finding[sensor].fit().excess - with_finding[sensor].fit().excess
+
+    # And with the columns of one in both models: the formulas of the residual with the finding,
+    # those of the residual without it, and offsets in regimes.
+    for substitute in (
         lambda sensor: found.columns(sensor, found.proposals[sensor]),
-        lambda sensor: found.columns(sensor, found.proposed(sensor, left_out[sensor])),
+        lambda sensor: found.columns(sensor, found.proposed(sensor, without_finding[sensor])),
         lambda sensor: _places(found, sensor, others),
     ):
-        beside = dict(alone)
-        for sensor in asked:
-            columns = stand_in(sensor)
+        fall_with_substitute = dict(fall)
+        for sensor in with_substitute:
+            columns = substitute(sensor)
             if columns is not None:
-                beside[sensor] = (
-                    left_out[sensor].fit(columns).excess - kept[sensor].fit(columns).excess
-                )
-        if sum(beside.values()) < NOT_NEEDED * sum(alone.values()):
+                before = without_finding[sensor].fit(columns).excess
+                after = with_finding[sensor].fit(columns).excess
+                fall_with_substitute[sensor] = before - after
+        if sum(fall_with_substitute.values()) < NOT_NEEDED * sum(fall.values()):
             return True
     return False
 
@@ -386,11 +391,12 @@ def _places(
 
     Shape (b, 1, 3), or None.
     """
-    offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset]
-    first = {regime.axis: regime.inside for regime in reversed(offsets)}
+    inside_of_axis = {}  # of the likeliest regime
+    for regime in found.regimes(sensor, chosen):
+        if regime.offset:
+            inside_of_axis.setdefault(regime.axis, regime.inside)
+    if not inside_of_axis:
+        return None
     nowhere = np.zeros(len(found.blocks[sensor].time))
-    return (
-        np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float)
-        if first
-        else None
-    )
+    columns = [inside_of_axis.get(axis, nowhere) for axis in AXES]
+    return np.stack(columns, axis=1)[:, None].astype(float)

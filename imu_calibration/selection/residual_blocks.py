@@ -114,18 +114,20 @@ class BlockWhitener:
     """
 
     def __init__(self, blocks: RestBlocks, select: np.ndarray):
-        variance, time = blocks.variance[select], blocks.time[select]
-        self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
-        covariance = np.diag(variance.mean(axis=1))
+        # One covariance for the three axes, whose white noise differs by a factor:
+        # C_ij = variance_i (i = j) + sum over the bias processes of sd^2 exp(-|t_i - t_j| / T)
+        variance = blocks.variance[select]
+        time = blocks.time[select]
+        mean_variance = variance.mean(axis=1, keepdims=True)
+        self.scale = np.sqrt(np.median(variance / mean_variance, axis=0))
+        covariance = np.diag(mean_variance[:, 0])
         # Intermediate arrays of a part, not of the matrix.
         for rows in np.array_split(np.arange(len(time)), COVARIANCE_PARTS):
             apart = np.abs(time[rows, None] - time[None, :])
             for process in blocks.processes:
                 covariance[rows] += process.sd**2 * np.exp(-apart / process.time)
-        self._factor, self._select = (
-            cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False),
-            select,
-        )
+        self._select = select
+        self._factor = cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)
 
     def __call__(self, rows: np.ndarray, axis: int | None = None) -> np.ndarray:
         """
@@ -158,67 +160,81 @@ def rest_blocks(
         Expected loss from noise.
 
     """
-    # Blocks of the windows in use, and the motion at a few rows of each.
+    # Blocks of the windows in use: their first samples, and the motion at a few rows of each.
     moving_time = sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1)
     length = max(MIN_BLOCK_SECONDS, moving_time / MAX_RESIDUAL_BLOCKS)
-    which = _some(windows, length)
-    windows = [windows[k] for k in which]
-    cuts = [_cut(window, length) for window in windows]
-    motion = JointMotion.concatenate(
-        window.motion.select(cut.rows) for window, cut in zip(windows, cuts)
-    )
+    used = _used_windows(windows, length)
+    windows = [windows[k] for k in used]
+    cuts = []
+    motions = []
+    rows_per_block = []
+    first_of_block = []
+    place_of_block = []
+    n_samples = 0
+    for place, window in enumerate(windows):
+        cut = _cut(window, length)
+        cuts.append(cut)
+        motions.append(window.motion.select(cut.rows))
+        rows_per_block.append(cut.per_block)
+        first_of_block.append(n_samples + cut.starts)
+        place_of_block.append(np.full(len(cut.starts), place))
+        n_samples += len(window)
+    motion = JointMotion.concatenate(motions)
     temperature = _temperatures(windows, cuts)
-    starts = np.cumsum([0, *np.concatenate([cut.per_block for cut in cuts])[:-1]])
-    place = np.repeat(np.arange(len(windows)), [len(cut.starts) for cut in cuts])
-    window = which[place]
-
-    # First sample of each block, and its number of samples.
-    first_samples = np.cumsum([0, *map(len, windows[:-1])])
-    edges = np.concatenate([cut.starts + first for cut, first in zip(cuts, first_samples)])
-    count = np.diff(edges, append=sum(map(len, windows))).astype(float)
+    starts = np.cumsum([0, *np.concatenate(rows_per_block)[:-1]])  # first row of each block
+    edges = np.concatenate(first_of_block)
+    place_of_window = np.concatenate(place_of_block)
+    window_of_block = used[place_of_window]
+    n_samples_of_block = np.diff(edges, append=n_samples).astype(float)
 
     # Columns and residuals.
     references = References(problem.recording.model, table, motion, temperature_c=temperature)
     columns_of = _block_means(problem, table, motion, temperature, starts)
-    left = residuals(windows, table, problem.recording.model, values=problem.recording.values)
+    residual_of = residuals(
+        windows, table, problem.recording.model, values=problem.recording.values
+    )
 
     # Variance within the blocks, without that of errors of the stamps.
     inner = _inner(windows)
     number = np.add.reduceat(inner, edges)
     freedom = number / PER_FREEDOM
-    rough, slope = {}, {}
-    for sensor, residual in left.items():
+    rough = {}
+    slope = {}
+    for sensor, residual in residual_of.items():
         rough[sensor] = _roughness(residual, inner, edges, number=number, least=LEAST_NOISE[sensor])
         slope[sensor] = _slope(residual, windows, edges, sensor)
     jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
-    louder = {sensor: jitter_ratio(rough[sensor], slope[sensor], jitter.sd) for sensor in left}
-    jitter = replace(jitter, ratio=_by_kind(louder, problem.recording.kind[window]))
+    by_jitter = {}
+    for sensor in residual_of:
+        by_jitter[sensor] = jitter_ratio(rough[sensor], slope[sensor], jitter.sd)
+    jitter = replace(jitter, ratio=_by_kind(by_jitter, problem.recording.kind[window_of_block]))
 
-    found = {}
-    for sensor, residual in left.items():
+    blocks = {}
+    for sensor, residual in residual_of.items():
         floor = explained.floor.noise[sensor]
-        busier = _busier(
-            windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which]
+        noise_factor = _white_noise_factor(
+            windows, sensor, floor, problem.recording.kind[used], ~problem.locked[used]
         )
+        variance = floor.low_variance * noise_factor[place_of_window]
         rows = np.concatenate([columns_of[sensor], block_means(residual, edges)], axis=1)
-        found[sensor] = RestBlocks(
+        blocks[sensor] = RestBlocks(
             sensor,
             references.at(sensor),
             starts=starts,
             time=block_means(np.concatenate([each.time for each in windows]), edges),
-            window=window,
-            locked=problem.locked[window],
+            window=window_of_block,
+            locked=problem.locked[window_of_block],
             design=tuple(rows @ join for join in problem.space.join[sensor]),
             index=tuple(problem.space.index[sensor]),
-            variance=floor.low_variance * busier[place] / count[:, None],
+            variance=variance / n_samples_of_block[:, None],
             # An estimated bias process would absorb a step or a warm-up; regimes are searched with
             # the least bias processes.
             processes=natural_processes(floor, problem.recording.period),
             freedom=freedom,
-            rough=rough[sensor] / louder[sensor],
+            rough=rough[sensor] / by_jitter[sensor],
             jitter=jitter,
         )
-    return found
+    return blocks
 
 
 def _temperatures(windows: Sequence[Window], cuts: Sequence['_Cut']) -> np.ndarray | None:
@@ -260,8 +276,10 @@ def _roughness(
 
 def _inner(windows: Sequence[Window]) -> np.ndarray:
     """Return 1 for samples with two neighbours in their window, 0 for its ends, shape (n,)."""
-    inner, ends = np.ones(sum(map(len, windows))), np.cumsum([len(window) for window in windows])
-    inner[ends - 1] = inner[np.append(0, ends[:-1])] = 0.0
+    ends = np.cumsum([len(window) for window in windows])
+    inner = np.ones(ends[-1])
+    inner[ends - 1] = 0.0  # last samples
+    inner[np.append(0, ends[:-1])] = 0.0  # first samples
     return inner
 
 
@@ -284,7 +302,7 @@ def _slope(
     return block_means(squares, edges)
 
 
-def _some(windows: Sequence[Window], length: float) -> np.ndarray:
+def _used_windows(windows: Sequence[Window], length: float) -> np.ndarray:
     """
     Return the numbers of the windows in use: all, or a random part of a long recording, in order.
     """
@@ -302,7 +320,7 @@ def _count_blocks(window: Window, length: float) -> int:
     return max(1, round((window.time[-1] - window.time[0]) / length))
 
 
-def _busier(
+def _white_noise_factor(
     windows: Sequence[Window], sensor: str, floor: NoiseModel, kinds: np.ndarray, judged: np.ndarray
 ) -> np.ndarray:
     """
@@ -313,24 +331,24 @@ def _busier(
     """
     # Variance of the white noise in each window; unknown in short ones.
     place = SENSORS.index(sensor)
-    own = np.full((len(windows), 3), np.nan)
+    variance = np.full((len(windows), 3), np.nan)
     for number, window in enumerate(windows):
         if len(window) > SHORT_WINDOW:
-            own[number] = window.noise_sd[place] ** 2
+            variance[number] = window.noise_sd[place] ** 2
 
     # That at rest.
     rests = judged & (kinds == 'static')
-    still = floor.white_variance
+    at_rest = floor.white_variance
     if rests.any():
-        still = np.nanmedian(own[rests], axis=0)
-    still = np.maximum(still, LEAST_NOISE[sensor] ** 2)
+        at_rest = np.nanmedian(variance[rests], axis=0)
+    at_rest = np.maximum(at_rest, LEAST_NOISE[sensor] ** 2)
 
-    found = np.ones((len(windows), 3))
+    factor = np.ones((len(windows), 3))
     for kind in np.unique(kinds[kinds != 'static']):
-        most = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
-        usual = np.nanmedian(own[judged & (kinds == kind)], axis=0)
-        found[kinds == kind] = np.clip(usual / still, 1.0, most)
-    return found
+        misfit = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
+        of_kind = np.nanmedian(variance[judged & (kinds == kind)], axis=0)
+        factor[kinds == kind] = np.clip(of_kind / at_rest, 1.0, misfit)
+    return factor
 
 
 def residuals(
@@ -341,13 +359,13 @@ def residuals(
 
     Rows within blocks would be too coarse.
     """
-    # Columns need much memory.
+    # Some windows at a time: columns need much memory.
     predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
-    found = {}
+    residual_of = {}
     for sensor in sensors_of(windows):
         readings = np.concatenate([measured(window, sensor) for window in windows])
-        found[sensor] = readings - np.concatenate([part[sensor] for part in predicted])
-    return found
+        residual_of[sensor] = readings - np.concatenate([part[sensor] for part in predicted])
+    return residual_of
 
 
 def _block_means(
@@ -424,9 +442,9 @@ ABOVE_NOISE = 3.0
 
 def largest_axes(squares: np.ndarray, least: float = LEAST_OF_AXIS) -> tuple[str, ...]:
     """
-    Return the axes whose squares.
+    Return the axes whose squares exceed the share `least` of the largest, the largest first.
 
-    Shape (3,), exceed the share `least` of the largest, the largest first.
+    The squares have the shape (3,).
     """
     return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > least * squares.max())
 
@@ -461,10 +479,16 @@ class BlockFits:
         prior_sd: np.ndarray,
         prior_mean: np.ndarray,
     ):
-        self.blocks, self.used, self._prior = blocks, frozenset(used), (prior_sd, prior_mean)
-        self._design = []  # of each part of the recording, one array for each axis
-        for white in blocks.white:
-            self._design.append([white(part, axis) for axis, part in enumerate(blocks.design)])
+        self.blocks = blocks
+        self.used = frozenset(used)
+        self._prior_sd = prior_sd
+        self._prior_mean = prior_mean
+        # Independent rows [columns | residual]: of the blocks that choose and of the locked ones,
+        # each a list over the axes.
+        self._design = []
+        for whiten in blocks.white:
+            self._design.append([whiten(part, axis) for axis, part in enumerate(blocks.design)])
+        # Per axis the columns of the parameters in use.
         self._at = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
 
     def fit(
@@ -487,22 +511,24 @@ class BlockFits:
 
         """
         count = 0 if columns is None else columns.shape[1]
-        amplitudes, sds, rests = np.zeros((count, 3)), np.zeros((count, 3)), []
+        amplitudes = np.zeros((count, 3))
+        sds = np.zeros((count, 3))
+        locked_residuals = []
         for axis in range(3):
-            at = np.union1d(
-                self._at[axis], np.flatnonzero(np.isin(self.blocks.index[axis], list(more)))
-            ).astype(int)
-            values, covariance, left = self._solved(axis, at, columns, half)
-            misfit = max(float(left @ left) / max(len(left) - len(values), 1), 1.0)
-            amplitudes[:, axis], sds[:, axis] = (
-                values[len(at) :],
-                np.sqrt(misfit * np.diag(covariance)[len(at) :]),
-            )
+            # Fit to the blocks that choose.
+            joining = np.flatnonzero(np.isin(self.blocks.index[axis], list(more)))
+            at = np.union1d(self._at[axis], joining).astype(int)
+            values, covariance, residual = self._solved(axis, at, columns, half)
+            n_free = max(len(residual) - len(values), 1)
+            misfit = max(float(residual @ residual) / n_free, 1.0)
+            amplitudes[:, axis] = values[len(at) :]
+            sds[:, axis] = np.sqrt(misfit * np.diag(covariance)[len(at) :])
+
+            # Prediction of the locked blocks.
             locked = self._rows(1, axis, at, columns)
-            rests.append(locked[:, -1] - locked[:, :-1] @ values)
-        return BlockFit(
-            amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked]
-        )
+            locked_residuals.append(locked[:, -1] - locked[:, :-1] @ values)
+        locked_window = self.blocks.window[self.blocks.locked]
+        return BlockFit(amplitudes, sds, np.stack(locked_residuals, axis=1), locked_window)
 
     def outside_catalogue(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -516,19 +542,22 @@ class BlockFits:
         columns : array, shape (b, k, 3)
 
         """
-        left_columns = []
-        left_residual = []
+        outside_columns = []
+        outside_residual = []
         for axis in range(3):
+            # Orthonormal basis of the catalogue's columns; x - U U^T x is orthogonal to them.
             design = self._design[0][axis]
-            scale = np.linalg.norm(design[:, :-1], axis=0)
-            basis, sizes = svd(design[:, :-1] / np.where(scale > 0, scale, 1), full_matrices=False)[
-                :2
-            ]
-            basis = basis[:, sizes > IMITATED * sizes.max()]
+            catalogue = design[:, :-1]
+            residual = design[:, -1]
+            norm = np.linalg.norm(catalogue, axis=0)
+            scaled = catalogue / np.where(norm > 0, norm, 1)
+            basis, singular_values, _ = svd(scaled, full_matrices=False)
+            basis = basis[:, singular_values > IMITATED * singular_values.max()]
+
             rows = self.blocks.white[0](columns[:, :, axis], axis)
-            left_columns.append(rows - basis @ (basis.T @ rows))
-            left_residual.append(design[:, -1] - basis @ (basis.T @ design[:, -1]))
-        return np.concatenate(left_columns), np.concatenate(left_residual)
+            outside_columns.append(rows - basis @ (basis.T @ rows))
+            outside_residual.append(residual - basis @ (basis.T @ residual))
+        return np.concatenate(outside_columns), np.concatenate(outside_residual)
 
     def axes(self) -> tuple[str, ...]:
         """
@@ -536,14 +565,18 @@ class BlockFits:
 
         They are in order of unweighted squares, the largest first.
         """
+        choosing = ~self.blocks.locked
         excess = self._excess()
-        noise = ABOVE_NOISE * np.sqrt(2.0 * (~self.blocks.locked).sum())
-        squares = excess * np.median(self.blocks.variance[~self.blocks.locked], axis=0)
-        return tuple(
-            axis
-            for axis in largest_axes(squares)
-            if excess[AXES.index(axis)] > min(noise, 0.99 * excess.max())
-        )
+        # The sum of n squares of unit noise has the variance 2 n. The axis with the largest excess
+        # is named in any case.
+        noise = ABOVE_NOISE * np.sqrt(2.0 * choosing.sum())
+        least_excess = min(noise, 0.99 * excess.max())
+        squares = excess * np.median(self.blocks.variance[choosing], axis=0)
+        named = []
+        for axis in largest_axes(squares):
+            if excess[AXES.index(axis)] > least_excess:
+                named.append(axis)
+        return tuple(named)
 
     @property
     def sigma(self) -> float:
@@ -560,8 +593,8 @@ class BlockFits:
         """
         excess = np.zeros(3)
         for axis in range(3):
-            left = self._solved(axis, self._at[axis])[2]
-            excess[axis] = max(float(left @ left) - len(left), 0.0)
+            _, _, residual = self._solved(axis, self._at[axis])
+            excess[axis] = max(float(residual @ residual) - len(residual), 0.0)
         return excess
 
     def _solved(
@@ -576,37 +609,58 @@ class BlockFits:
         if half is not None:
             time = self.blocks.time[~self.blocks.locked]
             rows = rows[(time > np.median(time)) == half]
-        scale = np.sqrt(np.maximum((rows[:, len(at) : -1] ** 2).sum(axis=0), 1e-60))
-        own = self.blocks.index[axis][at]
-        sd, mean = (
-            np.append(self._prior[0][own], AMPLITUDE_PRIOR_SD / scale),
-            np.append(self._prior[1][own], np.zeros_like(scale)),
-        )
+        # Parameters have the priors of the catalogue, amplitudes nearly none.
+        parameters = self.blocks.index[axis][at]
+        size = np.sqrt(np.maximum((rows[:, len(at) : -1] ** 2).sum(axis=0), 1e-60))
+        sd = np.append(self._prior_sd[parameters], AMPLITUDE_PRIOR_SD / size)
+        mean = np.append(self._prior_mean[parameters], np.zeros_like(size))
         values, covariance = solve_normal(rows.T @ rows, np.arange(len(sd)), sd, prior_mean=mean)
         return values, covariance, rows[:, -1] - rows[:, :-1] @ values
 
     def _rows(self, part: int, axis: int, at: np.ndarray, columns: np.ndarray | None) -> np.ndarray:
+        """
+        Return independent rows ``[columns at | further columns | residual]`` of an axis.
+
+        Of the blocks that choose (`part` 0), or of the locked ones (1).
+        """
         design = self._design[part][axis]
-        further = [] if columns is None else [self.blocks.white[part](columns[:, :, axis], axis)]
-        return np.concatenate([design[:, at], *further, design[:, -1:]], axis=1)
+        parts = [design[:, at]]
+        if columns is not None:
+            parts.append(self.blocks.white[part](columns[:, :, axis], axis))
+        return np.concatenate([*parts, design[:, -1:]], axis=1)
 
 
 def share_removed(before: BlockFit, after: BlockFit) -> float:
     """Return the share of the locked blocks' excess that a fit removes."""
-    return 1.0 - max(after.excess, 0.0) / before.excess if before.excess > 0 else 0.0
+    if before.excess <= 0:
+        return 0.0
+    return 1.0 - max(after.excess, 0.0) / before.excess
 
 
 def share_interval(
     before: BlockFit, after: BlockFit, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Return the 95 % interval of `share_removed`, by resampling locked windows."""
-    windows = np.unique(before.window)
-    sums = np.empty((2, len(windows)))  # excess of each window before and after
-    for k, window in enumerate(windows):
-        inside = before.window == window
-        sums[0, k] = (before.rest[inside] ** 2 - 1.0).sum()
-        sums[1, k] = (after.rest[inside] ** 2 - 1.0).sum()
-    drawn = sums[:, rng.integers(len(windows), size=(SHARE_RESAMPLES, len(windows)))].sum(axis=2)
-    shares = 1.0 - np.maximum(drawn[1], 0.0) / np.maximum(drawn[0], 1e-300)
+    """
+    Return the 95 % interval of `share_removed`, by the bootstrap over locked windows.
+
+    Each sample draws as many windows as there are, with replacement::
+
+        share = 1 - max(excess after, 0) / excess before
+
+    """
+    # Excess of each window: squares of the whitened residual, less 1 each from noise.
+    excess_before = []
+    excess_after = []
+    for window in np.unique(before.window):
+        in_window = before.window == window
+        excess_before.append((before.rest[in_window] ** 2 - 1.0).sum())
+        excess_after.append((after.rest[in_window] ** 2 - 1.0).sum())
+
+    excess = np.array([excess_before, excess_after])
+
+    n_windows = excess.shape[1]
+    drawn = rng.integers(n_windows, size=(SHARE_RESAMPLES, n_windows))
+    before_of_draw, after_of_draw = excess[:, drawn].sum(axis=2)
+    shares = 1.0 - np.maximum(after_of_draw, 0.0) / np.maximum(before_of_draw, 1e-300)
     low, high = np.quantile(shares, (0.025, 0.975))
     return float(low), float(high)

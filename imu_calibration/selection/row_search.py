@@ -119,12 +119,15 @@ class RowProblem:
 
         The improvement is by cross-validation of the fit.
         """
-        squares = []
-        for choice in (before, after):
-            rests = self.evidence.heldout_residuals(self.search.indices(choice))
-            squares.append([np.sum(rest**2) for rest in rests])
-        own = [k for k, block in enumerate(self.blocks) if block.sensor == sensor]
-        return self.blocks[min(own, key=lambda k: squares[1][k] / max(squares[0][k], 1e-300))]
+        residuals_before = self.evidence.heldout_residuals(self.search.indices(before))
+        residuals_after = self.evidence.heldout_residuals(self.search.indices(after))
+        blocks = []
+        ratios = []
+        for block, rest_before, rest_after in zip(self.blocks, residuals_before, residuals_after):
+            if block.sensor == sensor:
+                blocks.append(block)
+                ratios.append(np.sum(rest_after**2) / max(np.sum(rest_before**2), 1e-300))
+        return blocks[ratios.index(min(ratios))]
 
 
 @dataclass(frozen=True, eq=False)

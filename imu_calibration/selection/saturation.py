@@ -247,28 +247,25 @@ def without_clipping(
     One fast swing may be all that reaches a limit: a window in which outputs pile up is not locked,
     where they do so at a limit.
     """
-    locked, piled = locked_windows(np.array([window.kind for window in windows])), _piled(windows)
+    locked = locked_windows(np.array([window.kind for window in windows]))
+    piled = _piled(windows)
     limits, noise_sd, values = _limits(windows_at(windows, piled | ~locked), table, model)
     if not limits or values is None:
         return windows, locked, []
     locked &= ~piled
-    levels, kept = {limit.sensor: limit.level for limit in limits}, []
-    for rows in (~locked, locked):
-        part = windows_at(windows, rows)
-        kept.append(
-            without_clipped(
-                part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd
-            )
-        )
+
+    # Windows are cut at their clipped samples: locked and other ones separately, then in the order
+    # of time again.
+    levels = {limit.sensor: limit.level for limit in limits}
     entries = []
-    for number, part in enumerate(kept):
-        entries += [(window.time[0], number, window) for window in part]
-    in_order = sorted(entries, key=lambda entry: entry[:2])
-    return (
-        [window for *_, window in in_order],
-        np.array([number == 1 for _, number, _ in in_order]),
-        limits,
-    )
+    for is_locked in (False, True):
+        part = windows_at(windows, locked == is_locked)
+        predicted = predictions(part, table, model, values=values)
+        for window in without_clipped(part, predicted, levels, noise_sd=noise_sd):
+            entries.append((window.time[0], is_locked, window))
+    entries.sort(key=lambda entry: entry[:2])
+    kept = [window for _, _, window in entries]
+    return kept, np.array([is_locked for _, is_locked, _ in entries]), limits
 
 
 def _piled(windows: Sequence[Window]) -> np.ndarray:
@@ -289,26 +286,29 @@ def _limits(
 
     The parameters are from a simple fit without corrupted samples.
     """
-    nothing = [], {}, None
     suspects = [sensor for sensor in sensors_of(windows) if may_be_clipped(windows, sensor)]
     if not suspects:
-        return nothing
-    limits = {}
+        return [], {}, None
+
+    # Two fits without the samples near the largest reading: the first one still has clipped ones.
+    largest_readings = {}
     for sensor in suspects:
-        largest = [np.abs(measured(window, sensor)).max() for window in windows]
-        limits[sensor] = float(max(largest))
+        largest = max(np.abs(measured(window, sensor)).max() for window in windows)
+        largest_readings[sensor] = float(largest)
     noise_sd = {sensor: sample_sd_at_rest(windows, sensor) for sensor in sensors_of(windows)}
     kept = windows
     for _ in range(2):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
-        kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
+        kept = without_clipped(windows, predicted, largest_readings, noise_sd=noise_sd)
+        # An output that is always at or near its limit does not determine it.
         if len(kept) < MIN_FOLD_WINDOWS:
-            return nothing  # output that is always at or near its limit does not determine it
+            return [], {}, None
+
     values = simple_fit(kept, table, model)
     predicted = predictions(windows, table, model, values=values)
-    found = []
+    limits = []
     for sensor in suspects:
         limit = find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor)
         if limit:
-            found.append(limit)
-    return found, noise_sd, values
+            limits.append(limit)
+    return limits, noise_sd, values

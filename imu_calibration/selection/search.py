@@ -6,7 +6,6 @@ With earlier choices reconsidered after each step.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import AbstractSet, Any, ClassVar
 
 import numpy as np
@@ -128,8 +127,11 @@ class Search:
         )
 
     def indices(self, chosen: Sequence[Question]) -> tuple[int, ...]:
-        """Return the parameters of the baseline and of the chosen effects."""
-        return (*self.baseline, *chain.from_iterable(q.parameters for q in chosen))
+        """Return the indices of the parameters of the baseline, then of the chosen effects."""
+        indices = list(self.baseline)
+        for question in chosen:
+            indices += question.parameters
+        return tuple(indices)
 
     def others(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the questions about effects that are not chosen, and not resolved."""
@@ -142,28 +144,42 @@ class Search:
 
         Above `most` without the penalty for implausible sizes.
         """
-        cost = 0.5 * self.evidence.heldout(self.indices(chosen)) + PENALTY * sum(
-            q.penalty for q in chosen
-        )
-        return (
-            cost
-            if cost > most
-            else cost + IMPLAUSIBLE * sum(self.implausible(chosen, q) for q in chosen)
-        )
+        n_charged = sum(q.penalty for q in chosen)
+        cost = 0.5 * self.evidence.heldout(self.indices(chosen)) + PENALTY * n_charged
+        if cost > most:
+            return cost
+        n_implausible = sum(self.implausible(chosen, q) for q in chosen)
+        return cost + IMPLAUSIBLE * n_implausible
 
     def score(self, chosen: Sequence[Question], question: Question) -> Score:
-        """Return the Score of one more effect."""
-        beside = [*chosen, question]
-        smaller, larger = self.indices(chosen), self.indices(beside)
-        gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
-        p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
-        asked = p_value < FAMILY_WISE and gain > 0
+        """
+        Return the Score of one more effect.
+
+        With the squares chi^2 of the held-out residuals (twice the negative log likelihood)::
+
+            gain = (chi^2 without - chi^2 with) / 2
+
+        The p-value is that of the chi-square test times the number of tests (Bonferroni).
+        """
+        joined = [*chosen, question]
+        without_indices = self.indices(chosen)
+        with_indices = self.indices(joined)
+        heldout_without = self.evidence.heldout(without_indices)
+        heldout_with = self.evidence.heldout(with_indices)
+        gain = 0.5 * (heldout_without - heldout_with)
+        p_value = self.evidence.p_value(without_indices, with_indices) * len(self.questions)
+        p_value = min(1.0, p_value)
+
+        # Estimates only of effects with evidence.
+        has_evidence = p_value < FAMILY_WISE and gain > 0
+        if not has_evidence:
+            return Score(question, gain, p_value, allowed=False)
         return Score(
             question,
             gain,
             p_value,
-            asked and self.allowed(beside, question),
-            asked and self.implausible(beside, question),
+            self.allowed(joined, question),
+            self.implausible(joined, question),
         )
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
@@ -178,11 +194,11 @@ class Search:
             return False
         if np.max(np.abs(value)) < least_angle(question.effect, self.encoder_step):
             return False
+        # Three standard deviations above the known size.
         if question.effect.known_size and np.any(np.abs(value) - 3 * sd >= question.effect.largest):
             return False
-        return (self.any_size or not self.implausible(chosen, question)) and self.shows_alike(
-            chosen, question
-        )
+        size_is_allowed = self.any_size or not self.implausible(chosen, question)
+        return size_is_allowed and self.shows_alike(chosen, question)
 
     def early(self, chosen: Sequence[Question]) -> list[Question]:
         """
@@ -190,12 +206,17 @@ class Search:
 
         An early clock with a late sensor.
         """
-        scores = [
-            self.score(chosen, q)
-            for q in self.others(chosen)
-            if q.effect.nonnegative and self.estimate([*chosen, q], q)[0][0] < 0
-        ]
-        return [score.question for score in scores if replace(score, allowed=True).significant]
+        early = []
+        for question in self.others(chosen):
+            if not question.effect.nonnegative:
+                continue
+            value, _ = self.estimate([*chosen, question], question)
+            if not value[0] < 0:
+                continue
+            score = self.score(chosen, question)
+            if replace(score, allowed=True).significant:
+                early.append(question)
+        return early
 
     def implausible(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -213,8 +234,10 @@ class Search:
 
         Zero for those of other effects, shape (q,).
         """
-        used, values = self.indices(chosen), np.zeros(len(self.evidence.total) - 1)
-        values[list(used)] = self.evidence.fit(used)[0]
+        used = self.indices(chosen)
+        fitted, _ = self.evidence.fit(used)
+        values = np.zeros(len(self.evidence.total) - 1)  # the last row is the residual
+        values[list(used)] = fitted
         return values
 
     def estimate(
@@ -230,14 +253,27 @@ class Search:
         self, chosen: Sequence[Question], question: Question, names: Sequence[str]
     ) -> dict[str, float]:
         """
-        Return parameter -> its change when an effect joins the baseline and some choices.
+        Return parameter -> its change when an effect joins the baseline and the other choices.
 
-        The parameters are of the baseline and of the other choices among `names`.
+        Parameters
+        ----------
+        chosen : sequence of Question
+        question : Question
+            The effect that joins, last; it may be one of `chosen`.
+        names : sequence of str
+            Names of the first parameters of the space: those of the baseline and of the effects.
+            A warm-up at a time constant of the bank has none.
+
         """
         others = [q for q in chosen if q is not question]
-        smaller, larger = self.indices(others), self.indices([*others, question])
-        moved = self.evidence.fit(larger)[0][: len(smaller)] - self.evidence.fit(smaller)[0]
-        return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
+        without_indices = self.indices(others)
+        without, _ = self.evidence.fit(without_indices)
+        joint, _ = self.evidence.fit(self.indices([*others, question]))
+        moved = {}
+        for index, change in zip(without_indices, joint[: len(without)] - without):
+            if index < len(names):
+                moved[names[index]] = float(change)
+        return moved
 
     def shows_alike(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -247,13 +283,17 @@ class Search:
         """
         if question.sensor in SENSORS or len(question.effect.acts_on) < 2:
             return True
-        rest = [q for q in chosen if q is not question]
-        before, after = (self.evidence.heldout_parts(self.indices(some)) for some in (rest, chosen))
-        return all(
-            (after[sensor] - before[sensor]).sum() < 2 * MIN_GAIN_NATS
-            for sensor in after
-            if sensor in question.effect.acts_on
-        )
+        others = [q for q in chosen if q is not question]
+        before = self.evidence.heldout_parts(self.indices(others))
+        after = self.evidence.heldout_parts(self.indices(chosen))
+        for sensor in after:
+            if sensor not in question.effect.acts_on:
+                continue
+            # Squares of residuals are twice the nats.
+            loss = (after[sensor] - before[sensor]).sum()
+            if not loss < 2 * MIN_GAIN_NATS:
+                return False
+        return True
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
         """
@@ -263,14 +303,18 @@ class Search:
         """
         chosen = self.reconsidered(list(start)) if start else []
         for _ in range(2 * MOST_FINDINGS):
+            # Forward: the significant effect with the largest net gain joins.
+            significant = []
             others = self.others(chosen)
-            scores = [
-                self.score(chosen, q) for q in reported('testing effects', others, len(others))
-            ]
-            good = [s for s in scores if s.significant]
-            if not good or len(chosen) >= MOST_FINDINGS:
+            for question in reported('testing effects', others, len(others)):
+                score = self.score(chosen, question)
+                if score.significant:
+                    significant.append(score)
+            if not significant or len(chosen) >= MOST_FINDINGS:
                 break
-            best = max(good, key=lambda s: s.net)
+            best = max(significant, key=lambda score: score.net)
+
+            # Backward: without what it makes unnecessary. The same choice again is the end.
             before = [q.label for q in chosen]
             chosen = self.reconsidered([*chosen, best.question])
             if [q.label for q in chosen] == before:
@@ -295,31 +339,35 @@ class Search:
         return chosen
 
     def _dropped(self, chosen: Sequence[Question]) -> list[Question] | None:
+        """Return the choice without its first insignificant effect; None if all are significant."""
+        # Effects with many parameters first.
         for question in sorted(chosen, key=lambda q: -q.penalty):
-            rest = [q for q in chosen if q is not question]
-            if not self.score(rest, question).significant:
-                return rest
+            others = [q for q in chosen if q is not question]
+            if not self.score(others, question).significant:
+                return others
         return None
 
     def _replaced(self, chosen: Sequence[Question]) -> list[Question] | None:
+        """Return the choice with the best exchange of one effect; None if none lowers the cost."""
         best: list[Question] | None = None
         cost = self.cost(chosen) - MIN_REPLACEMENT_NATS
         for place, question in enumerate(chosen):
             # It could not be added again, and an effect that cancels it may be in the model.
             if question.name in self.resolved:
                 continue
-            rest = [*chosen[:place], *chosen[place + 1 :]]
-            for other in self.others(rest):
+            remaining = [*chosen[:place], *chosen[place + 1 :]]
+            for other in self.others(remaining):
                 if other is question:
                     continue
                 trial = [*chosen[:place], other, *chosen[place + 1 :]]
-                value = self.cost(trial, cost)
-                if (
-                    value < cost
-                    and all(self.allowed(trial, each) for each in trial)
-                    and self.score(rest, other).significant
-                ):
-                    best, cost = trial, value
+                trial_cost = self.cost(trial, cost)
+                if not trial_cost < cost:
+                    continue
+                if not all(self.allowed(trial, each) for each in trial):
+                    continue
+                if self.score(remaining, other).significant:
+                    best = trial
+                    cost = trial_cost
         return best
 
     def drop_insignificant(self, chosen: Sequence[Question]) -> Sequence[Question]:
@@ -340,25 +388,30 @@ class Search:
 
         They would do as well in its place, best first, at most `most`.
         """
-        place, cost = chosen.index(question), self.cost(chosen)
-        found, alike = {}, TIE
+        place = chosen.index(question)
+        cost = self.cost(chosen)
+
+        # Two effects that are smooth in time are separable less well the more they explain.
+        smooth_tie = TIE
         if question.effect.smooth:
-            alike = max(
-                TIE,
-                COLLINEAR * (self.cost([each for each in chosen if each is not question]) - cost),
-            )
+            others = [each for each in chosen if each is not question]
+            gain = self.cost(others) - cost
+            smooth_tie = max(TIE, COLLINEAR * gain)
+
+        rivals: dict[str, tuple[Question, float]] = {}
         for other in self.others(chosen):
-            trial = [*chosen[:place], other, *chosen[place + 1 :]]
-            tie = alike if other.effect.smooth else TIE
-            difference = self.cost(trial, cost + tie) - cost
+            # A special case with an equal fit is preferred: the general effect is not its rival.
             if question.effect.contained_in == other.name:
-                # A special case with an equal fit is preferred, and the general effect is not its
-                # rival
                 continue
-            if difference < tie and self.allowed(trial, other):
-                if other.name not in found or difference < found[other.name][1]:
-                    found[other.name] = (other, difference)
-        return sorted(found.values(), key=lambda pair: pair[1])[:most]
+            trial = [*chosen[:place], other, *chosen[place + 1 :]]
+            tie = smooth_tie if other.effect.smooth else TIE
+            difference = self.cost(trial, cost + tie) - cost
+            if not difference < tie or not self.allowed(trial, other):
+                continue
+            # A warm-up is tested at several time constants; the best one counts.
+            if other.name not in rivals or difference < rivals[other.name][1]:
+                rivals[other.name] = (other, difference)
+        return sorted(rivals.values(), key=lambda pair: pair[1])[:most]
 
 
 def least_angle(effect: Effect, encoder_step: float) -> float:
@@ -370,8 +423,10 @@ def least_angle(effect: Effect, encoder_step: float) -> float:
     Steps repeat each time the table returns to a pose: they do not average out, and resemble errors
     of the table.
     """
-    angles: dict[str | tuple, float] = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}
-    return 0.5 * encoder_step / angles[effect.unit] if effect.unit in angles else 0.0
+    angle_of_unit: dict[str | tuple, float] = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}
+    if effect.unit not in angle_of_unit:
+        return 0.0
+    return 0.5 * encoder_step / angle_of_unit[effect.unit]
 
 
 @dataclass(frozen=True)
@@ -468,5 +523,5 @@ class SelectedEffects:
     @property
     def adopted(self) -> list[Question]:
         """Findings that belong into the model."""
-        strange = self.implausible
-        return [question for question in self.named if question not in strange]
+        implausible = self.implausible
+        return [question for question in self.named if question not in implausible]

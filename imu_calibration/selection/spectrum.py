@@ -80,51 +80,60 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     joint : int
 
     """
+    # Projections of p pieces on k orders, in m columns.
     order = np.arange(LOWEST_ORDER, HIGHEST_ORDER + 1)
-    pieces = [
-        (number, *_projected(rest, time, angle, order))
-        for number, rest, time, angle in _pieces(windows, rests, joint)
-    ]
-    if not pieces:
+    windows_of_pieces = []
+    sums_of_pieces = []
+    weights_of_pieces = []
+    for window, rest, time, angle in _pieces(windows, rests, joint):
+        sums_of_piece, weight_of_piece = _projected(rest, time, angle, order)
+        windows_of_pieces.append(window)
+        sums_of_pieces.append(sums_of_piece)
+        weights_of_pieces.append(weight_of_piece)
+    if not windows_of_pieces:
         return None
-    number, sums, weight = (np.stack(part) for part in zip(*pieces))  # (p,), (p, k, m), (p, k)
-    seen = weight > 0
-    enough = seen.sum(axis=0) >= MIN_SPECTRUM_PIECES
+    sums = np.stack(sums_of_pieces)  # (p, k, m)
+    weight = np.stack(weights_of_pieces)  # (p, k)
+
+    # Orders that enough pieces show.
+    count = (weight > 0).sum(axis=0)
+    enough = count >= MIN_SPECTRUM_PIECES
     if not enough.any():
         return None
-    order, sums, weight, count = (
-        order[enough],
-        sums[:, enough],
-        weight[:, enough],
-        seen.sum(axis=0)[enough],
-    )
+    order = order[enough]
+    sums = sums[:, enough]
+    weight = weight[:, enough]
+    count = count[enough]
+
+    # T^2 = n mean' S^-1 mean, with mean and covariance S of real and imaginary part over n pieces.
     scaled = sums / np.sqrt(np.where(weight > 0, weight, np.inf))[..., None]
     parts = np.stack([scaled.real, scaled.imag], axis=-1)  # (p, k, m, 2)
     mean = parts.sum(axis=0) / count[:, None, None]
-    about = np.einsum('pkxi,pkxj->kxij', parts, parts) - count[:, None, None, None] * np.einsum(
-        'kxi,kxj->kxij', mean, mean
-    )
-    scatter = about / (count - 1)[:, None, None, None]
-    spread = np.trace(scatter, axis1=-2, axis2=-1)
+    squares = np.einsum('pkxi,pkxj->kxij', parts, parts)
+    squares_of_mean = count[:, None, None, None] * np.einsum('kxi,kxj->kxij', mean, mean)
+    covariance = (squares - squares_of_mean) / (count - 1)[:, None, None, None]
     # Repeated data have no scatter.
-    known = (spread > ROUNDING_SHARE * (mean**2).sum(axis=-1)) & (
-        np.linalg.det(scatter) > ROUNDING_SHARE * spread**2
-    )
-    scatter[~known], mean[~known] = np.eye(2), 0.0
-    t_squared = count[:, None] * np.einsum(
-        'kxi,kxi->kx', mean, np.linalg.solve(scatter, mean[..., None])[..., 0]
-    )
+    trace = np.trace(covariance, axis1=-2, axis2=-1)
+    known = trace > ROUNDING_SHARE * (mean**2).sum(axis=-1)
+    known &= np.linalg.det(covariance) > ROUNDING_SHARE * trace**2
+    covariance[~known] = np.eye(2)
+    mean[~known] = 0.0
+    whitened = np.linalg.solve(covariance, mean[..., None])[..., 0]
+    t_squared = count[:, None] * np.einsum('kxi,kxi->kx', mean, whitened)
+
+    # T^2 (n - 2) / (2 (n - 1)) follows F(2, n - 2).
     degrees = (count - 2)[:, None]
     p_value = f_sf(t_squared * degrees / (2 * (count - 1)[:, None]), 2, degrees)
+
+    # The coherent wave, and its power over that of the other orders.
     wave = sums.sum(axis=0) / weight.sum(axis=0)[:, None]
     power = np.abs(wave) ** 2
-    usual = np.maximum(np.median(power, axis=0), np.finfo(float).tiny)
-    return Orders(
-        order, 2 * np.abs(wave), p_value, power / usual, _alike(number, sums, weight, wave)
-    )
+    median_power = np.maximum(np.median(power, axis=0), np.finfo(float).tiny)
+    share = _share_in_phase(np.array(windows_of_pieces), sums, weight, wave)
+    return Orders(order, 2 * np.abs(wave), p_value, power / median_power, share)
 
 
-def _alike(
+def _share_in_phase(
     number: np.ndarray, sums: np.ndarray, weight: np.ndarray, wave: np.ndarray
 ) -> np.ndarray:
     """
@@ -173,19 +182,22 @@ def _projected(
 
     Zero where a piece does not show an order.
     """
+    # Enough cycles in the piece, and enough samples per cycle.
     turned = np.ptp(angle)
-    shown = (turned * order > 2 * np.pi * CYCLES_OF_ORDER) & (
-        2 * np.pi > SHORTEST_CYCLE * order * np.abs(np.diff(angle)).max()
-    )
-    sums, weight = np.zeros((len(order), rest.shape[1]), complex), np.zeros(len(order))
+    largest_step = np.abs(np.diff(angle)).max()
+    shown = turned * order > 2 * np.pi * CYCLES_OF_ORDER
+    shown &= 2 * np.pi > SHORTEST_CYCLE * order * largest_step
+    sums = np.zeros((len(order), rest.shape[1]), complex)
+    weight = np.zeros(len(order))
     if shown.any():
-        middle = (angle - angle.mean()) / turned
-        smooth = np.linalg.qr(
-            np.column_stack([np.ones(len(time)), time - time.mean(), middle, middle**2])
-        )[0]
+        # Waves without terms linear in time and quadratic in the angle.
+        centred = (angle - angle.mean()) / turned
+        smooth_terms = [np.ones(len(time)), time - time.mean(), centred, centred**2]
+        smooth, _ = np.linalg.qr(np.column_stack(smooth_terms))
         waves = np.exp(-1j * np.outer(angle, order[shown]))
         waves -= smooth @ (smooth.T @ waves)
-        sums[shown], weight[shown] = waves.T @ rest, (np.abs(waves) ** 2).sum(axis=0)
+        sums[shown] = waves.T @ rest
+        weight[shown] = (np.abs(waves) ** 2).sum(axis=0)
     return sums, weight
 
 
@@ -298,38 +310,41 @@ def find_tones(
         for effect, size in zip(formula.effects, formula.values):
             known = replace(model, catalogue=model.catalogue.with_effects(effect))
             model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
-    left = residuals(found.used, table, model, values=values)
-    edges, tests = (
-        np.cumsum([len(window) for window in found.used])[:-1],
-        1 + len(table.joint_names),
-    )
-    parts = {sensor: np.split(rest, edges) for sensor, rest in left.items()}
+    edges = np.cumsum([len(window) for window in found.used])[:-1]
+    residual_of = {}  # sensor -> residual of each window
+    for sensor, residual in residuals(found.used, table, model, values=values).items():
+        residual_of[sensor] = np.split(residual, edges)
+    tests = 1 + len(table.joint_names)
+
+    # Fixed frequencies. They are removed, because sampled at equal angles a fixed frequency would
+    # be a multiple of some speeds.
     tones = {}
-    for sensor, own in parts.items():
-        tones[sensor] = _significant(
-            of_stretches(sensor, _stretches(found.used, own, None), None), tests
-        )
-        for tone in tones[
-            sensor
-        ].values():  # sampled at equal angles, a fixed frequency would be a multiple of some speeds
-            for window, part in zip(found.used, own):
-                part[:, AXES.index(tone.axis)] = _without(
-                    tone.frequency, window.time, part[:, AXES.index(tone.axis)]
-                )
-    both = [np.concatenate(pair, axis=1) for pair in zip(*parts.values())]
-    orders = [orders_of(found.used, both, joint) for joint in range(len(table.joint_names))]
-    for place, (sensor, own) in enumerate(parts.items()):
-        turning: list[Tone] = []
+    for sensor, of_windows in residual_of.items():
+        stretches = _stretches(found.used, of_windows, None)
+        tones[sensor] = _significant(of_stretches(sensor, stretches, None), tests)
+        for tone in tones[sensor].values():
+            axis = AXES.index(tone.axis)
+            for window, residual in zip(found.used, of_windows):
+                residual[:, axis] = _without(tone.frequency, window.time, residual[:, axis])
+
+    # Multiples of the speed of each joint: in steady rotation, and in all motions.
+    of_all_sensors = [np.concatenate(pair, axis=1) for pair in zip(*residual_of.values())]
+    orders = [
+        orders_of(found.used, of_all_sensors, joint) for joint in range(len(table.joint_names))
+    ]
+    for place, (sensor, of_windows) in enumerate(residual_of.items()):
+        candidates: list[Tone] = []
         for joint, name in enumerate(table.joint_names):
-            turning += of_stretches(sensor, _stretches(found.used, own, joint), name)
-            turning += _whole(sensor, orders[joint], name, place=place)
-        tones[sensor] |= _significant(turning, tests)
+            candidates += of_stretches(sensor, _stretches(found.used, of_windows, joint), name)
+            candidates += _whole(sensor, orders[joint], name, place=place)
+        tones[sensor] |= _significant(candidates, tests)
+
     rested = any(window.kind == 'static' for window in found.used)
-    surest_first = {}
-    for sensor, every in tones.items():
-        in_order = sorted(every.values(), key=lambda tone: tone.p_value)
-        surest_first[sensor] = tuple(replace(tone, rested=rested) for tone in in_order)
-    return surest_first
+    in_order = {}
+    for sensor, of_sensor in tones.items():
+        likeliest_first = sorted(of_sensor.values(), key=lambda tone: tone.p_value)
+        in_order[sensor] = tuple(replace(tone, rested=rested) for tone in likeliest_first)
+    return in_order
 
 
 def _significant(tones: Iterable[Tone], tests: int) -> dict[tuple[str, str | None], Tone]:
@@ -338,23 +353,23 @@ def _significant(tones: Iterable[Tone], tests: int) -> dict[tuple[str, str | Non
 
     Its p-value is multiplied by the number of tests and axes.
     """
-    corrected, first = (
-        [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones],
-        {},
-    )
-    for tone in sorted(
-        (tone for tone in corrected if tone.p_value < TONE_P_VALUE), key=lambda tone: tone.p_value
-    ):
+    significant = []
+    for tone in tones:
+        corrected = replace(tone, p_value=tone.p_value * len(AXES) * tests)
+        if corrected.p_value < TONE_P_VALUE:
+            significant.append(corrected)
+    first: dict[tuple[str, str | None], Tone] = {}
+    for tone in sorted(significant, key=lambda tone: tone.p_value):
         first.setdefault((tone.axis, tone.joint), tone)
     return first
 
 
 def _without(frequency: float, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values without the waves about a frequency, to the resolution of their duration."""
-    waves = np.exp(
-        2j * np.pi * np.outer(time - time[0], frequency + 0.5 * np.arange(-2, 3) / np.ptp(time))
-    )
-    basis = np.linalg.qr(np.column_stack([waves.real, waves.imag]))[0]
+    # Five frequencies, half of the resolution 1 / duration apart.
+    frequencies = frequency + 0.5 * np.arange(-2, 3) / np.ptp(time)
+    waves = np.exp(2j * np.pi * np.outer(time - time[0], frequencies))
+    basis, _ = np.linalg.qr(np.column_stack([waves.real, waves.imag]))
     return values - basis @ (basis.T @ values)
 
 

@@ -52,21 +52,16 @@ def within_limits(
 
     Two joints swing with at most `n_other` other joints.
     """
-    limits, count = builder.limits, builder.n_joints
-    lower, upper = (
-        np.where(limits.endless, -np.pi, limits.lower),
-        np.where(limits.endless, np.pi, limits.upper),
-    )
+    limits = builder.limits
+    count = builder.n_joints
+    lower = np.where(limits.endless, -np.pi, limits.lower)
+    upper = np.where(limits.endless, np.pi, limits.upper)
     moving = np.flatnonzero(upper > lower)
 
     def places(n):
-        """Spread positions over the range of every joint, each value once."""
-        return (
-            lower
-            + (upper - lower)
-            * (rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T + 0.5)
-            / n
-        )
+        """Spread positions over the range of every joint, each value once (Latin hypercube)."""
+        number = rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T
+        return lower + (upper - lower) * (number + 0.5) / n
 
     def swing(at, frequency):
         """
@@ -87,24 +82,25 @@ def within_limits(
         )
         return swing_at(middle, amplitude, np.maximum(frequency, 0.1), duration=swing_time)
 
-    tasks, only = [_rest_at(position) for position in places(n_poses)], np.eye(count)
+    tasks = [_rest_at(position) for position in places(n_poses)]
+    of_joint = np.eye(count)  # row: 1 for one joint
     for joint in moving.tolist():
-        tasks += [
-            swing(at, frequency * only[joint])
-            for at, frequency in zip(places(len(frequencies)), frequencies, strict=True)
-        ]
+        # One joint swings.
+        for at, frequency in zip(places(len(frequencies)), frequencies, strict=True):
+            tasks.append(swing(at, frequency * of_joint[joint]))
+
+        # Two joints swing.
         others = moving[moving < joint][-n_other:]
-        tasks += [
-            swing(at, 0.3 * only[joint] + 0.45 * only[other])
-            for other, at in zip(others, places(max(len(others), 1)), strict=False)
-        ]
+        for other, at in zip(others, places(max(len(others), 1)), strict=False):
+            tasks.append(swing(at, 0.3 * of_joint[joint] + 0.45 * of_joint[other]))
+
+        # A joint without an end spins, up to 90 % of its speed.
         if limits.endless[joint]:
             shares = 0.9 * np.linspace(0.3, 1.0, len(frequencies))
             speeds = shares * np.degrees(limits.speed[joint])
-            tasks += [
-                spin_joint(joint, np.where(limits.turns, np.degrees(at), np.nan), speed, dwell=4.0)
-                for at, speed in zip(places(len(shares)), speeds, strict=True)
-            ]
+            for at, speed in zip(places(len(shares)), speeds, strict=True):
+                at_deg = np.where(limits.turns, np.degrees(at), np.nan)
+                tasks.append(spin_joint(joint, at_deg, speed, dwell=4.0))
     run(builder, rng, tasks)
 
 
@@ -386,26 +382,31 @@ def _random(
     n_simultaneous=4,
 ):
     """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
+    # The order of the draws is part of the recording of a seed. Angles in deg, speeds in deg/s.
     tasks = poses([_near(rng, up_b, 0.25) for up_b in directions], 2.6)
+
+    # Spins about each axis of the sensor at every speed, about oblique axes, and of one joint.
     speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
-    tasks += [
-        spin_vertical(_near(rng, axis, 0.2), speeds[:, k], 2.0) for k, axis in enumerate(np.eye(3))
-    ]
-    tasks += [
-        spin_vertical(_near(rng, rng.choice(CORNERS), 0.3), rng.uniform(120, 220), 2.0)
-        for _ in range(n_oblique)
-    ]
-    tasks += [
-        spin_joint(joint, rng.uniform(-180, 180, 3), rng.uniform(50, 120), dwell=3.0)
-        for joint in (1, 2)
-    ]
+    for k, axis in enumerate(np.eye(3)):
+        tasks.append(spin_vertical(_near(rng, axis, 0.2), speeds[:, k], 2.0))
+    for _ in range(n_oblique):
+        axis = _near(rng, rng.choice(CORNERS), 0.3)
+        tasks.append(spin_vertical(axis, rng.uniform(120, 220), 2.0))
+    for joint in (1, 2):
+        position = rng.uniform(-180, 180, 3)
+        tasks.append(spin_joint(joint, position, rng.uniform(50, 120), dwell=3.0))
+
+    # Swings, fast and slow, whose speed is that of an amplitude of 7 to 14 deg at 1 Hz.
     for axis in range(3):
-        tasks += [
-            swing(axis, rng.uniform(7, 14) / frequency, frequency, duration=3.5)
-            for frequency in (rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0))[:n_swings]
-        ]
+        frequencies = [rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0)]
+        for frequency in frequencies[:n_swings]:
+            amplitude = rng.uniform(7, 14) / frequency
+            tasks.append(swing(axis, amplitude, frequency, duration=3.5))
+
+    # Two axes turn at once.
     rates = rng.uniform(80, 180, (n_simultaneous, 2)) * rng.choice([-1, 1], (n_simultaneous, 2))
-    tasks += [simultaneous(pair, 2.0)[k] for k, pair in zip(rng.permutation(5), rates)]
+    for k, pair in zip(rng.permutation(5), rates):
+        tasks.append(simultaneous(pair, 2.0)[k])
     run(builder, rng, tasks, reference_every=15)
 
 

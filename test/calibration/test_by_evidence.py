@@ -245,18 +245,18 @@ def test_a_finding_of_the_model_as_asked_must_stand_out_too(examined, monkeypatc
     solution = extended_solution(
         found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named
     )
-    assert by_evidence._without_faint(found, solution, solution.model) is found
+    assert by_evidence._without_insignificant(found, solution, solution.model) is found
     monkeypatch.setattr(
         by_evidence, 'stands_out', lambda _, question, **settings: question is not found.named[0]
     )
-    less = by_evidence._without_faint(found, solution, solution.model)
+    less = by_evidence._without_insignificant(found, solution, solution.model)
     assert found.named[0] not in less.named and list(less.unstable) == [
         *found.unstable,
         found.named[0],
     ]
     # By hand a requested effect remains.
     monkeypatch.setattr(type(found), 'settings', SelectionSettings(judge_requested=False))
-    assert by_evidence._without_faint(found, solution, solution.model) is found
+    assert by_evidence._without_insignificant(found, solution, solution.model) is found
 
 
 def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import imu_calibration
-from imu_calibration.calibration.by_evidence import _named_elsewhere
+from imu_calibration.calibration.by_evidence import _findings_of_others_only
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.forward_equations import References, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
@@ -195,5 +195,5 @@ def test_what_other_recordings_name_comes_once_and_beside_what_the_largest_names
             ]
         )
 
-    more = _named_elsewhere(found('a'), [found('a', 'b'), found('b', 'c')])
+    more = _findings_of_others_only(found('a'), [found('a', 'b'), found('b', 'c')])
     assert [question.effect.key[1] for question in more] == ['b', 'c']

@@ -92,11 +92,17 @@ def gain_of_findings(
         Sensors that the difference acts on.
 
     """
-    problem, applied = found.problem, _compensated(found, before, after)
-    if applied is None:
-        return heldout_gain(problem, before, after, sensors=sensors)
-    chosen = gain_in_turn(problem, *applied, sensors=sensors)
-    sums = _locked_errors(found, table, [_applied_parameters(found, some) for some in applied])
+    compensated = _compensated(found, before, after)
+    if compensated is None:
+        return heldout_gain(found.problem, before, after, sensors=sensors)
+
+    # Sensor and measure from the windows that choose, then the errors in the locked windows.
+    chosen = gain_in_turn(found.problem, compensated.before, compensated.after, sensors=sensors)
+    sides = [
+        _applied_parameters(found, compensated.before),
+        _applied_parameters(found, compensated.after),
+    ]
+    sums = _locked_errors(found, table, sides)
     return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
 
 
@@ -122,14 +128,18 @@ def gains_of_formulas(
         return {}
     problem = found.problem
     before = _applied_parameters(found, found.adopted)
-    model, values = before.model, before.values
 
     # The model with the formulas, linearised at their amplitudes.
+    model = before.model
+    values = before.values
     for proposal in proposals:
         for effect, size in zip(proposal.effects, proposal.values):
             known = replace(model, catalogue=model.catalogue.with_effects(effect))
             model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
-    model, accumulator = model.at(values), Accumulator()
+    model = model.at(values)
+
+    # Estimated from the windows that are not locked.
+    accumulator = Accumulator()
     unlocked = [window for window, locked in zip(found.used, problem.locked) if not locked]
     for group in chunks(unlocked):
         for window in reduce_windows(group, model, table):
@@ -138,20 +148,23 @@ def gains_of_formulas(
     estimated = solution.values
 
     # Compensation fixes the effects of the model that it does not undo as on the first side.
-    after = applied_values(model, estimated)
+    applied = applied_values(model, estimated)
     for effect in not_applied(before.model):
-        after[model.slices[effect.key]] = before.applied[before.model.slices[effect.key]]
+        applied[model.slices[effect.key]] = before.applied[before.model.slices[effect.key]]
     latest = latest_settling(model, estimated, solution.sd)
-    sides = [before, _Side(model.at(estimated), estimated, after, latest)]
-    sums, gains = {}, {}
+    after = _Side(model.at(estimated), estimated, applied, latest)
+
+    # A formula that compensation cannot undo has a gain in the residual of the model only.
+    sums_of = {}
+    gains = {}
     for proposal in proposals:
         undone = any(effect.compensation == 'exact' for effect in proposal.effects)
-        of = APPLIED if undone else OF_MODEL
-        if of not in sums:
-            sums[of] = _locked_errors(found, table, sides, of=of)
-        gain = sums[of].gains(proposal.sensor, of)[SAMPLES]
-        noise = problem.noise[proposal.sensor].white_variance
-        gains[proposal.sensor] = replace(gain, noise_rms=float(np.sqrt(np.mean(noise))))
+        error_kind = APPLIED if undone else OF_MODEL
+        if error_kind not in sums_of:
+            sums_of[error_kind] = _locked_errors(found, table, [before, after], of=error_kind)
+        gain = sums_of[error_kind].gains(proposal.sensor, error_kind)[SAMPLES]
+        white_variance = problem.noise[proposal.sensor].white_variance
+        gains[proposal.sensor] = replace(gain, noise_rms=float(np.sqrt(np.mean(white_variance))))
     return gains
 
 
@@ -167,23 +180,35 @@ def _locked_errors(
 
     The windows are those of `HeldOutData` and the documents: after effects have settled.
     """
-    problem, sums = found.problem, DistanceSums()
+    problem = found.problem
     start = max(judged_from_of(side.latest, problem.duration) for side in sides)
-    held_out = [
-        window
-        for window, locked in zip(found.used, problem.locked)
-        if locked and window.time[0] >= start
-    ]
+    held_out = []
+    for window, locked in zip(found.used, problem.locked):
+        if locked and window.time[0] >= start:
+            held_out.append(window)
+
     errors_of = _errors if of == APPLIED else _model_errors
+    sums = DistanceSums()
     for group in chunks(held_out):
-        for window, *errors in zip(group, *(errors_of(group, table, side) for side in sides)):
+        errors_of_sides = [errors_of(group, table, side) for side in sides]
+        for window, *errors in zip(group, *errors_of_sides):
             sums.add(window, errors, problem.noise)
     return sums
 
 
+@dataclass(frozen=True)
+class _CompensatedFindings:
+    """Two choices of effects, without implausible findings, which are not in the model."""
+
+    before: list[Question]
+    """The smaller choice."""
+    after: list[Question]
+    """The larger choice: with at least one more effect that compensation can undo."""
+
+
 def _compensated(
     found: Investigation | HandInvestigation, before: Sequence[Question], after: Sequence[Question]
-) -> list[list[Question]] | None:
+) -> _CompensatedFindings | None:
     """
     Return the findings of two choices that belong into the model.
 
@@ -193,7 +218,7 @@ def _compensated(
     adopted_after = [question for question in after if question in found.adopted]
     for question in adopted_after:
         if question not in adopted_before and question.effect.compensation == 'exact':
-            return [adopted_before, adopted_after]
+            return _CompensatedFindings(adopted_before, adopted_after)
     return None
 
 
@@ -203,17 +228,20 @@ def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Si
 
     It is estimated without the locked windows.
     """
-    problem, wide = found.problem, found.problem.recording.model
-    model = replace(problem.baseline, temperature_ref_c=wide.temperature_ref_c)
+    problem = found.problem
+    gathered = problem.recording.model  # with all effects under test
+    model = replace(problem.baseline, temperature_ref_c=gathered.temperature_ref_c)
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    values = model.start_from(wide, problem.values(chosen))
+    values = model.start_from(gathered, problem.values(chosen))
     model = model.at(values)
     latest = latest_settling(model, values, _sd_of(problem, model, chosen))
     centre: Mapping[str, np.ndarray] = {}
     if not_applied(model):
-        accumulator = problem.recording.accumulated(wide)
-        uncorrected = uncorrected_on_table(model, values, accumulator, gathered=wide, latest=latest)
+        accumulator = problem.recording.accumulated(gathered)
+        uncorrected = uncorrected_on_table(
+            model, values, accumulator, gathered=gathered, latest=latest
+        )
         centre = uncorrected.centre
     return _Side(model, values, applied_values(model, values, centre), latest)
 
@@ -227,13 +255,13 @@ def _sd_of(
     A warm-up that was only tried at a bank of time constants has none for its own.
     """
     used = problem.search.indices(chosen)
-    covariance = problem.evidence.fit(used)[1]
-    known = dict(zip(used, np.sqrt(np.diag(covariance)), strict=True))
+    _, covariance = problem.evidence.fit(used)
+    sd_of_index = dict(zip(used, np.sqrt(np.diag(covariance)), strict=True))
     sd = np.zeros(len(model.param_names))
     for question in chosen:
         start = model.slices[question.effect.key].start
         for place, index in enumerate(question.parameters):
-            sd[start + place] = known[index]
+            sd[start + place] = sd_of_index[index]
     return sd
 
 
@@ -249,30 +277,39 @@ def gain_by_hand(
     the Earth about the vertical. Choice and estimate of each side exclude the poses; if no
     additional finding can be compensated, the residual is that of the model.
     """
-    applied = _compensated(found, before, after)
-    if applied is None:
+    compensated = _compensated(found, before, after)
+    if compensated is None:
         return found.problem.gain(found.held_out, before, after, sensor=sensor)
-    block, poses = found.problem.clearest(applied[0], applied[1], sensor), found.baseline.poses
+
+    # The rows in which the difference of the two choices is clearest.
+    block = found.problem.clearest(compensated.before, compensated.after, sensor)
+    poses = found.baseline.poses
     end = end_by_hand(poses)
-    pair = [
-        np.zeros((len(block.group), 1 if block.duration is not None else block.known.shape[1]))
-        for _ in applied
-    ]
+    n_columns = 1 if block.duration is not None else block.known.shape[1]
+    errors_before = np.zeros((len(block.group), n_columns))
+    errors_after = np.zeros((len(block.group), n_columns))
+
+    # Each part of the recording is predicted by a fit to the other parts.
     start = 0.0
     for part in found.held_out:
         rows = np.isin(block.group, part.groups)
-        for errors, chosen in zip(pair, applied):
+        for errors, chosen in (
+            (errors_before, compensated.before),
+            (errors_after, compensated.after),
+        ):
             additional = part.named_in(chosen)
             model, values, earth = found.extended(part.problem, additional)
             moved = model.model.at(values)
             latest = latest_settling(moved, values, _sd_of(part.problem, moved, additional))
             start = max(start, judged_from_of(latest, end))
             uncorrected = uncorrected_in_time(moved, values, poses.time, end=end, latest=latest)
-            values = applied_values(moved, values, uncorrected.centre)
-            errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, values, earth)
-    return gain_of_groups(
-        block.select(late := block.time >= start), [errors[late] for errors in pair], APPLIED
-    )
+            applied = applied_values(moved, values, uncorrected.centre)
+            errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, applied, earth)
+
+    # Only rows after the effects of both choices have settled.
+    settled = block.time >= start
+    pair = [errors_before[settled], errors_after[settled]]
+    return gain_of_groups(block.select(settled), pair, APPLIED)
 
 
 def _pose_errors(
@@ -296,12 +333,11 @@ def _pose_errors(
     corrected = corrected_with(
         model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=warm
     )
+    # At rest the force is gravity, and points up: the vertical Earth's rate is along it.
     norm = np.linalg.norm(corrected.force, axis=1, keepdims=True)
-    return (
-        norm - found.baseline.gravity
-        if block.sensor == 'accelerometer'
-        else corrected.rate - earth * corrected.force / norm
-    )
+    if block.sensor == 'accelerometer':
+        return norm - found.baseline.gravity
+    return corrected.rate - earth * corrected.force / norm
 
 
 def _errors(
@@ -309,19 +345,23 @@ def _errors(
 ) -> Iterator[dict[str, np.ndarray]]:
     """
     Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3).
+
+    The true readings are those of an ideal sensor on the table as this side estimates it.
     """
-    model, values = side.model, side.values
+    # Ideal sensors at the estimated reference (angles, places, delays of the table).
     motion, temperature, rows = all_samples(windows)
-    ideal = with_reference(model, nominal_values(model), values)
-    at_ideal = model.at(ideal)
-    references = References(at_ideal, table, motion, temperature_c=temperature)
-    refs = [references.at(sensor) for sensor in SENSORS]
-    ref = refs[1].select(rows)
+    ideal = with_reference(side.model, nominal_values(side.model), side.values)
+    ideal_model = side.model.at(ideal)
+    references = References(ideal_model, table, motion, temperature_c=temperature)
+    reference_of = {sensor: references.at(sensor) for sensor in SENSORS}
+
+    # Readings as compensation corrects them, with the motion at the gyroscope.
+    ref = reference_of['gyroscope'].select(rows)
     raw = []
     for sensor in SENSORS:
         raw.append(np.concatenate([measured(window, sensor) for window in windows]))
-    count = len(values)
-    known = Calibration(model, side.applied, np.zeros((count, count)), (HELD,) * count)
+    count = len(side.values)
+    known = Calibration(side.model, side.applied, np.zeros((count, count)), (HELD,) * count)
     corrected = compensated_samples(
         known,
         *raw,
@@ -330,12 +370,14 @@ def _errors(
         thermal_branch=ref.thermal_branch,
         vibration=ref.vibration,
     )
-    errors = [
-        true - sensor_output(at_ideal, sensor, ideal, ref=own)[rows]
-        for true, sensor, own in zip((corrected.force, corrected.rate), SENSORS, refs)
-    ]
+
+    corrected_of = {'accelerometer': corrected.force, 'gyroscope': corrected.rate}
+    errors = {}
+    for sensor in SENSORS:
+        true = sensor_output(ideal_model, sensor, ideal, ref=reference_of[sensor])
+        errors[sensor] = corrected_of[sensor] - true[rows]
     for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
-        yield {sensor: error[start:stop] for sensor, error in zip(SENSORS, errors)}
+        yield {sensor: error[start:stop] for sensor, error in errors.items()}
 
 
 def _model_errors(
@@ -344,6 +386,6 @@ def _model_errors(
     """
     Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3).
     """
-    left = residuals(windows, table, side.model, values=side.values)
+    residual_of = residuals(windows, table, side.model, values=side.values)
     for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
-        yield {sensor: rest[start:stop] for sensor, rest in left.items()}
+        yield {sensor: residual[start:stop] for sensor, residual in residual_of.items()}

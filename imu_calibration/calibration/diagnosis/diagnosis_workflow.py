@@ -32,7 +32,7 @@ from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HARM
 from imu_calibration.document.verdict import motion_misfits, unsteady
-from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
+from imu_calibration.effects.base import UNITS, Effect, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.kinematics.table import Table
@@ -240,8 +240,11 @@ class _FormulaModels:
 
 def _formula_models(recordings: TableRecordings, extension: 'ProposedExtension') -> _FormulaModels:
     """Return the calibrations with the formulas of a diagnosis."""
+    # All of them describe this recording.
     effects = _proposed_effects(extension.diagnosis)
     proposed = _with_proposals(recordings, extension, effects)
+
+    # Compensation of another recording: those that it can undo, and of these the ones that help.
     transferable = proposed
     transferable_effects = [effect for effect in effects if _is_transferable(effect)]
     if len(transferable_effects) < len(effects):
@@ -329,30 +332,32 @@ def _with_proposals(
     """
     if not effects:
         return None
+
+    # Exactly the effects of the calibration and the formulas, without a further search.
     model = extension.result.calibration.model
-    catalogue = model.catalogue.with_effects(*effects)
-    names: dict[str, list[str]] = {section: [] for section in (*SENSORS, 'reference')}
+    names: dict[str, list[str]] = {'accelerometer': [], 'gyroscope': [], 'reference': []}
     for effect in (*model.effects, *effects):
         if effect.role is not Role.LIMIT:
             names[effect.sensor].append(effect.name)
-    texts = {section: '+'.join(of_section) for section, of_section in names.items()}
-    chosen = replace(
+    options = replace(
         extension.options,
-        accelerometer_model=texts['accelerometer'],
-        gyroscope_model=texts['gyroscope'],
-        reference_model=texts['reference'] or 'none',
-        catalogue=catalogue,
+        accelerometer_model='+'.join(names['accelerometer']),
+        gyroscope_model='+'.join(names['gyroscope']),
+        reference_model='+'.join(names['reference']) or 'none',
+        catalogue=model.catalogue.with_effects(*effects),
         as_asked=True,
     )
-    solved = recordings.solved(chosen)
-    # A formula determines changes of the output, not its zero: biases of the affected axes keep the
-    # uncertainty.
-    unsure = ModelExtension(
-        moves=tuple((moved, 1.0) for moved in biases_off(model, extension.diagnosis.unexplained))
-    )
+    solved = recordings.solved(options)
+
+    # A formula determines changes of the output, not its zero: the biases of the affected axes may
+    # still contain the residual, and keep this uncertainty.
+    bias_changes = []
+    for change in biases_off(model, extension.diagnosis.unexplained):
+        bias_changes.append((change, 1.0))
+    widened = ModelExtension(moves=tuple(bias_changes)).applied(solved.solution)
     return conclude(
-        replace(solved, solution=unsure.applied(solved.solution)),
-        chosen,
+        replace(solved, solution=widened),
+        options,
         provenance=extension.provenance,
         under_test={effect.sensor for effect in effects},
     ).calibration

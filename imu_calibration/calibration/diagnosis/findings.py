@@ -363,17 +363,16 @@ def build_diagnosis(
         of the investigation.
 
     """
-    problem, named, limits = found.problem, found.named, found.limits
+    problem = found.problem
+    named = found.named
     analysis = ResidualAnalysis.of(found, table)
-    rests = analysis.unexplained
+    unexplained = analysis.unexplained
     baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
-    solution = (
-        extended_solution(
-            problem.space, problem.noise, problem.baseline, chosen=named, saturations=limits
+    solution = baseline
+    if named or found.limits:
+        solution = extended_solution(
+            problem.space, problem.noise, problem.baseline, chosen=named, saturations=found.limits
         )
-        if named or limits
-        else baseline
-    )
 
     def gain_of(place: int) -> Gain:
         return gain_of_findings(
@@ -387,43 +386,41 @@ def build_diagnosis(
     def shows(place: int, mate: Question, gain: Gain) -> bool:
         if gain.sensor not in mate.effect.sensors:
             return False
-        own, other = (
-            gain_in_turn(
-                problem, named[:place], [*named[:place], each], sensors=[gain.sensor]
-            ).reduction
-            for each in (named[place], mate)
-        )
-        return MATE * own <= other
+        before = named[:place]
+        by_finding = gain_in_turn(problem, before, [*before, named[place]], sensors=[gain.sensor])
+        by_mate = gain_in_turn(problem, before, [*before, mate], sensors=[gain.sensor])
+        return MATE * by_finding.reduction <= by_mate.reduction
 
     def motion_of(question: Question, mate: Question) -> str:
         if len(table.joint_names) == 1:
             return motions_of_one_joint(question, mate)
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
 
+    # Implausible findings are not in the calibration.
     reported = calibrated or solution
-    findings = [_clipping(limit, reported) for limit in limits]
-    strange = found.implausible
-    findings += [
-        finding(
-            problem.search,
-            named,
-            place,
-            solution=solution if named[place] in strange else reported,
-            share=found.explained.share,
-            gain_of=gain_of,
-            motion_of=motion_of,
-            shows=shows,
-            rivals=_rivals(found, named[place]),
-        )
-        for place in range(len(named))
-    ]
+    implausible = found.implausible
+    findings = [_clipping(limit, reported) for limit in found.limits]
     affected: set[str] = set()
-    for question in named:
+    for place, question in enumerate(named):
         affected |= set(question.effect.sensors)
-    sensors = sorted(affected) or list(rests)
+        findings.append(
+            finding(
+                problem.search,
+                named,
+                place,
+                solution=solution if question in implausible else reported,
+                share=found.explained.share,
+                gain_of=gain_of,
+                motion_of=motion_of,
+                shows=shows,
+                rivals=_rivals(found, question),
+            )
+        )
+    sensors = sorted(affected) or list(unexplained)
+    proposals = [rest.proposal for rest in unexplained.values() if rest.proposal is not None]
     return Diagnosis(
         tuple(findings),
-        rests,
+        unexplained,
         candidates_of(problem.search, named, agree=_agreement(problem), withdrawn=found.unstable),
         tuple(found.not_testable),
         baseline,
@@ -433,11 +430,7 @@ def build_diagnosis(
         int(np.sum(problem.locked)),
         onset=found.onset,
         stamp_jitter=analysis.stamp_jitter,
-        formula_gains=gains_of_formulas(
-            found,
-            table,
-            [rest.proposal for rest in rests.values() if rest.proposal is not None],
-        ),
+        formula_gains=gains_of_formulas(found, table, proposals),
     )
 
 
@@ -539,8 +532,10 @@ def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagno
     """
     Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings.
     """
-    problem, named = found.problem, list(found.named)
-    before, after = _with_residuals(found.baseline), _with_residuals(hand)
+    problem = found.problem
+    named = list(found.named)
+    before = _with_residuals(found.baseline)
+    after = _with_residuals(hand)
 
     def gain_of(place: int) -> Gain:
         return gain_by_hand(
@@ -559,7 +554,9 @@ def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagno
         )
         for place in range(len(named))
     )
-    gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor) if named else None
+    gain = None
+    if named:
+        gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor)
     count = len(found.baseline.poses.start)
     return Diagnosis(
         findings,
