@@ -194,7 +194,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
     solution = result.solution
     requested = result.calibration.requested
-    # No motion determines a parameter whose remedy is another one.
+    # No motion determines a parameter with another remedy.
     wanted = np.array(
         [
             name in requested and not _has_remedy(result, name)

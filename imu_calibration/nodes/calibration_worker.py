@@ -515,7 +515,7 @@ class CalibrationWorker(threading.Thread):
         if result is not None:
             verdict, judged = str(result.verdict.word), result.verdict.text
             complete = result.verdict.complete
-            # First what makes it incomplete: a status has room for three lines.
+            # First the causes of an incomplete state: a status has room for three lines.
             reasons = shortcomings(result.calibration)
             lines = list(dict.fromkeys([*reasons, *summary(result, self.hints)]))
         values = {

@@ -162,7 +162,7 @@ def _of_motion() -> Iterator:
     for pair in product(_atoms('alpha'), components):
         yield _times(*pair)
 
-    # Magnitude and sign, alone and with one more factor; the sign times its own quantity is the
+    # Magnitude and sign, single and with one more factor; the sign times its own quantity is the
     # magnitude.
     for text, factors in components:
         magnitude = (f'abs({text})', factors)

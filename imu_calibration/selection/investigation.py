@@ -158,7 +158,7 @@ def investigate(
             linearised_again = stepped_again
             onset = None
 
-    # Any other change: the longer part alone.
+    # Any other change: only the longer part.
     if onset is not None:
         before_onset = [window for window in used if window.time[-1] < onset.time]
         after_onset = [window for window in used if window.time[0] >= onset.time]

@@ -55,7 +55,7 @@ def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
         slow_only[sensor] = np.zeros(3, bool)
         slow_variance[sensor] = np.zeros(3)
         for axis in range(3):
-            # The best fit of all candidate effects together: what remains, no effect explains.
+            # The best fit of all candidate effects together: no effect explains the remainder.
             squares, rank = least_misfit(space.within_sum(sensor, axis, moving, part='within'))
             slow_squares, slow_rank = least_misfit(
                 space.within_sum(sensor, axis, moving, part='slow')

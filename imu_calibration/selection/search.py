@@ -314,7 +314,7 @@ class Search:
                 break
             best = max(significant, key=lambda score: score.net)
 
-            # Backward: without what it makes unnecessary. The same choice again is the end.
+            # Backward: without effects that it makes unnecessary. The same choice again is the end.
             before = [q.label for q in chosen]
             chosen = self.reconsidered([*chosen, best.question])
             if [q.label for q in chosen] == before:

@@ -366,7 +366,7 @@ def _significant(tones: Iterable[Tone], tests: int) -> dict[tuple[str, str | Non
 
 def _without(frequency: float, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values without the waves about a frequency, to the resolution of their duration."""
-    # Five frequencies, half of the resolution 1 / duration apart.
+    # Five frequencies, with a distance of half the resolution 1 / duration.
     frequencies = frequency + 0.5 * np.arange(-2, 3) / np.ptp(time)
     waves = np.exp(2j * np.pi * np.outer(time - time[0], frequencies))
     basis, _ = np.linalg.qr(np.column_stack([waves.real, waves.imag]))
