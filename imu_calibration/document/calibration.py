@@ -127,9 +127,14 @@ class Calibration:
         return texts_of(self.gauge)
 
     @property
+    def accelerometer_defines_axes(self) -> bool:
+        """Whether the axes are those of the accelerometer, calibrated or not."""
+        return self.gauge.get('axes') == ACCELEROMETER_AXES
+
+    @property
     def gyroscope_in_accelerometer_axes(self) -> bool:
         """Whether the accelerometer, which was calibrated too, defines axes of the gyroscope."""
-        return self.gauge.get('axes') == ACCELEROMETER_AXES and not self.absent
+        return self.accelerometer_defines_axes and not self.absent
 
     @property
     def by_hand(self) -> dict:

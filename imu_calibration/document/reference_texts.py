@@ -52,4 +52,4 @@ OF_GRAVITY = ReferenceTexts(
 
 def texts_of(gauge: Mapping[str, Any]) -> ReferenceTexts:
     """Return the texts of the reference that gives sensors the axes of a document."""
-    return {ACCELEROMETER_AXES: OF_GRAVITY}.get(gauge.get('axes', ''), OF_TABLE)
+    return OF_GRAVITY if gauge.get('axes') == ACCELEROMETER_AXES else OF_TABLE

@@ -17,7 +17,6 @@ from imu_calibration.document.calibration import (
 )
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, reason_of
 from imu_calibration.document.outcome import missing
-from imu_calibration.document.reference_texts import ACCELEROMETER_AXES
 from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
@@ -407,8 +406,7 @@ def _mostly_undetermined(calibration: Calibration, sensor: str) -> str:
     """Return why an unproven sensor is not applied even with consent; '' where it may be."""
     status: list[str] = []
     # By hand the accelerometer defines the axes: without it only the bias has a reference.
-    by_hand = calibration.gauge.get('axes') == ACCELEROMETER_AXES
-    only_bias = by_hand and 'accelerometer' in calibration.absent
+    only_bias = calibration.accelerometer_defines_axes and 'accelerometer' in calibration.absent
     for effect in calibration.model.effects:
         if effect.sensor == sensor and (effect.role is Role.OFFSET or not only_bias):
             status += calibration.status[calibration.model.slices[effect.key]]
