@@ -45,7 +45,7 @@ from imu_calibration.document.outcome import (
     shortcomings,
 )
 from imu_calibration.document.proof_entry import ProofEntry
-from imu_calibration.document.rest_noise import motions_at_rest, moved_at_rest, swayed_at_rest
+from imu_calibration.document.rest_noise import motions_at_rest, moved_at_rest
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.effects.forward_equations import without_input
@@ -422,7 +422,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
         certain = scatter * _smallest_share(calibration, sensor)
-        if moved_at_rest(calibration.by_hand, sensor) or swayed_at_rest(calibration.by_hand):
+        if motions_at_rest(calibration.by_hand, (sensor,)):
             continue
         if certain > tolerances[part][0] and scatter > _misfit(calibration, sensor):
             factor, unit = for_people(UNITS[sensor])
