@@ -115,7 +115,7 @@ def uncorrected_on_table(
             ]
             if at_end:
                 column = columns_at(model, effect, [end])[group.name][0]
-                centre[group.name] = np.column_stack([column, np.zeros((len(column), 3))])
+                centre[group.name] = _without_slope(column)
             else:
                 centre[group.name] = _moved(
                     effect,
@@ -131,6 +131,11 @@ def uncorrected_on_table(
                 squares += (rest**2).sum(axis=0)
         sizes.append(_size(effect, np.sqrt(squares / counts.sum()), at_end))
     return Uncorrected(centre, tuple(sizes))
+
+
+def _without_slope(columns: np.ndarray) -> np.ndarray:
+    """Return the `Centre` of a group of columns, shape (width,), in which the bias has its part."""
+    return np.column_stack([columns, np.zeros((len(columns), 3))])
 
 
 def _projection(
@@ -205,8 +210,7 @@ def uncorrected_in_time(
         at_end, at_times = has_settled(latest, effect, end), columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
         for name, columns in applied.items():
-            constant = columns.mean(axis=0)
-            centre[name] = np.column_stack([constant, np.zeros((len(constant), 3))])
+            centre[name] = _without_slope(columns.mean(axis=0))
         rows = model.layout(effect.sensor).rows
         rest = sum(
             (at_times[name] - centre[name][:, 0])
