@@ -92,7 +92,8 @@ class CompensatorDiagnostics:
         node.look_for_correction()
         node.return_from_harm()
         compensation = node.compensation
-        serious, notes = self._lines(compensation)
+        unready = self._unready()
+        serious, notes = self._lines(compensation, unready)
         notes += self._stream(compensation) + [
             line for each in node.inputs for line in each.faults()
         ]
@@ -113,8 +114,8 @@ class CompensatorDiagnostics:
                 f'corrected with calibration {adopted.version}'
                 f' ({decisions_text(adopted.calibration.decisions)})'
             )
-        elif self._unready():
-            good = f'{self._unready()}; {self._uncorrected()}'
+        elif unready:
+            good = f'{unready}; {self._uncorrected()}'
         frame_id = '' if adopted is None else adopted.calibration.frame_id
         return [
             *self._health(compensation, frame_id),
@@ -201,7 +202,7 @@ class CompensatorDiagnostics:
             return f'{", ".join(node.documents.names())} has not sent a calibration yet'
         return ''
 
-    def _lines(self, compensation):
+    def _lines(self, compensation, unready):
         """Return (faults that prevent correction, notes), one line each."""
         node = self._node
         serious = [node.corrected_already] if node.corrected_already else []
@@ -211,7 +212,7 @@ class CompensatorDiagnostics:
                 + (f'; calibration {node.adopted.version} remains in use' if node.adopted else '')
             )
         if compensation is None:
-            if self._unready():
+            if unready:
                 return serious, []
             what = self._uncorrected()
             waiting = (
