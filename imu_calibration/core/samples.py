@@ -177,6 +177,13 @@ class ImuSamples(AlignedArrays):
     meaning.
     """
 
+    @classmethod
+    def concatenate(cls, parts: Iterable[Any]) -> Any:
+        """Join `parts` in order; a sensor that one of them lacks is absent."""
+        parts = list(parts)
+        absent = sorted({sensor for part in parts for sensor in part.absent})
+        return replace(super().concatenate(parts), absent=tuple(absent))
+
 
 @dataclass(frozen=True, eq=False)
 class JointSamples(AlignedArrays):

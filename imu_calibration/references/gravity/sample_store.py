@@ -7,7 +7,6 @@ All samples up to a limit, then the least informative are discarded first.
 import io
 from collections.abc import Iterable, Sequence
 from copy import copy
-from dataclasses import replace
 
 import numpy as np
 
@@ -81,10 +80,7 @@ class HandStore:
         if not self._parts:
             return None
         if len(self._parts) > 1:
-            # A sensor that one run lacks has no readings in the joined ones.
-            absent = {sensor for part in self._parts for sensor in part.absent}
-            joined = ImuSamples.concatenate(self._parts)
-            self._parts = [replace(joined, absent=tuple(sorted(absent)))]
+            self._parts = [ImuSamples.concatenate(self._parts)]
         return self._parts[0]
 
     def true_stamps(self, stamp_ns: np.ndarray) -> np.ndarray:
