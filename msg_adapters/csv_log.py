@@ -734,6 +734,11 @@ COMPRESSORS = {b'\x1f\x8b': 'gzip', b'PK': 'zip', b'\x28\xb5': 'zstd', b'BZ': 'b
 """First two bytes -> program that has compressed a file."""
 
 
+def _without_comment(line):
+    """Return a line without its comment; most lines have none."""
+    return COMMENT.sub('', line) if '#' in line else line
+
+
 def _is_utf_8(head):
     """Return whether the first bytes of a file are text in UTF-8, of which the last may be cut."""
     try:
@@ -924,7 +929,7 @@ class _Table:
 
     def _as_numbers(self, line):
         """Return a line without comment, with cells that have no quotes, and decimal points."""
-        line = COMMENT.sub('', line)
+        line = _without_comment(line)
         if '"' not in line:
             comma = self.decimal_comma and self.delimiter != ','
             return line.replace(',', '.') if comma else line
@@ -940,7 +945,7 @@ class _Table:
         """Return the lines with at least `width` cells; count those that are dropped."""
         complete = []
         for line in lines:
-            plain = COMMENT.sub('', line)
+            plain = _without_comment(line)
             if not plain.strip():
                 continue
             if line.strip() in self._header_lines:
