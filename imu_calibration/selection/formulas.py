@@ -443,11 +443,12 @@ class FormulaSearch:
         # All formulas with the same number of columns at once.
         for width in {len(formula.columns) for formula in self.formulas}:
             chosen = [k for k, formula in enumerate(self.formulas) if len(formula.columns) == width]
-            places = []  # of the columns on each axis, (n_chosen, width, 3)
+            places = []
             for k in chosen:
                 places.append([self._at(column) for column in self.formulas[k].columns])
+            place_on_axes = np.array(places)  # (n_chosen, width, 3)
             for axis in range(3):
-                at = np.array(places)[:, :, axis]
+                at = place_on_axes[:, :, axis]
                 free = self._free[axis]
                 size = np.sqrt(np.maximum(np.einsum('bt,bt->t', free, free), 1e-300))
                 slopes = (free.T @ self._rest[axis]) / size

@@ -32,7 +32,7 @@ from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HARM
 from imu_calibration.document.verdict import motion_misfits, unsteady
-from imu_calibration.effects.base import UNITS, Effect, Role
+from imu_calibration.effects.base import SECTIONS, UNITS, Effect, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.kinematics.table import Table
@@ -335,7 +335,7 @@ def _with_proposals(
 
     # Exactly the effects of the calibration and the formulas, without a further search.
     model = extension.result.calibration.model
-    names: dict[str, list[str]] = {'accelerometer': [], 'gyroscope': [], 'reference': []}
+    names: dict[str, list[str]] = {section: [] for section in SECTIONS}
     for effect in (*model.effects, *effects):
         if effect.role is not Role.LIMIT:
             names[effect.sensor].append(effect.name)
