@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusal import refused
 from scipy.ndimage import gaussian_filter1d
 
+from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.rest_noise import (
     MOVED_DENSITY,
@@ -16,6 +18,7 @@ from imu_calibration.document.rest_noise import (
 )
 from imu_calibration.document.verdict import _step_of, judge
 from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY
+from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.references.gravity.sway import sway_at_rest
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate_recordings
@@ -99,6 +102,17 @@ def test_a_slow_sway_is_named_by_calibrate_and_inspect():
     options = CalibrationOptions(gravity=GRAVITY)
     (look,) = inspect_recording(SampleBlock(imu), [Topics()], None, options=options)
     assert look.by_hand.calibration.by_hand['sway'] == found.by_hand['sway']
+
+
+@pytest.mark.parametrize('amplitude', [3e-3, 1e-2])
+def test_a_sway_that_leaves_no_attitude_at_rest_is_named(amplitude):
+    imu, _, _ = simulate(10451, n_poses=5, period=PERIOD_S, still=2.5, force_sd=0.01, rate_sd=1e-3)
+    with refused(NotObservableError, 'moved_at_rest', 4, 5, 'mrad'):
+        gather_by_hand(swaying(imu, amplitude))
+    # The cause of too few attitudes is another one where the IMU was still.
+    imu, _, _ = simulate(10452, n_poses=3, period=PERIOD_S, still=2.5, force_sd=0.01, rate_sd=1e-3)
+    with refused(NotObservableError, 'too_few_attitudes', 3):
+        gather_by_hand(imu)
 
 
 def test_the_tilt_of_a_sway_is_measured_and_noise_is_none():
