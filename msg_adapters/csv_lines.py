@@ -16,6 +16,11 @@ Name and number, as for a plotter: ``ax:0.12``.
 The name has a limit, and digits can be divided in one way only: the time of a search is otherwise
 quadratic in the length of a line.
 """
+SENSOR_LABELS = (
+    ('acc', re.compile(r'acc(?:e|el|elerometer|eleration)?')),
+    ('gyro', re.compile(r'gyr(?:o|os|oscope)?')),
+)
+"""Sensor -> word in its name, where a column names the sensor of each row."""
 MOST_LINES = 50
 """Lines from which a decoration is recognised."""
 LEAST_CELLS = 4
@@ -45,6 +50,15 @@ def plain_lines(lines: Sequence[str]) -> list[str]:
     lines = _with_serial_column(lines)
     lines = _with_header_of_labels(lines)
     return _with_header_of_echo(lines)
+
+
+def sensor_of_label(label: str) -> str:
+    """Return the sensor of a row by its name: 'acc', 'gyro', or '' for another one."""
+    words = re.split(r'[^a-z]+', re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', label).lower())
+    for sensor, word in SENSOR_LABELS:
+        if any(map(word.fullmatch, words)):
+            return sensor
+    return ''
 
 
 def _with_serial_column(lines):

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
@@ -22,7 +22,13 @@ from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.core.progress import remark
 from imu_calibration.core.readings import READING_SPELLINGS, SI_UNITS, UNIT_SIZES, unit_of
-from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
+from imu_calibration.core.samples import (
+    EPOCH,
+    ImuSamples,
+    JointSamples,
+    TemperatureSamples,
+    stamps_of,
+)
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.files import name_of_path
 from imu_calibration.preprocessing.counter_overflow import (
@@ -40,7 +46,7 @@ from imu_calibration.preprocessing.sensor_join import (
 )
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from imu_calibration.preprocessing.value_checks import force_error, samples_per_second
-from msg_adapters.csv_lines import plain_lines
+from msg_adapters.csv_lines import plain_lines, sensor_of_label
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.storages import suffixes
 from msg_adapters.write import write_session
@@ -246,6 +252,8 @@ class CsvLog:
     """How accelerometer and gyroscope were joined, where they have stamps of their own."""
     text: LogText | None = None
     """The rows; of two logs those of the slower sensor."""
+    row_names: tuple[str, ...] = ()
+    """Conditions on the rows of accelerometer and gyroscope, where a column names the sensor."""
 
 
 # Readings that are not finite are counted where samples are used.
@@ -260,6 +268,9 @@ def read_csv(
     """
     Read a text log with a header line.
 
+    Of a log with a row per sensor, whose name is in a column, both sensors are read and joined as
+    two logs are (`read_logs`).
+
     Parameters
     ----------
     path : path-like
@@ -269,8 +280,8 @@ def read_csv(
         time, force, rate, temperature or joint.JOINT. A name may be the number of a column (1 is
         the first).
     where : sequence of str
-        Conditions ``COLUMN=VALUE``; only the rows that fulfil all are read, such as those of one
-        of several IMUs in a log.
+        Conditions ``COLUMN=VALUE[,VALUE]``; only the rows that fulfil all are read, such as those
+        of one of several IMUs in a log.
     raw : sequence of str
         Quantities, 'force' or 'rate', that are not converted to SI.
 
@@ -283,6 +294,13 @@ def read_csv(
     """
     path = Path(path)
     table = _Table(path)
+    rows = _rows_of_sensors(table, where)
+    if len({each.sensor for each in rows}) == 2:
+        return _read_sensor_rows(path, rows, columns, where, raw=raw)
+    if rows:
+        # One of the sensors alone.
+        table = _Table(path, rows[0].sensor)
+        where = (*where, rows[0].condition)
     found = [table.stated(_parse(text)) for text in columns]
     given = {(each.quantity, each.joint) for each in found}
     stated = {each.quantity for each in found}
@@ -294,7 +312,7 @@ def read_csv(
         raise InputError(
             f'{path} must have a column of'
             f' {lacking}{"" if lacking == "time" else " per axis"}, got the columns'
-            f' {shortened(", ".join(table.names), 300)}; {REMEDY}',
+            f' {shortened(", ".join(table.names), 300)}{_unnamed_axes(table)}; {REMEDY}',
             key='columns',
         )
     table.load([name for each in found for name in each.names], where)
@@ -381,6 +399,18 @@ def _lacking(table, by_quantity, *, stated):
     if len(missing) == 2 or (len(unknown) >= 3 and not stated):
         return missing[0]
     return ''
+
+
+def _unnamed_axes(table):
+    """Return that columns x, y, z belong to no sensor, or ''."""
+    readings = {name: _reading_of(_words(name)[0]) for name in table.names}
+    bare = [name for name, reading in readings.items() if reading and not reading.sensor]
+    if len(bare) < 3:
+        return ''
+    return (
+        f', of which {", ".join(bare)} name no sensor; write its name (accelerometer, gyroscope) in'
+        ' a column of each row or in the name of the file'
+    )
 
 
 def _times(table, columns):
@@ -497,16 +527,15 @@ def read_logs(
     found: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
     for path in files:
         try:
-            log = _sensor_log(path, where)
+            log = _sensor_log(_Table(path), where)
         except InputError:
             if not in_folder:
                 raise
             continue  # a folder has logs of other sensors too
         if log is not None:
             found[log.columns.quantity].append(log)
-    if in_folder and len(found['force']) > 1:
-        # Phones add linear accelerations, which have no gravity.
-        found['force'] = [log for log in found['force'] if log.has_gravity]
+    if in_folder:
+        found['force'] = _with_gravity_only(found['force'])
     for quantity, logs in found.items():
         if len(logs) != 1:
             names = ', '.join(log.table.path.name for log in logs)
@@ -517,7 +546,18 @@ def read_logs(
                 ' and gyroscope, or one that has both',
                 code='several_logs',
             )
-    force, rate = found['force'][0], found['rate'][0]
+    return _log_of_two(found['force'][0], found['rate'][0])
+
+
+def _with_gravity_only(logs):
+    """Return the logs of force without the linear accelerations that phones add to them."""
+    if len(logs) < 2:
+        return logs
+    return [log for log in logs if log.has_gravity]
+
+
+def _log_of_two(force, rate):
+    """Return the CsvLog of a `_SensorLog` of each sensor."""
     readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.table.path)
     of_force, of_rate = readings.columns
     return CsvLog(
@@ -532,6 +572,90 @@ def read_logs(
         joined=readings.joined,
         text=_text_of_two(force, rate, readings.joined),
     )
+
+
+@dataclass(frozen=True)
+class _SensorRows:
+    """The rows of one sensor in a log with a row per sensor."""
+
+    sensor: str
+    """'acc' or 'gyro'."""
+    name: str
+    """Name of the sensor in its column."""
+    condition: str
+    """COLUMN=VALUE of these rows."""
+
+
+def _rows_of_sensors(table, where):
+    """
+    Return the `_SensorRows` of a log with a row per sensor; [] for another log.
+
+    Of several rows of one sensor those without "uncalibrated" in their name remain.
+    """
+    for name in table.word_columns:
+        names = table.values_of(name, where)
+        rows = [
+            _SensorRows(sensor, value, f'{name}={value}')
+            for value in names
+            if (sensor := sensor_of_label(value))
+        ]
+        # A name of all rows is needed where no column has the name of a sensor.
+        if not rows or (
+            len(names) == 1 and any(each.quantity in SENSOR_OF for each in _guess(table))
+        ):
+            continue
+        plain = [each for each in rows if 'uncal' not in each.name.lower()]
+        named = {each.sensor for each in plain}
+        return plain + [each for each in rows if each.sensor not in named]
+    return []
+
+
+def _read_sensor_rows(path, rows, columns, where, *, raw):
+    """
+    Return the CsvLog of a log with a row per sensor.
+
+    Arguments as for `read_csv`; `rows`: `_SensorRows` of both sensors.
+    """
+    stated = [_parse(text) for text in columns]
+    other = [each for each in stated if each.quantity not in ('time', *SENSOR_OF)]
+    if other:
+        raise InputError(
+            f'of a log with a row per sensor time, force and rate are read, got {other[0]} for'
+            f' {path}; omit it, or join the rows of each time',
+            key='columns',
+            code='sensor_rows',
+        )
+    found: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
+    for each in rows:
+        quantity = 'force' if each.sensor == 'acc' else 'rate'
+        own = [columns for columns in stated if columns.quantity in ('time', quantity)]
+        table = _Table(path, each.sensor)
+        try:
+            log = _sensor_log(table, (*where, each.condition), own, raw)
+        except InputError:
+            if sum(other.sensor == each.sensor for other in rows) == 1:
+                raise
+            continue  # such as linear accelerations, whose unit is unknown
+        if log is None:
+            raise InputError(
+                f'{path} must have a column of {quantity} per axis and one of time in the rows'
+                f' {each.condition}, got {shortened(", ".join(table.names), 300)}; {REMEDY}',
+                key='columns',
+                code='sensor_rows',
+            )
+        found[quantity].append(replace(log, condition=each.condition))
+    found['force'] = _with_gravity_only(found['force'])
+    for quantity, logs in found.items():
+        if len(logs) != 1:
+            conditions = ', '.join(log.condition for log in logs) or 'none with gravity'
+            raise InputError(
+                f'one sensor must give the {quantity} in the rows of {path}, got {conditions};'
+                ' state the names of accelerometer and gyroscope (COLUMN=NAME,NAME)',
+                key='where',
+                code='sensor_rows',
+            )
+    force, rate = found['force'][0], found['rate'][0]
+    return replace(_log_of_two(force, rate), row_names=(force.condition, rate.condition))
 
 
 def _text_of_two(force, rate, joined):
@@ -560,11 +684,14 @@ class _SensorLog:
     stream: SensorStream
     """Force in SI; rates as in the log."""
     counted: CounterStamps
+    condition: str = ''
+    """COLUMN=NAME of its rows, where a column names the sensor."""
 
     @property
     def has_gravity(self) -> bool:
         """Whether a force has the length of gravity most of the time."""
-        return _force_unit(self.stream.values) == SI_UNITS['accelerometer']
+        unit = _force_unit(self.stream.values)
+        return unit == SI_UNITS['accelerometer'] or (self.columns.unit == RAW_UNIT and bool(unit))
 
 
 def _one_sensor(columns):
@@ -574,20 +701,30 @@ def _one_sensor(columns):
     return sensors[0] if 'time' in quantities and len(sensors) == 1 else None
 
 
-def _sensor_log(path, where):
-    """Return the `_SensorLog` of a path; None where it has neither sensor."""
-    table = _Table(path)
-    guess = _guess(table)
+def _sensor_log(table, where, stated=(), raw=()):
+    """
+    Return the `_SensorLog` of a table; None where it has neither sensor.
+
+    `stated`: Columns of the user; `raw` as for `read_csv`.
+    """
+    known = [table.stated(each) for each in stated]
+    quantities = {each.quantity for each in known}
+    guess = known + [each for each in _guess(table, quantities) if each.quantity not in quantities]
     found = {each.quantity: each for each in guess}
     sensor = _one_sensor(guess)
     if sensor is None:
         return None
     columns = found[sensor]
+    if sensor in raw:
+        columns = _as_raw(columns)
     table.load([*found['time'].names, *columns.names], where)
     time, counted = _times(table, found['time'])
+    # Both sensors count from one origin, but need not begin together.
+    start_ns = table.start_ns(time)
+    counted = replace(counted, stamp_ns=counted.stamp_ns + start_ns)
     values = table.values(columns.names)
     if columns.quantity == 'force':
-        columns = _with_unit(columns, lambda: _force_unit(values), path)
+        columns = _with_unit(columns, lambda: _force_unit(values), table.path)
         values = values * _size_of(columns)
     stream = finite_stream(counted.stamp_ns, values)
     return _SensorLog(table, time, columns, stream, counted)
@@ -788,9 +925,14 @@ def split_cells(line: str, delimiter: str | None, path: Path) -> list[str]:
 
 
 class _Table:
-    """Header and columns of a text log."""
+    """
+    Header and columns of a text log.
 
-    def __init__(self, path):
+    `sensor` ('acc' or 'gyro') has the rows that are read, whatever the names of their columns.
+    """
+
+    def __init__(self, path, sensor=''):
+        self.sensor = sensor
         if not path.is_file():
             raise InputError(f'a text log must be a regular file, got {path}; check the path')
         self.path = path
@@ -850,6 +992,11 @@ class _Table:
             for k, cell in enumerate(rows[first])
             if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell)
         }
+        self.word_columns = [
+            name
+            for k, name in enumerate(self.names)
+            if all(len(row) > k and _is_word(row[k]) for row in rows[first:])
+        ]
         self.clocks = {k for k, cell in enumerate(rows[first]) if TIME_OF_DAY.fullmatch(cell)}
         self.n_dropped = 0
         self.lines = []
@@ -896,9 +1043,7 @@ class _Table:
         wanted = sorted({self.column(name) for name in names})
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': None}
-        with _opened(self.path) as file:
-            lines = plain_lines(file.read().splitlines())[self.first :]
-        lines = self._selected(lines, where)
+        lines = self._selected(self._rows(), where)
         lines = self.lines = self._complete(lines, wanted[-1] + 1)
         number_lines = [self._as_numbers(line) for line in lines]
         with warnings.catch_warnings():
@@ -926,6 +1071,20 @@ class _Table:
             raise InputError(
                 f'{self.path} must have at least two rows of numbers, got fewer; check the file'
             )
+
+    def _rows(self):
+        """Return the lines of the rows."""
+        with _opened(self.path) as file:
+            return plain_lines(file.read().splitlines())[self.first :]
+
+    def values_of(self, name, where):
+        """Return the different cells of a column in the rows that fulfil `where`, sorted."""
+        column, found = self.column(name), set()
+        for line in self._selected(self._rows(), where):
+            cells = self._cells(line) if '"' in line else line.split(self.delimiter)
+            if len(cells) > column:
+                found.add(cells[column].strip())
+        return sorted(found)
 
     def _as_numbers(self, line):
         """Return a line without comment, with cells that have no quotes, and decimal points."""
@@ -977,9 +1136,7 @@ class _Table:
                     continue
                 cell = cells[column].strip()
                 seen[cell] += 1
-                if cell == value or (
-                    _numeric(cell) and _numeric(value) and float(cell) == float(value)
-                ):
+                if any(map(partial(_same, cell), (value, *value.split(',')))):
                     kept.append(line)
             if not kept:
                 most = ', '.join(cell for cell, _ in seen.most_common(5))
@@ -1004,6 +1161,14 @@ class _Table:
     def raw(self, name):
         """Return one column as read, float or datetime64."""
         return self._values[self.column(name)]
+
+    def start_ns(self, time):
+        """Return the first of the Columns of time, ns; 0 for dates and times since 1970."""
+        values = self.raw(time.names[0])
+        if len(time.names) == 2 or values.dtype.kind == 'M':
+            return 0
+        start = float(values[0]) * _time_size(time.unit)
+        return 0 if start > EPOCH else round(start * 1e9)
 
     def stamps(self, time):
         """
@@ -1120,6 +1285,12 @@ def _is_word(cell):
     return text[:1].isalpha() and text.lower() not in ('nan', 'inf', 'null', 'na')
 
 
+def _same(cell, value):
+    """Return whether a cell has a value, as text or as a number."""
+    value = value.strip()
+    return cell == value or (_numeric(cell) and _numeric(value) and float(cell) == float(value))
+
+
 def _without_brackets(text):
     """Return text without the brackets around it: (m/(s^2)) is m/(s^2)."""
     text = text.strip()
@@ -1147,6 +1318,8 @@ def _guess(table, stated=frozenset()):
             words = 'temperature'
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
         reading = _reading_of(words)
+        if table.sensor and reading is not None:
+            reading = replace(reading, sensor=table.sensor)
         for quantity, pattern in COLUMN_PATTERNS:
             if quantity in axes:
                 if reading is not None and re.fullmatch(pattern, reading.sensor):
@@ -1537,6 +1710,8 @@ def read_directly(path: Path, options: LogOptions) -> CsvLog:
         log = read_logs([path], options.columns, options.where)
     name = name_of_path(path)
     remark(f'{name} is read as {"; ".join(map(str, log.columns))}')
+    if log.row_names:
+        remark(f'{name} has a row per sensor, read are {" and ".join(log.row_names)}')
     if log.joined is not None:
         remark(f'{name}: {log.joined.text}')
     if log.n_dropped:

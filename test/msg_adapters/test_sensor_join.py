@@ -232,3 +232,88 @@ def test_a_late_gyroscope_of_one_stream_is_named_with_its_value(streams, late_s)
     assert abs(stored['delay'] - late_s) < 4 * stored['sd'] + 1e-3
     named = [each['check'] for each in found.statistics['preflight']]
     assert ('gyroscope_delay' in named) == (late_s != 0.0)
+
+
+OTHER_ROWS = [f'Magnetometer,{START_NS + k * 10**8},1,2,3' for k in range(20)]
+
+
+def sensor_rows(streams, names, *, start_ns=0, unit_ns=1, force_scale=1.0, rate_scale=1.0):
+    """Return rows NAME,time,x,y,z of both sensors in order of their names."""
+    rows = []
+    for name, stream, scale in zip(names, streams, (force_scale, rate_scale), strict=True):
+        for stamp, values in zip(stream.stamp_ns, scale * stream.values, strict=True):
+            numbers = ','.join(f'{value:.9f}' for value in values)
+            rows.append(f'{name},{(stamp - start_ns) / unit_ns if start_ns else stamp},{numbers}')
+    return rows
+
+
+@pytest.mark.parametrize(
+    ('names', 'header', 'options'),
+    [
+        (('Accelerometer', 'Gyroscope'), 'sensor,time,x,y,z', {}),
+        # One unit in the header; the other sensor has another one, by its values.
+        (('ACCE', 'GYRO'), 'type,time,x (m/s^2),y (m/s^2),z (m/s^2)', {'rate_scale': 180 / np.pi}),
+        # Times since the start of the phone, both of which must keep their difference.
+        (
+            ('android.sensor.accelerometer', 'android.sensor.gyroscope'),
+            'sensor,time (ms),X,Y,Z',
+            {'start_ns': START_NS - 10**13, 'unit_ns': 10**6, 'force_scale': 1 / 9.80665},
+        ),
+    ],
+)
+def test_a_log_with_a_row_per_sensor_is_split_by_their_names(
+    streams, tmp_path, names, header, options
+):
+    path = tmp_path / 'log.csv'
+    rows = sensor_rows(streams, names, **options)
+    path.write_text('\n'.join([header, *OTHER_ROWS * (not options), *rows]) + '\n')
+    log = read_csv(path)
+    assert len(log.row_names) == 2 and all(map(str.endswith, log.row_names, names))
+    expected = join_sensors(*streams)
+    assert len(log.imu) == len(expected.imu)
+    np.testing.assert_allclose(log.imu.force_s, expected.imu.force_s, atol=1e-7)
+    # Stamps of 19 digits lose 256 ns, in turns with up to 20 rad/s^2.
+    np.testing.assert_allclose(log.imu.rate_s, expected.imu.rate_s, atol=1e-5)
+    assert log.joined.delay.delay == pytest.approx(expected.delay.delay, abs=1e-6)
+    with refused(InputError, 'sensor_rows'):
+        read_csv(path, ['temperature=3:C'])
+
+
+def test_names_of_sensors_decide_and_can_be_selected(streams, tmp_path):
+    path = tmp_path / 'log.csv'
+    names = ('acc', 'gyro left')
+    rows = sensor_rows(streams, names)
+    other = [row.replace('left', 'right') for row in rows if 'left' in row]
+    path.write_text('\n'.join(['sensor,time,x,y,z', *rows, *other]) + '\n')
+    with refused(InputError, 'sensor_rows', 'left', 'right'):
+        read_csv(path)
+    both = read_csv(path, where=['sensor=acc,gyro left'])
+    assert np.isfinite(both.imu.rate_s).all()
+    one = read_csv(path, where=['sensor=acc'])
+    assert np.isnan(one.imu.rate_s).all() and len(one.imu) == len(streams[0].stamp_ns)
+    # Numbers name no sensor, and columns without a header need a statement.
+    path.write_text('\n'.join(['sensor,time,x,y,z', *(f'{len(row) % 2}{row[3:]}' for row in rows)]))
+    with pytest.raises(InputError, match='x, y, z name no sensor'):
+        read_csv(path)
+    path.write_text('\n'.join(rows) + '\n')
+    with refused(InputError, 'sensor_rows', '1=acc'):
+        read_csv(path)
+    stated = read_csv(path, ['time=2:ns', 'force=3,4,5:m/s^2', 'rate=3,4,5:rad/s'])
+    np.testing.assert_array_equal(stated.imu.force_s, both.imu.force_s)
+
+
+def test_two_logs_that_count_from_one_origin_keep_their_difference(streams, tmp_path):
+    force, rate = streams
+    rate = SensorStream(rate.stamp_ns[400:], rate.values[400:])  # it begins 3 s later
+    for name, stream in (('acc', force), ('gyro', rate)):
+        seconds = [f'{(stamp - START_NS) * 1e-9 + 77.0:.9f}' for stamp in stream.stamp_ns]
+        lines = [
+            ','.join([time, *(f'{value:.9f}' for value in values)])
+            for time, values in zip(seconds, stream.values, strict=True)
+        ]
+        header = ','.join(['time (s)', *(f'{name}_{axis}' for axis in 'xyz')])
+        (tmp_path / f'{name}.csv').write_text('\n'.join([header, *lines]) + '\n')
+    joined = read_logs([tmp_path / 'acc.csv', tmp_path / 'gyro.csv']).joined
+    expected = join_sensors(force, rate)
+    assert len(joined.imu) == len(expected.imu)
+    assert joined.delay.delay == pytest.approx(expected.delay.delay, abs=1e-5)

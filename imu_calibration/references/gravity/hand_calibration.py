@@ -278,7 +278,7 @@ def gather_by_hand(
     attitudes = distinct_attitudes(poses.force)
     # Without an accelerometer gravity is not measured: rests determine the gyroscope's bias.
     if attitudes < MIN_ATTITUDES and 'accelerometer' not in imu.absent:
-        require_no_sway(imu, poses.force, list(zip(poses.start, poses.stop)), MIN_ATTITUDES)
+        require_no_sway(imu, poses.force, list(zip(poses.start, poses.stop)), least=MIN_ATTITUDES)
         raise NotObservableError(
             f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still'
             f' ({POSES_FULL} or more for all parameters), got {attitudes} in {len(poses.start)}'
@@ -539,7 +539,7 @@ def _as_ranges(imu: ImuSamples, stills: Sequence[slice] | None) -> list[tuple[in
     ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
     ranges = [(a, b) for a, b in ranges if b - a >= 2]
     if not ranges:
-        require_no_sway(imu, np.zeros((0, 3)), [], MIN_ATTITUDES)
+        require_no_sway(imu, np.zeros((0, 3)), [], least=MIN_ATTITUDES)
         raise NotObservableError(
             f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still, '
             'got no interval at rest; hold the IMU still for a second or more in each attitude, '

@@ -20,7 +20,7 @@ KEPT_SECONDS = 1.0
 
 
 def require_no_sway(
-    imu: ImuSamples, rest_force: np.ndarray, rests: Sequence[tuple[int, int]], least: int
+    imu: ImuSamples, rest_force: np.ndarray, rests: Sequence[tuple[int, int]], *, least: int
 ) -> None:
     """
     Refuse a recording in which a sway leaves fewer than the needed attitudes at rest.
