@@ -118,7 +118,7 @@ def number(
     return check
 
 
-def whole(low: int = 0, high: int = 2**62) -> Requirement:
+def whole(low: float = 0, high: float = 2**62) -> Requirement:
     """Require an integer in [low, high]."""
 
     def check(value: Any, place: str) -> None:

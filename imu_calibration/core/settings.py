@@ -2,12 +2,26 @@
 Every adjustable number, declared once: YAML files, options and ROS parameters are made from here.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from typing import Any
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.schema import (
+    Document,
+    Requirement,
+    anything,
+    flag,
+    mapping,
+    number,
+    require,
+    text,
+    whole,
+)
 
+SETTINGS = Document('setting', anything, 'correct or omit it', error=InputError)
+"""Values of settings by name; the requirement of each follows from its declaration."""
 CHANGE = 1.5
 """
 Factor of the error from which a significant change counts, a convention: with it the error of a
@@ -84,34 +98,26 @@ def override(group: Any, values: Mapping[str, Any]) -> Any:
 
     """
     known = {item.name: item for item in describe(group)}
+    parts = {name: _requirement(item) for name, item in known.items()}
+    require(values, SETTINGS, mapping(optional=parts, closed=True))
     checked = {}
     for name, value in values.items():
-        if name not in known:
-            raise InputError(
-                f"setting '{name}' is unknown; the settings here are {', '.join(sorted(known))}"
-            )
-        checked[name] = _checked(known[name], value)
+        checked[name] = float(value) if isinstance(known[name].default, float) else value
     return replace(group, **checked)
 
 
-def _checked(declared, value):
-    default, (low, high) = declared.default, declared.bounds
-    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if default is not None and not isinstance(value, type(default)):
-        raise InputError(
-            f"setting '{declared.name}' must be {type(default).__name__}, got {value!r}; correct it"
-        )
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        if (low is not None and value < low) or (high is not None and value > high):
-            raise InputError(
-                f"setting '{declared.name}' must lie in [{low}, {high}], got {value!r}; choose a"
-                ' value inside'
-            )
-    if declared.choices and value not in declared.choices:
-        raise InputError(
-            f"setting '{declared.name}' must be one of {', '.join(declared.choices)}, got"
-            f" '{value}'; choose one",
-            code='choice_unknown',
-        )
-    return value
+def _requirement(declared: Setting) -> Requirement:
+    """Return the requirement of a value: its type is that of the default."""
+    low, high = declared.bounds
+    low = -math.inf if low is None else low
+    high = math.inf if high is None else high
+    match declared.default:
+        case bool():
+            return flag()
+        case int():
+            return whole(low, high)
+        case float():
+            return number(low, high)
+        case str():
+            return text(*declared.choices, code='choice_unknown' if declared.choices else '')
+    return anything

@@ -37,6 +37,11 @@ Sine of the angle up to which two axes count as parallel: their common perpendic
 there.
 """
 
+MOST_JOINTS = 16
+"""
+Largest number of joints, for which a plan takes 1.4 GB and 100 s: the memory grows with the square.
+"""
+
 
 class AxisAngle(NamedTuple):
     """One angular error of an axis relative to the preceding axis."""
@@ -360,6 +365,12 @@ def _require_joints(joints):
             'table: joints must list at least one joint, got none; describe them from the base'
             ' outwards',
             code='no_joint',
+        )
+    if len(joints) > MOST_JOINTS:
+        raise InputError(
+            f'table: joints must be at most {MOST_JOINTS}, got {len(joints)}; omit those that do'
+            ' not move',
+            code='joints_many',
         )
     names = [joint.name for joint in joints]
     for name in names:

@@ -328,6 +328,11 @@ mount: {rpy_deg: [0, 0, 90], xyz: null}
         ({'joint': []}, 'key_unknown', ["'joint'", 'joints, up']),
         ({'joints': None}, 'no_joint', ['joints']),
         ({'joints': []}, 'no_joint', ['joints']),
+        (
+            {'joints': [{'name': f'j{k}', 'axis': [0, 0, 1]} for k in range(17)]},
+            'joints_many',
+            [16, 17],
+        ),
         ({'joints': [{'name': 'a'}]}, 'keys_missing', ["{'name': 'a'}", 'axis']),
         (
             {'joints': [{'name': 'a', 'axis': [0, 0, 0]}]},

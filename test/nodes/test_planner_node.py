@@ -177,7 +177,7 @@ def test_an_action_without_control_msgs_is_refused_and_auto_takes_the_topic(monk
     with refused(InputError, 'package_missing', 'control_msgs'):
         joint_commands.make_command(node, 'action', print)
     assert isinstance(joint_commands.make_command(node, 'auto', print), joint_commands.TopicCommand)
-    with refused(InputError, 'choice_unknown', 'command', 'topic, action, auto'):
+    with refused(InputError, 'choice_unknown', 'command', 'topic', 'action', 'auto'):
         override(PlannerNodeSettings(), {'command': 'telepathy'})
 
 
