@@ -3,12 +3,17 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from imu_calibration.calibration.check_result import TOO_FEW_WINDOWS, CheckResult
+from imu_calibration.calibration.check_result import (
+    OWN_RECORDING,
+    TOO_FEW_WINDOWS,
+    CheckResult,
+)
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.settings import CHANGE
-from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
+from imu_calibration.document.calibration import Calibration, scale_questions
 from imu_calibration.document.change import changes_since
+from imu_calibration.document.outcome import decision_limits
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.preprocessing.checks import unusable
@@ -61,7 +66,11 @@ def require_sensor(calibration: Calibration, absent: Collection[str]) -> frozens
 
 
 def check_errors(
-    errors: ReadingErrors, calibration: Calibration, *, change_limit: float = CHANGE
+    errors: ReadingErrors,
+    calibration: Calibration,
+    *,
+    change_limit: float = CHANGE,
+    own_recording: bool = False,
 ) -> CheckResult:
     """
     Return the result of the check of a calibration.
@@ -73,26 +82,26 @@ def check_errors(
     calibration : Calibration
     change_limit : float
         Factor of the error from which a significant change counts, at least 1.
+    own_recording : bool
+        Whether the calibration was made from this recording: no decision is then better than that
+        in its file.
 
     """
-    refused = {}
-    for sensor in calibration.sensors:
-        if why := never_applied(calibration, sensor):
-            refused[sensor] = why
-
     # Errors of the same kind of motion now and on the day of the calibration.
     changes = changes_since(errors.stored, errors.proof)
     notes = [*errors.notes]
     if errors.proof and not changes:
         notes.append('the file has no held-out error of the same kinds of motion to compare')
     notes += scale_questions(calibration).values()
+    if own_recording:
+        notes.append(OWN_RECORDING)
 
     return CheckResult(
         errors.proof,
         errors.findings,
         why=errors.why,
         notes=tuple(notes),
-        refused=refused,
+        limits=decision_limits(calibration, own_recording=own_recording),
         changes=changes,
         change_limit=change_limit,
         dropped=dropped_text({**errors.lost, 'unusable': unusable(errors.findings)}, errors.n_used),

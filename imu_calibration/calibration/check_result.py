@@ -7,17 +7,19 @@ from imu_calibration.core.settings import CHANGE
 from imu_calibration.document.change import RegimeChange
 from imu_calibration.document.decision import (
     HELPS,
-    UNPROVEN,
     SensorDecision,
     decide,
     most_cautious,
     reason_of,
     worse_regimes,
 )
+from imu_calibration.document.outcome import DecisionLimit
 from imu_calibration.document.proof_entry import Proof
 
 TOO_FEW_WINDOWS = 'fewer than three windows of rest or motion were found; record for longer'
 """Why there is no proof on a table."""
+OWN_RECORDING = 'it was calibrated from this recording: the result can differ on new recordings'
+"""Note on a check with the recording of the calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +34,8 @@ class CheckResult:
     """Why there is no proof, where there is none."""
     notes: tuple[str, ...] = ()
     """Notes on the result."""
-    refused: dict[str, str] = field(default_factory=dict)
-    """Sensor of which compensation refuses the values -> why."""
+    limits: dict[str, DecisionLimit] = field(default_factory=dict)
+    """Sensor -> best decision that this recording can give (`outcome.decision_limits`)."""
     changes: tuple[RegimeChange, ...] = ()
     """Error now against the held-out error in the file of the calibration, by regime."""
     change_limit: float = CHANGE
@@ -93,13 +95,19 @@ class CheckResult:
         return lines
 
     def decision(self, sensor: str) -> SensorDecision:
-        """Return the decision on a sensor; at best UNPROVEN where compensation refuses it."""
-        found = decide(self.proof.get(sensor))
-        return most_cautious([found, UNPROVEN]) if sensor in self.refused else found
+        """Return the decision on a sensor: that of its errors, at best its limit."""
+        decisions = [decide(self.proof.get(sensor))]
+        if sensor in self.limits:
+            decisions.append(self.limits[sensor].decision)
+        return most_cautious(decisions)
 
     def _line(self, sensor: str) -> str:
-        why = f'; not applied: {self.refused[sensor]}' if sensor in self.refused else ''
-        return f'{sensor} {self.decision(sensor)}: {reason_of(self.proof.get(sensor))}{why}'
+        decision = self.decision(sensor)
+        why = reason_of(self.proof.get(sensor))
+        limit = self.limits.get(sensor)
+        if limit is not None and limit.decision is decision:
+            why = limit.why
+        return f'{sensor} {decision}: {why}'
 
     @property
     def helped(self) -> Proof:

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.document.calibration import Calibration, listed, never_applied
-from imu_calibration.document.decision import HELPS, WARNING, reason_of
+from imu_calibration.document.decision import (
+    HELPS,
+    UNPROVEN,
+    WARNING,
+    SensorDecision,
+    reason_of,
+)
 from imu_calibration.estimation.solution import DETERMINED
 
 STATED_CHECKS = ('latitude', 'mount')
@@ -65,13 +71,43 @@ def dropped_of(calibration: Calibration) -> tuple[dict[str, int], int]:
     return dropped, kept
 
 
+@dataclass(frozen=True)
+class DecisionLimit:
+    """The best decision that any recording can give on a sensor, where that is not `helps`."""
+
+    decision: SensorDecision
+    """The decision."""
+    why: str
+    """Its reason."""
+
+
+def decision_limits(
+    calibration: Calibration, *, own_recording: bool = True
+) -> dict[str, DecisionLimit]:
+    """
+    Return sensor -> limit of the decision on it.
+
+    On the recording of the calibration its decision is the limit: the errors of the same readings
+    are no further evidence. On others only the values count that compensation refuses.
+    """
+    limits = {}
+    for sensor, decision in calibration.decisions.items():
+        refused = never_applied(calibration, sensor)
+        if decision is HELPS or not (refused or own_recording):
+            continue
+        why = refused or calibration.decision_reasons.get(sensor)
+        limits[sensor] = DecisionLimit(
+            decision if own_recording else UNPROVEN,
+            why or reason_of(calibration.proof.get(sensor)),
+        )
+    return limits
+
+
 def shortcomings(calibration: Calibration) -> list[str]:
     """Return the reasons for which the exit code is 3, a line each; empty for 0."""
     lines = []
-    for sensor, word in calibration.decisions.items():
-        if word is not HELPS:
-            why = never_applied(calibration, sensor) or calibration.decision_reasons.get(sensor)
-            lines.append(f'{sensor} {word}: {why or reason_of(calibration.proof.get(sensor))}')
+    for sensor, limit in decision_limits(calibration).items():
+        lines.append(f'{sensor} {limit.decision}: {limit.why}')
     for sensor, why in (calibration.statistics.get('unusable_sensors') or {}).items():
         lines.append(f'{sensor} not calibrated: {why}')
     for entry in calibration.statistics.get('preflight') or ():

@@ -279,15 +279,5 @@ def check_recording(
     else:
         names = [name_of(recording)]
         errors = errors_on_table(sources, table, calibration, options=options, names=names)
-    result = check_errors(errors, calibration, change_limit=limit)
-    return replace(result, notes=(*result.notes, *_notes(recording, calibration)))
-
-
-def _notes(recording, calibration):
-    """Return a note when the calibration was made from this very recording."""
-    same = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
-    return (
-        ('it was calibrated from this recording: the result can differ on new recordings',)
-        if same
-        else ()
-    )
+    own = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
+    return check_errors(errors, calibration, change_limit=limit, own_recording=bool(own))

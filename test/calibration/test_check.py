@@ -10,6 +10,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.outcome import shortcomings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.window_statistics import Regime
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
@@ -71,6 +72,19 @@ def test_a_sensor_without_readings_is_unproven_and_a_3(pair, calibrated):
     assert list(found.helped) == ['accelerometer'] and not found.helps
     assert found.decision('gyroscope') == 'unproven' and found.exit_code == 3
     assert [line for line in found.reasons if 'gyroscope unproven' in line]
+
+
+def test_the_own_recording_gives_no_better_decision_than_its_file(pair, calibrated):
+    table, why = Table.from_mapping(pair.table), 'none of its parameters is determined'
+    known = replace(
+        calibrated.calibration,
+        decision={'accelerometer': 'unproven', 'gyroscope': 'helps'},
+        decision_reasons={'accelerometer': why},
+    )
+    own, new = (check_recording(data.block, known, table) for data in (pair.first, pair.second))
+    assert own.reasons == shortcomings(known)[:1] and why in own.reasons[0]
+    assert list(own.helped) == ['gyroscope'] and own.exit_code == 3
+    assert new.helps and new.exit_code == 0
 
 
 def test_nothing_to_judge_on_is_no_proof():
