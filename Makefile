@@ -38,6 +38,8 @@ endif
 
 STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
+# Every line of the list and of those that it names. The lists are complete: nothing is resolved, and two processes install half of one each.
+ALL_PINS = cat $(PINS) $$(sed -n 's|^-r |constraints/|p' $(PINS))
 # Four processes on two cores: live tests mostly wait. conftest.py orders the files. test/run_lanes.py repeats live tests that failed.
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 4
@@ -58,8 +60,8 @@ $(STAMP): $(filter-out $(addprefix constraints/,docs.txt rosdebian.txt validate.
 	  { echo 'The venv module of $(PYTHON) is missing; run: apt-get install python3-venv' >&2; exit 1; }
 	@echo 'Installing $(PINS) into $(VENV): a minute or two, once.'
 	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
-	@$(PIP) $$(cat $(PINS) $$(sed -n 's|^-r |constraints/|p' $(PINS)) | grep -oE '^(setuptools|wheel)==[0-9.]+')
-	@$(PIP) --prefer-binary --no-build-isolation --use-pep517 --requirement $(PINS)
+	@$(PIP) $$($(ALL_PINS) | grep -oE '^(setuptools|wheel)==[0-9.]+')
+	@$(ALL_PINS) | grep '^[A-Za-z]' | split -n r/2 --filter='$(PIP) --prefer-binary --no-deps --no-build-isolation --use-pep517 --requirement /dev/stdin'
 	@$(PIP) --no-deps --no-build-isolation --use-pep517 --editable .
 	@touch $@
 

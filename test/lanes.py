@@ -89,8 +89,13 @@ def pytest_sessionstart():
 
 
 def pytest_collection_finish():
-    """Begin with the collection of garbage, from which everything that was imported is exempt."""
+    """
+    Begin with the collection of garbage, from which everything that was imported is exempt.
+
+    It begins after 20,000 new objects in place of 700, a fiftieth of the time of all tests.
+    """
     gc.freeze()
+    gc.set_threshold(20_000)
     gc.enable()
 
 
