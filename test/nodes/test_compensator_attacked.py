@@ -172,7 +172,7 @@ def test_parameters_change_while_it_runs_or_say_why_not(bench, place, tmp_path):
     for values, words in (
         ({'calibration_file': str(tmp_path / 'other.yaml')}, 'read-only'),
         ({'noise_file': '/dev/zero'}, 'read-only'),
-        ({'adopt': 'nobody'}, 'file, topic, file_then_topic'),
+        ({'adopt': 'nobody'}, 'file_then_topic'),
         ({'public_executor': True}, 'public_executor'),
         ({'target_xyz': [1.0, 0.0, 0.0]}, 'target_frame'),
     ):
