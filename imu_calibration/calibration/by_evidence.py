@@ -131,7 +131,12 @@ def _solved_with(
     point: dict[str, np.ndarray] = {}
     for search in searches:
         point |= search.point_of_adopted
-    extension = ModelExtension(tuple(question.effect.key for question in added), point)
+    keys = [question.effect.key for question in added]
+    for question in added:
+        lower = (question.sensor, question.effect.lower_order)
+        if question.effect.lower_order and lower not in (*keys, *first.model.slices):
+            keys.append(lower)
+    extension = ModelExtension(tuple(keys), point)
     return replace(source.solved(extension.options(options)), extension=extension)
 
 

@@ -209,6 +209,11 @@ class Effect:
     Abscissa of its residual plot: 'time', 'temperature', 'force', 'rate', 'angle'; empty: its own
     signal.
     """
+    lower_order: str = ''
+    """
+    Effect of the same sensor that a model with it has too: the vertex of a parabola is a
+    convention, ``(x - r)^2 = (x - s)^2 + 2 (s - r) (x - s) + constant``.
+    """
     contained_in: str = ''
     """Effect of the same sensor of which it is a special case."""
     known_size: bool = False

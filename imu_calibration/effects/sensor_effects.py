@@ -176,6 +176,7 @@ def _pair(sensor):
             ),
             motion=('warm_up',),
             needs=('temperature',),
+            lower_order=f'{short}_thermal_bias',
             groups=(base.TEMPERATURE_SQUARED,),
             coefficients=amplitude_coefficients,
         ),

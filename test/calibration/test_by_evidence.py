@@ -4,7 +4,7 @@ One mind for two verbs.
 What a recording demands is in the model of `calibrate`, as `diagnose` finds it, and nothing else.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -13,7 +13,12 @@ import pytest
 
 import imu_calibration as imu
 from imu_calibration.calibration import by_evidence
-from imu_calibration.calibration.by_evidence import _moves, extended_solution, stands_out
+from imu_calibration.calibration.by_evidence import (
+    _moves,
+    _solved_with,
+    extended_solution,
+    stands_out,
+)
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
@@ -432,3 +437,40 @@ def test_a_wander_of_every_axis_passes_for_noise_and_is_told():
     assert result.document['notes'] == [note]
     plain = make_session(7, None, 'realistic', **COARSE)
     assert not diagnosed(plain).notes
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Options with which a model was solved, in place of its solution."""
+
+    options: CalibrationOptions
+    extension: ModelExtension | None = None
+
+
+@pytest.mark.parametrize(
+    ('model', 'added'),
+    [
+        (SensorModel(), ['accel_thermal_bias_2', 'accel_thermal_bias']),
+        (
+            SensorModel().with_effect('accelerometer', 'accel_thermal_bias'),
+            ['accel_thermal_bias_2'],
+        ),
+    ],
+)
+def test_a_bend_with_the_temperature_is_estimated_with_its_slope(model, added):
+    """
+    The vertex at the rounded first temperature is a convention.
+
+    With the vertex 2 K away the coefficient of the square alone was wrong by 10 sd.
+    """
+    question = SimpleNamespace(
+        sensor='accelerometer', effect=CATALOGUE.find('accelerometer', 'accel_thermal_bias_2')
+    )
+    solved = _solved_with(
+        SimpleNamespace(solved=Stated),
+        CalibrationOptions(),
+        SimpleNamespace(model=model),
+        [question],
+        [],
+    )
+    assert solved.options.added == tuple(('accelerometer', name) for name in added)
