@@ -69,7 +69,8 @@ LARGEST_FIGURE = 1e30
 STATUSES = (DETERMINED, WEAK, HELD)
 """Statuses of a figure."""
 _FIGURE = number(-LARGEST_FIGURE, LARGEST_FIGURE)
-_SIZE = number(0.0, LARGEST_FIGURE, code='status_or_interval')
+_SIZE = number(0.0, LARGEST_FIGURE)
+_BOUND = number(0.0, LARGEST_FIGURE, code='status_or_interval')
 _FORM = list_of(text(*TERMS, code='not_a_text'))
 
 
@@ -79,21 +80,21 @@ def _of_axes(each: Requirement) -> Requirement:
 
 _TERM = mapping(
     {
-        'value': _of_axes(maybe(_FIGURE)),
-        'interval95': _of_axes(maybe(list_of(maybe(_SIZE), 2, code='status_or_interval'))),
+        'value': _of_axes(maybe(_SIZE)),
+        'interval95': _of_axes(maybe(list_of(maybe(_BOUND), 2, code='status_or_interval'))),
         'status': _of_axes(maybe(text(*STATUSES, code='status_or_interval'))),
     },
     {'reason': maybe(_of_axes(text(code='not_a_text')))},
 )
 _TREND = mapping(
-    dict.fromkeys(('value', 'sd'), _of_axes(maybe(_FIGURE))),
-    {'time_constant': _of_axes(maybe(_FIGURE))},
+    {'value': _of_axes(maybe(_FIGURE)), 'sd': _of_axes(maybe(_SIZE))},
+    {'time_constant': _of_axes(maybe(_SIZE))},
 )
 _SENSOR = mapping(
     {
         'slow_part': _of_axes(_FORM),
         'also_possible': _of_axes(list_of(_FORM)),
-        **dict.fromkeys(('sample_sd', 'shortest_averaging_time', 'excess'), _of_axes(_FIGURE)),
+        **dict.fromkeys(('sample_sd', 'shortest_averaging_time', 'excess'), _of_axes(_SIZE)),
     },
     {
         **dict.fromkeys(TERMS, _TERM),
@@ -101,12 +102,12 @@ _SENSOR = mapping(
         'taken_out': maybe(
             mapping(optional=dict.fromkeys(('temperature', 'turn_on', 'ramp'), _TREND), closed=True)
         ),
-        'record_for': maybe(mapping(each=_of_axes(maybe(_FIGURE)))),
-        'scatter_between_rests': maybe(_of_axes(_FIGURE)),
-        'oscillation': maybe(_of_axes(maybe(list_of(_FIGURE, 2)))),
+        'record_for': maybe(mapping(each=_of_axes(maybe(_SIZE)))),
+        'scatter_between_rests': maybe(_of_axes(_SIZE)),
+        'oscillation': maybe(_of_axes(maybe(list_of(_SIZE, 2)))),
     },
 )
-_CURVE = list_of(_FIGURE)
+_CURVE = list_of(_SIZE)
 NOISE = Document(
     'noise document',
     mapping(
@@ -114,7 +115,7 @@ NOISE = Document(
         {
             **dict.fromkeys(SENSORS, _SENSOR),
             'frame_id': text(code='not_a_text'),
-            'recording': maybe(mapping(optional={'seconds_at_rest': maybe(_FIGURE)})),
+            'recording': maybe(mapping(optional={'seconds_at_rest': maybe(_SIZE)})),
             'provenance': maybe(mapping()),
             'allan_deviation': maybe(
                 mapping(

@@ -28,7 +28,7 @@ def noise():
 
 
 @pytest.mark.parametrize(
-    'value', [float('inf'), float('nan'), 10**40, True, 'text', '1.5', [1.0], {'a': 1.0}]
+    'value', [-1.0, float('inf'), float('nan'), 10**40, True, 'text', '1.5', [1.0], {'a': 1.0}]
 )
 @pytest.mark.parametrize('part', ['excess', 'sample_sd', 'shortest_averaging_time', 'value'])
 def test_a_figure_of_another_kind_is_refused(noise, part, value):
