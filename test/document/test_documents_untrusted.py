@@ -77,6 +77,33 @@ def test_a_px4_file_without_the_default_parameters_is_imported(tmp_path):
     assert found.model.temperature_ref_c == 25.0
 
 
+def import_px4(folder, **parameters):
+    """Return the calibration of a parameter file in which both sensors have a slope."""
+    slopes = {'TC_A_ENABLE': 1, 'TC_G_ENABLE': 1, 'TC_A0_X1_0': 0.01, 'TC_G0_X1_0': 0.002}
+    slopes |= {'CAL_ACC0_XOFF': 0.0, 'CAL_GYRO0_XOFF': 0.0}
+    lines = [f'1\t1\t{name}\t{value}\t9\n' for name, value in (slopes | parameters).items()]
+    return import_file(
+        find_target('px4'), ''.join(lines).encode(), folder / 'absent', frame_id='imu_link'
+    )
+
+
+def test_px4_sensors_with_other_reference_temperatures_share_one(tmp_path):
+    """That of the gyroscope counted for both sensors."""
+    found = import_px4(tmp_path, TC_A0_TREF=40.0, TC_G0_TREF=35.0, TC_G0_TMIN=10.0)
+    assert found.model.temperature_ref_c == 40.0
+    values = dict(zip(found.model.param_names, found.values, strict=True))
+    assert values['accelerometer.bias.x'] == 0
+    assert values['gyroscope.bias.x'] == pytest.approx(0.002 * 5.0)
+    assert found.conditions['temperature_range_c'] == [10.0, 100.0]
+
+
+@pytest.mark.parametrize('value', ['inf', 'nan'])
+@pytest.mark.parametrize('name', ['TC_A0_TREF', 'TC_G0_TREF', 'TC_A0_TMIN'])
+def test_a_px4_temperature_that_is_not_finite_is_refused(tmp_path, name, value):
+    with pytest.raises(InputError):
+        import_px4(tmp_path, **{name: value})
+
+
 @pytest.mark.parametrize('value', [float('inf'), float('nan'), -float('inf')])
 def test_a_coefficient_that_overflows_is_refused_before_it_becomes_a_name(value):
     with refused(InputError, 'column_overflows', 'finite'):

@@ -4,6 +4,7 @@ ArduPilot and PX4.
 Parameter files with offsets, scale factors and linear temperature calibration of the first IMU.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from itertools import product
 from pathlib import Path
@@ -256,29 +257,36 @@ def imu_px4(found: dict) -> AffineImu:
     Thermal offsets beyond the first power are refused by `read_px4`.
     """
     bias, thermal = {}, {}
-    ref, limits = PX4_REFERENCE_C, None
+    ref: float | None = None
+    lowest, highest = -math.inf, math.inf
     for sensor in SENSORS:
         short = f'{TC[sensor]}0'
         bias[sensor] = vector_of(found, CAL_OFFSET[sensor])
         thermal[sensor] = np.zeros(3)
         if found.get(f'{TC[sensor]}_ENABLE'):
-            # thermal correction = X0 + X1 (T - TREF): X0 is a part of the bias.
-            constant = [found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)]
-            linear = [found.get(f'{short}_X1_{axis}', 0.0) for axis in range(3)]
-            bias[sensor] = bias[sensor] + constant
-            thermal[sensor] = np.array(linear)
             # Parameter files omit parameters that have the autopilot's default.
-            ref = found.get(f'{short}_TREF', PX4_REFERENCE_C)
-            limits = (
-                found.get(f'{short}_TMIN', PX4_RANGE_C[0]),
-                found.get(f'{short}_TMAX', PX4_RANGE_C[1]),
-            )
+            sensor_ref = found.get(f'{short}_TREF', PX4_REFERENCE_C)
+            if ref is None:
+                ref = sensor_ref
+            # The reference of each sensor is its own, that of a calibration is common:
+            #   X0 + X1 (T - TREF) = X0 + X1 (ref - TREF) + X1 (T - ref)
+            constant = [found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)]
+            linear = np.array([found.get(f'{short}_X1_{axis}', 0.0) for axis in range(3)])
+            bias[sensor] = bias[sensor] + constant + linear * (ref - sensor_ref)
+            thermal[sensor] = linear
+            lowest = np.maximum(lowest, found.get(f'{short}_TMIN', PX4_RANGE_C[0]))
+            highest = np.minimum(highest, found.get(f'{short}_TMAX', PX4_RANGE_C[1]))
+    if ref is not None and not -math.inf < lowest < highest < math.inf:
+        raise InputError(
+            'the temperatures from TMIN to TMAX of a PX4 parameter file must be a range that the'
+            f' sensors share, got {lowest:g} to {highest:g}; correct them'
+        )
     return AffineImu(
         bias=bias,
         matrix=_matrix(found, CAL_SCALE),
         thermal=thermal,
-        temperature_ref_c=ref,
-        temperature_range_c=limits,
+        temperature_ref_c=PX4_REFERENCE_C if ref is None else ref,
+        temperature_range_c=None if ref is None else (float(lowest), float(highest)),
     )
 
 
