@@ -116,6 +116,13 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
             code='nothing_in_common',
         )
     notes = _notes(first, second)
+    mat_flu_first = first.readings.mat_flu_source()
+    mat_flu_second = second.readings.mat_flu_source()
+    if mat_flu_first is not None and mat_flu_second is not None:
+        turn = mat_flu_first.T @ mat_flu_second
+        if not np.array_equal(turn, np.eye(3)):
+            notes.append(f'both are compared in the axes {first.readings.axes} of the first one')
+            second = _in_other_readings(second, turn)
     axes = {first.gauge.get('axes'), second.gauge.get('axes')}
     if axes == {MOUNT_AXES, ACCELEROMETER_AXES}:
         note = 'both are compared in the axes of the accelerometer'
@@ -160,6 +167,47 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
         status=tuple(status),
         covariance_terms={},
         gauge={**calibration.gauge, 'axes': ACCELEROMETER_AXES},
+    )
+
+
+def _in_other_readings(calibration: Calibration, mat_ts: np.ndarray) -> Calibration:
+    """
+    Return the same calibration of readings in other axes, ``mat_ts reading`` (signed permutation).
+
+    A bias b becomes ``P b``, a matrix M ``P M P'``, arms A (a row per output) ``|P| A P'``: linear
+    in the values.
+
+    Raises
+    ------
+    InputError
+        For effects of another form.
+
+    """
+    slope = np.eye(len(calibration.values))
+    for effect in calibration.model.effects:
+        if effect.sensor not in SENSORS:
+            continue
+        part = calibration.model.slices[effect.key]
+        if effect.role is Role.OFFSET:
+            slope[part, part] = mat_ts
+        elif effect.role in (Role.LINEAR, Role.CROSS):
+            slope[part, part] = np.kron(mat_ts, mat_ts)
+        elif effect.role is Role.ARMS:
+            slope[part, part] = np.kron(np.abs(mat_ts), mat_ts)
+        else:
+            raise InputError(
+                'calibrations with further effects are compared for readings in the same axes,'
+                f' {effect.name} is in {calibration.readings.axes}; state the same axes for both',
+                key='axes',
+                code='other_axes',
+            )
+    order = np.argmax(np.abs(slope), axis=1)
+    return replace(
+        calibration,
+        values=slope @ calibration.values,
+        covariance=slope @ calibration.covariance @ slope.T,
+        status=tuple(calibration.status[place] for place in order),
+        covariance_terms={},
     )
 
 

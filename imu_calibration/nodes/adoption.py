@@ -7,7 +7,7 @@ from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
 from imu_calibration.compensation.plausible_change import implausible_change
 from imu_calibration.compensation.stream import requested_transfer
-from imu_calibration.compensation.unit_gate import UnitGate
+from imu_calibration.compensation.unit_gate import GravityScale, UnitGate
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.readings import RawReadings
@@ -368,7 +368,7 @@ def _prepared(
         correct_stamps=settings.correct_stamps,
         watch=_watch(calibration, transfer, settings, before),
         readings=calibration.readings,
-        gate=UnitGate(calibration.readings),
+        gate=UnitGate(calibration.readings, GravityScale(calibration)),
     )
     if before is not None:
         compensation.prepare(before.compensation)

@@ -14,15 +14,18 @@ from imu_calibration.compensation.stream import (
     refuse_corrected,
     requested_transfer,
 )
+from imu_calibration.compensation.unit_gate import GravityScale, corrected_rates_text
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import counter
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.core.scales import DOUBTFUL, IMPOSSIBLE, scale_range
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.document.calibration import ABSENT, Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
+from imu_calibration.effects.base import Role
 from imu_calibration.preprocessing.checks import (
     frozen_lines,
     is_one_stamp,
@@ -216,6 +219,7 @@ def compensate_recording(
         )
     _refuse_corrected_log(recording)
     other, frame = None, target_frame
+    checks = RawChecks(readings, calibration)
     if gyroscope_topic is not None:
         split = read_split(recording, topics)
         joined = split.joined.imu
@@ -225,7 +229,7 @@ def compensate_recording(
                 block, calibration, transfer, late=late, used=used, readings=readings, mask=mask
             )
         # The messages of the slower sensor are corrected, in the frame of the accelerometer.
-        refuse_units(joined.select(slice(UNIT_READINGS)), readings)
+        checks.require_scale(joined.select(slice(UNIT_READINGS)))
         refuse_corrected(gyroscope_topic)
         other, frame = split.other, target_frame or joined.frame_id
         if split.topic == gyroscope_topic:
@@ -235,11 +239,11 @@ def compensate_recording(
     with bag:
         refuse_corrected(bag.imu_topic)
         if other is None:
-            _refuse_bag_unit(recording, topics, readings)
+            checks.require_scale(_first_readings(recording, topics))
         stream = CompensationStream(
             calibration, temperature=temperatures(recording, topics), transfer=transfer
         )
-        search, checks = FrozenSearch(), RawChecks(readings)
+        search = FrozenSearch()
 
         def correct(imu):
             advance(len(imu))
@@ -337,8 +341,8 @@ def _refuse_corrected_log(recording):
         )
 
 
-def _refuse_bag_unit(recording, topics, readings):
-    """Check the unit at the start of a bag, in a pass of its own: nothing is written before."""
+def _first_readings(recording, topics):
+    """Return the samples at the start of a bag, in a pass of its own: nothing is written before."""
     parts, count = [], 0
     with open_bag(recording, topics, want_joints=False) as bag:
         for block in bag.blocks():
@@ -348,25 +352,48 @@ def _refuse_bag_unit(recording, topics, readings):
             count += len(block.imu)
             if count >= UNIT_READINGS:
                 break
-    if parts:
-        refuse_units(ImuSamples.concatenate(parts), readings)
+    return ImuSamples.concatenate(parts) if parts else None
 
 
 class RawChecks:
     """
-    Checks of raw readings that need all of them: stamps, one sensor, and the unit of the rates.
+    Checks of raw readings.
+
+    Unit and scale of the force before the correction; of all readings stamps, one sensor, and the
+    unit of the rates.
 
     Parameters
     ----------
     readings : RawReadings
         Their stated units.
+    calibration : Calibration
+        That corrects them.
 
     """
 
-    def __init__(self, readings: RawReadings):
+    def __init__(self, readings: RawReadings, calibration: Calibration):
+        self._calibration = calibration
+        self.cautions: tuple[str, ...] = ()
+        """A line for each sensor whose corrected readings may have another scale than the truth."""
         self._readings, self._check = readings, StreamCheck(one_sensor=True)
         self._gatherer = EvidenceGatherer(STANDARD_GRAVITY)
         self._n_samples = 0
+
+    def require_scale(self, imu: ImuSamples | None) -> None:
+        """Raise where the first raw samples are in another unit than those of the calibration."""
+        if imu is None:
+            return
+        refuse_units(imu, self._readings)
+        force = self._readings.accelerometer.convert(imu.force_s)
+        measured = np.isfinite(force).all(axis=1) & np.any(imu.force_s != 0.0, axis=1)
+        if not measured.any() or 'accelerometer' in self._calibration.absent:
+            return
+        scale = GravityScale(self._calibration)
+        lengths = scale.lengths(force[measured])
+        if (error := scale.error(lengths)) is not None:
+            raise error
+        if question := scale.question(lengths):
+            self.cautions += (question,)
 
     def push(self, imu: ImuSamples) -> None:
         """Process raw samples; the unit of the rates needs readings of both sensors."""
@@ -379,7 +406,7 @@ class RawChecks:
 
     def require(self) -> None:
         """
-        Raise where stamps do not advance, there are two sensors, or the unit of rates is wrong.
+        Raise for equal stamps, two sensors, or rates in another unit or at another scale.
 
         After the last samples.
         """
@@ -391,6 +418,15 @@ class RawChecks:
         self._check.sources.require_one()
         evidence = self._gatherer.evidence({}, self._readings)
         refuse(tuple(rate_unit(evidence)))
+        matrix = self._calibration.of('gyroscope', Role.LINEAR)
+        if evidence.turning is None or matrix is None or 'gyroscope' in self._calibration.absent:
+            return
+        ratio = 1.0 / (evidence.turning.factor * float(np.mean(np.diag(matrix))))
+        text = corrected_rates_text(ratio)
+        if scale_range(ratio) is IMPOSSIBLE:
+            raise InputError(text, key='gyroscope_unit', code='corrected_scale')
+        if scale_range(ratio) is DOUBTFUL:
+            self.cautions += (text,)
 
     @property
     def n_wrapped(self) -> int:
@@ -405,9 +441,10 @@ def _in_memory(recording, calibration, transfer, *, late, used, readings, mask):
     kept = mask.kept(block.imu.stamp_ns)
     mask.require_used()
     imu = block.imu.select(kept)
-    refuse_units(imu, readings)
+    checks = RawChecks(readings, calibration)
+    checks.require_scale(imu)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
-    search, checks = FrozenSearch(), RawChecks(readings)
+    search = FrozenSearch()
     checks.push(imu)
     checks.require()
     search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
@@ -443,7 +480,7 @@ def _outcome(imu, stream, lost, *, used, search, checks):
         against + stream.warnings(),
         lost,
         refused,
-        used.cautions,
+        (*used.cautions, *checks.cautions),
         sum(samples.values()),
         checks.n_wrapped,
     )

@@ -4,11 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusal import refused
 from test_live_compensation import field, imu_samples, messages
 
-from imu_calibration.compensation.unit_gate import MOST_READINGS, UnitGate
+from imu_calibration.compensation.unit_gate import MOST_READINGS, GravityScale, UnitGate
+from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings, combined
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.effects.base import Role
 from imu_calibration.nodes.message_compensation import WITHHELD, LiveCompensation
+from imu_calibration.use_cases.compensate import compensate_recording
 from validation.imu_messages import patch_imu
 
 from worlds.compensation_cases import random_calibration
@@ -90,3 +95,38 @@ def test_withheld_messages_are_counted_by_their_reason():
     raw = messages(raw_of(imu_samples()))
     assert [live(data) for data in raw] == [None] * len(raw)
     assert live.counts[WITHHELD] == len(raw)
+
+
+def made_for(scale):
+    """Return a calibration of an accelerometer that reads `scale` times the truth."""
+    calibration = random_calibration(4, (), ())
+    values = calibration.values.copy()
+    for role in (Role.LINEAR, Role.OFFSET):
+        values[calibration.model.part('accelerometer', role)] *= scale
+    return replace(calibration, values=values)
+
+
+def at_rest(scale, n=400):
+    noise = np.random.default_rng(10460).normal(0.0, 0.01, (n, 6))
+    readings = noise + [0.1, 0.2, scale * G, 0.0, 0.0, 0.0]
+    return ImuSamples(10**9 + 10**7 * np.arange(n), readings[:, :3], readings[:, 3:], 'imu_link')
+
+
+@pytest.mark.parametrize(('scale', 'given'), [(0.48, 2.0), (1.9, 0.45), (2.3, 0.8)])
+def test_a_calibration_for_another_scale_is_refused(scale, given):
+    """Readings of a usual length, which this calibration makes four times as long as gravity."""
+    imu = at_rest(given)
+    with refused(InputError, 'corrected_scale', 9.807):
+        compensate_recording(imu, made_for(scale))
+    gate = UnitGate(RawReadings(), GravityScale(made_for(scale)))
+    assert not any(map(gate.passes, imu.stamp_ns.tolist(), imu.force_s.tolist()))
+    assert gate.error is not None and gate.error.code == 'corrected_scale'
+
+
+@pytest.mark.parametrize(('scale', 'given', 'code'), [(0.5, 1.0, 3), (1.0, 0.5, 3), (0.5, 0.5, 0)])
+def test_a_calibration_for_a_doubtful_scale_is_a_caution(scale, given, code):
+    imu = at_rest(given)
+    found = compensate_recording(imu, made_for(scale))
+    assert (len(found.cautions), found.exit_code) == (code // 3, code)
+    gate = UnitGate(RawReadings(), GravityScale(made_for(scale)))
+    assert any(map(gate.passes, imu.stamp_ns.tolist(), imu.force_s.tolist()))

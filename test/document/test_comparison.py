@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.comparison import (
@@ -21,7 +22,7 @@ from imu_calibration.document.comparison import (
     compare,
     in_accelerometer_axes,
 )
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
@@ -153,6 +154,40 @@ def rotated(calibration, rotation, axes):
         values=turn @ values,
         covariance=turn @ calibration.covariance @ turn.T,
         gauge={'origin': 'mount', 'axes': axes},
+    )
+
+
+@pytest.mark.parametrize(
+    ('axes', 'mat_ts'),
+    [
+        ('frd', np.diag([1.0, -1.0, -1.0])),
+        ('y,-x,z', [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0, 0, 1]]),
+    ],
+)
+def test_readings_in_other_axes_are_compared_in_those_of_the_first(axes, mat_ts):
+    """`mat_ts`: from forward-left-up to the axes of the source; biases of 0.3, errors of 1e-4."""
+    rng, mat_ts = np.random.default_rng(10465), np.asarray(mat_ts)
+    first, second = draw(rng), draw(rng)
+    shift = np.zeros(COUNT)
+    for sensor in SENSORS:
+        shift[MODEL.part(sensor, Role.OFFSET)] = [0.3, -0.2, 0.1]
+        shift[MODEL.part(sensor, Role.LINEAR)] = 0.01 * rng.normal(size=9)
+    first = replace(first, values=first.values + shift, readings=RawReadings(axes='flu'))
+    values = second.values + shift
+    other = values.copy()
+    for sensor in SENSORS:
+        bias, matrix = MODEL.part(sensor, Role.OFFSET), MODEL.part(sensor, Role.LINEAR)
+        other[bias] = mat_ts @ values[bias]
+        other[matrix] = (mat_ts @ values[matrix].reshape(3, 3) @ mat_ts.T).ravel()
+    arms = MODEL.part('accelerometer', Role.ARMS)
+    rows = np.argmax(np.abs(mat_ts), axis=1)  # the axis that each output of the source has
+    other[arms] = (values[arms].reshape(3, 3)[rows] @ mat_ts.T).ravel()
+    same = compare(first, replace(second, values=values))
+    turned = replace(second, values=other, readings=RawReadings(axes=axes))
+    assert not compare(first, replace(turned, readings=RawReadings(axes='flu'))).agree
+    assert compare(first, turned).agree and same.agree
+    np.testing.assert_allclose(
+        [row.second for row in compare(first, turned).rows], [row.second for row in same.rows]
     )
 
 

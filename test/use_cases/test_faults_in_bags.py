@@ -104,6 +104,26 @@ def test_a_dead_band_is_named(storage, tmp_path):
     assert found.exit_code == 3
     z = found.calibration.values[:3] - ACCELEROMETER.bias
     assert np.abs(z / found.calibration.sd[:3]).max() < 4.0
+    # The accelerometer is corrected, and a rate within the band remains 0.
+    corrected = compensate_recording(tmp_path / 'bag', found.calibration)
+    assert not corrected.refused and corrected.imu is not None
+    still = np.all(rate == 0.0, axis=1)
+    length = np.linalg.norm(corrected.imu.force_s[still], axis=1).mean()
+    assert length == pytest.approx(GRAVITY, rel=1e-3)
+    assert not corrected.imu.rate_s[still].any()
+
+
+def test_a_dead_band_at_rest_leaves_the_noise_of_the_accelerometer(tmp_path):
+    generator, n = np.random.default_rng(10461), 4000
+    stamps = START_NS + np.arange(n) * 10_000_000
+    force = np.array([0.3, -0.2, 9.79]) + 0.015 * generator.standard_normal((n, 3))
+    write_session(tmp_path / 'bag', ImuSamples(stamps, force, np.zeros((n, 3)), 'imu_link'))
+    found = identify_recording(tmp_path / 'bag')
+    assert found.figures.sensors == ('accelerometer',)
+    assert list(found.figures.recording['unusable']) == ['gyroscope']
+    # 4000 readings determine the density to 1.1 %.
+    for axis in found.figures.accelerometer:
+        assert axis.white == pytest.approx(0.015 / np.sqrt(100.0), rel=0.06)
 
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])

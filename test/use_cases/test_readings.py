@@ -16,6 +16,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings, parse_axes, unit_of
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.effects.base import Role
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
@@ -163,6 +164,18 @@ def test_compensate_refuses_readings_without_gravity(tmp_path, truth, in_g):
         with refused(InputError, 'without_gravity'):
             compensate_recording(tmp_path / 'free', in_g, output=output, **units)
     assert not (tmp_path / 'out').exists()
+
+
+def test_rates_at_another_scale_than_the_calibrated_one_are_a_caution_or_refused(truth, in_g):
+    raw = in_units(truth[0], 'g', 'deg/s')
+    assert compensate_recording(raw, in_g).exit_code == 0
+    half = compensate_recording(replace(raw, rate_s=0.5 * raw.rate_s), in_g)
+    assert (len(half.cautions), half.exit_code) == (1, 3)
+    values = in_g.values.copy()
+    values[in_g.model.part('gyroscope', Role.LINEAR)] *= 0.48
+    with refused(InputError, 'corrected_scale') as caught:  # 2 / 0.48 times the truth
+        compensate_recording(replace(raw, rate_s=2.0 * raw.rate_s), replace(in_g, values=values))
+    assert caught.value.key == 'gyroscope_unit'
 
 
 @pytest.mark.parametrize('rate_unit', ['deg/s', 'counts:65.5/(deg/s)'])
