@@ -243,9 +243,7 @@ class Reduced(Protocol):
         """Moving windows with kept samples."""
 
 
-def against_joints(
-    gathered: Reduced, model: SensorModel, table: Table | None = None
-) -> tuple[CheckFinding, ...]:
+def against_joints(gathered: Reduced, model: SensorModel, table: Table) -> tuple[CheckFinding, ...]:
     """
     Return the findings of a comparison of rates and forces with the joints.
 
@@ -257,8 +255,8 @@ def against_joints(
         Windows of a recording.
     model : SensorModel
         Defines the columns.
-    table : Table, optional
-        With it the mount that would fit is named.
+    table : Table
+        Gives the mount that would fit.
 
     """
     found = []
@@ -311,15 +309,11 @@ def _rates(moments, windows, table):
     found = list(_rate_units(moments))
     if found:
         return found
-    finding = None
-    if table is not None:
-        exchange = find_exchange(windows, table)
-        if exchange and not exchange.joints and exchange.span is None:
-            return []  # `_axes` reports turned or exchanged IMU axes, with the mount that fits
-        finding = (exchanged(exchange, windows, table) if exchange else None) or standing_still(
-            windows, table
-        )
-    finding = finding or same_motion(moments, windows, table)
+    exchange = find_exchange(windows, table)
+    if exchange and not exchange.joints and exchange.span is None:
+        return []  # `_axes` reports turned or exchanged IMU axes, with the mount that fits
+    finding = exchanged(exchange, windows, table) if exchange else None
+    finding = finding or standing_still(windows, table) or same_motion(moments, windows, table)
     return [] if finding is None else [finding]
 
 
@@ -362,7 +356,7 @@ def _axes(sensor, moments, table, windows):
         return
     delay = (
         signs_or_delay(windows, table)
-        if sensor == 'gyroscope' and table is not None and match.turned and match.mirrored
+        if sensor == 'gyroscope' and match.turned and match.mirrored
         else None
     )
     if delay and delay.sure:
@@ -389,7 +383,7 @@ def _cause(match, matrix, seen, table):
             ' or the joint axes in the table'
         )
     fits = ''
-    if table is not None and np.trace(seen) > 2.5:
+    if np.trace(seen) > 2.5:
         # Rounded, then plus zero: no -0.
         angles_deg = np.round(mount_rpy_deg(matrix, table)) + 0.0
         listed = ', '.join(f'{angle:.0f}' for angle in angles_deg)
@@ -397,7 +391,7 @@ def _cause(match, matrix, seen, table):
     return f'the sensor is turned against the table; correct mount.rpy_deg in the table{fits}'
 
 
-def check_units(gathered: Reduced, model: SensorModel, table: Table | None = None) -> None:
+def check_units(gathered: Reduced, model: SensorModel, table: Table) -> None:
     """
     Refuse recordings with units other than SI, or with axes other than those of the table.
 

@@ -304,7 +304,7 @@ RESOLVED = 4
 """Shifts that are tested per sampling period: the rates of fast sweeps differ within one period."""
 
 
-def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> CheckFinding | None:
+def same_motion(moments: tuple, windows: list[Window], table: Table) -> CheckFinding | None:
     """
     Return the cause if the gyroscope does not measure the motion of the joints, otherwise None.
 
@@ -318,7 +318,7 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
         itself.
     windows : list of Window
         Stored moving windows with their samples; without them, no delay is found.
-    table : Table, optional
+    table : Table
 
     """
     cross, reference, measured = moments
@@ -327,17 +327,13 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
     # Other checks report units, signs and axes.
     if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:
-        return (
-            a_period_late(windows, table)
-            if table is not None and explained < 1.0 - SHARE_TIE
-            else None
-        )
+        return a_period_late(windows, table) if explained < 1.0 - SHARE_TIE else None
     key, cause = (
         'imu_topic',
         'this IMU does not turn when the table does; give the topic of the IMU on the table',
     )
     if np.trace(measured) > MIN_RATE_GAIN * np.trace(reference):
-        cause, key = (_cause(windows, table) if table is not None else ''), None
+        cause, key = _cause(windows, table), None
     elif gain > MIN_RATE_GAIN:
         return None
     if not cause:

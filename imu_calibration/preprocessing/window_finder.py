@@ -42,8 +42,8 @@ class MotionGatherer:
 
     Parameters
     ----------
-    table : Table or None
-        Names of the joints and their noise; None accepts the joints of the stream in their order.
+    table : Table
+        Names of the joints and their noise.
     settings : WindowSettings
     keep_unused : bool
         Also return windows of kind 'unused', so that every accepted sample is in exactly one
@@ -65,7 +65,7 @@ class MotionGatherer:
         unusable: Sequence[str] = (),
     ):
         self.cleaner = BlockCleaner(
-            () if table is None else table.joint_names,
+            table.joint_names,
             nominal,
             watchers,
             one_sensor=True,
@@ -73,7 +73,7 @@ class MotionGatherer:
             unusable=unusable,
         )
         self._settings = settings
-        self._noise_rad = None if table is None else table.joint_noise_rad
+        self._noise_rad = table.joint_noise_rad
         self._queue = {name: [] for name in STREAMS}
         self._epoch_shift = dict.fromkeys(STREAMS, 0)
         self._turns = _Unwrapper()

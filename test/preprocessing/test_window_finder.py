@@ -91,8 +91,8 @@ def record(
     return imu, JointSamples(START + joint_ns, position, np.full(position.shape, np.nan), NAMES)
 
 
-def gather(imu, joints, temperature=None, keep_unused=False, table=TABLE, **changed):
-    gatherer = MotionGatherer(table, WindowSettings(**changed), keep_unused)
+def gather(imu, joints, temperature=None, keep_unused=False, **changed):
+    gatherer = MotionGatherer(TABLE, WindowSettings(**changed), keep_unused)
     windows = gatherer.push(SampleBlock(imu, joints, temperature)) + gatherer.finish()
     return windows, gatherer.counts
 
@@ -494,14 +494,6 @@ def test_unknown_joint_names_are_refused():
     wrong = JointSamples(joints.stamp_ns, joints.position, joints.velocity, ('pan', 'tilt', 'roll'))
     with refused(InputError, 'joint_names', 'outer, middle, inner', 'pan, tilt, roll'):
         gather(imu, wrong)
-
-
-def test_no_table_takes_the_joints_as_they_are():
-    imu, joints = record(tour())
-    for window, other in zip(
-        gather(imu, joints)[0], gather(imu, joints, table=None)[0], strict=True
-    ):
-        same(window, other)
 
 
 def test_clock_set_back_starts_again():
