@@ -419,9 +419,12 @@ class GatherStep:
         Return the SessionData of a recording, given (its number, callable that yields its blocks).
         """
         session, source = numbered
-        return naming(self.names, session)(
-            self.read, source, session, Preflight(self.table.gravity_value, one_sensor=True)
-        )
+        with naming(self.names, session):
+            return self.read(source, session, Preflight(self.table.gravity_value, one_sensor=True))
+
+    def blocks(self, source: Callable[[], Iterable[SampleBlock]]) -> Iterable[SampleBlock]:
+        """Return the blocks of a recording as they are gathered."""
+        return source()
 
     def read(
         self,
@@ -444,12 +447,12 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        gathered = self._gather(source(), session, (preflight,), windows=windows)
+        gathered = self._gather(self.blocks(source), session, (preflight,), windows=windows)
         if len(preflight.without_readings) or preflight.unusable:
             if windows is not None:
                 windows.clear()
             gathered = self._gather(
-                source(),
+                self.blocks(source),
                 session,
                 (),
                 windows=windows,

@@ -73,17 +73,16 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
     `applied`: parameters of the other sensor, shape (n_params,).
     """
     judged = held_out.judged[sensor]
+    # Only the parameters of the sensor differ between the folds; the others are as applied.
     (other,) = set(SENSORS) - {sensor}
-    of_other = np.char.startswith(held_out.solution.param_names, other)
+    is_fixed = np.char.startswith(held_out.solution.param_names, other)
 
-    def beside(folds: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return parameters of folds with those of the other sensor as they are applied."""
-        return [np.where(of_other, applied, values) for values in folds]
-
-    of_solution = judged.rms(smallest_errors(held_out, sensor, beside(held_out.folds)))
+    folds = [np.where(is_fixed, applied, values) for values in held_out.folds]
+    of_solution = judged.rms(smallest_errors(held_out, sensor, folds))
     fits: list[PlainFit] = []
     for estimate in held_out.plain_estimates(sensor, applied):
-        error = judged.rms(held_out.errors(sensor, beside(estimate.folds)))
+        folds = [np.where(is_fixed, applied, values) for values in estimate.folds]
+        error = judged.rms(held_out.errors(sensor, folds))
         fits.append(PlainFit(sensor, estimate, error, of_solution, judged.unit))
     # Estimates of the table and the clock have to pay: the residual may have moved them.
     chosen = fits[0]

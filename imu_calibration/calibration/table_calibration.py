@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -25,7 +24,6 @@ from imu_calibration.estimation.solution import Solution, shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.references.turntable.accumulator import restrict
@@ -165,7 +163,7 @@ class TableRecordings:
             judged_from,
         )
         parts = self.reduced(step)
-        gathered = join(parts, self.names, partial(check_units, model=model, table=self.table))
+        gathered = join(parts, self.names, model=model, table=self.table)
         report('solving')
         return solved_windows(WindowObservations(self.table, gathered, model), options)
 

@@ -1,8 +1,7 @@
 """Errors of raw and of corrected readings on a table."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions
@@ -62,7 +60,9 @@ def errors_on_table(
     """
     names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
     model = reference_model(calibration, table)
-    step = GatherStep(table, model, options.windows, options.nominal, names)
+    step = BothReadings(
+        table, model, options.windows, options.nominal, names, calibration=calibration
+    )
 
     # The windows of each recording, reduced twice: with raw and with corrected readings.
     before = HeldOut()
@@ -70,15 +70,9 @@ def errors_on_table(
     parts = []
     for session, source in enumerate(sources):
         windows: list[Window] = []
-        parts.append(
-            naming(names, session)(
-                step.read,
-                partial(_with_corrected, source, calibration, options),
-                session,
-                Preflight(table.gravity_value, one_sensor=True),
-                windows=windows,
-            )
-        )
+        preflight = Preflight(table.gravity_value, one_sensor=True)
+        with naming(names, session):
+            parts.append(step.read(source, session, preflight, windows=windows))
         for window in windows:
             if window.kind == 'unused':
                 continue
@@ -87,7 +81,7 @@ def errors_on_table(
                 before.add(reduce_window(raw, model, table, session=session))
                 after.add(reduce_window(corrected, model, table, session=session))
 
-    gathered = join(parts, names, lambda part: check_units(part, model, table))
+    gathered = join(parts, names, model=model, table=table)
     not_checked = require_sensor(calibration, gathered.absent)
     proof = prove_readings(before, after, model, reference=reference_values(model, calibration))
     lost = dropped(gathered.counts)
@@ -101,28 +95,29 @@ def errors_on_table(
     )
 
 
-def _with_corrected(
-    source: Callable, calibration: Calibration, options: CalibrationOptions
-) -> Iterator[SampleBlock]:
-    """
-    Yield the blocks of a recording with corrected readings in addition to the raw ones.
+@dataclass(frozen=True)
+class BothReadings(GatherStep):
+    """Gathers windows with corrected readings in addition to the raw ones."""
 
-    As compensation writes them into a bag.
-    """
-    temperature = None
-    if invertible(calibration.model).needs_temperature:
-        known = [block.temperature for block in source() if block.temperature is not None]
-        temperature = TemperatureSamples.concatenate(known) if known else None
-    stream = CompensationStream(calibration, temperature=temperature)
-    for block in source():
-        if block.imu is not None and len(block.imu):
-            # The cleaner converts the raw readings of the block afterwards.
-            readings = options.nominal or RawReadings()
-            found = stream.correct(readings.apply(block.imu))
-            block = replace(
-                block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate]))
-            )
-        yield block
+    calibration: Calibration = field(kw_only=True)
+    """Corrects the readings, as compensation writes them into a bag."""
+
+    def blocks(self, source: Callable[[], Iterable[SampleBlock]]) -> Iterator[SampleBlock]:
+        """Yield the blocks of a recording with corrected readings."""
+        temperature = None
+        if invertible(self.calibration.model).needs_temperature:
+            known = [block.temperature for block in source() if block.temperature is not None]
+            temperature = TemperatureSamples.concatenate(known) if known else None
+        stream = CompensationStream(self.calibration, temperature=temperature)
+        for block in source():
+            if block.imu is not None and len(block.imu):
+                # The cleaner converts the raw readings of the block afterwards.
+                readings = self.nominal or RawReadings()
+                found = stream.correct(readings.apply(block.imu))
+                block = replace(
+                    block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate]))
+                )
+            yield block
 
 
 def _both(window: Window) -> tuple[Window, Window]:

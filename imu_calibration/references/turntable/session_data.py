@@ -1,10 +1,10 @@
 """Data of sessions on a table: windows stored, held out for the proof, merged."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.accumulator import (
     Accumulator,
@@ -476,26 +477,19 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
     return total
 
 
-def naming(names: Sequence[str], session: int) -> Callable:
-    """
-    Return a function that calls another one.
-
-    With several recordings, the name of the recording is put before its error.
-    """
-
-    def call(function: Callable, *arguments: Any, **options: Any) -> Any:
-        try:
-            return function(*arguments, **options)
-        except ImuCalibrationError as error:
-            if len(names) < 2:
-                raise
-            raise error.named(names[session]) from error
-
-    return call
+@contextmanager
+def naming(names: Sequence[str], session: int) -> Iterator[None]:
+    """Put the name of a recording before its errors where there are several recordings."""
+    try:
+        yield
+    except ImuCalibrationError as error:
+        if len(names) < 2:
+            raise
+        raise error.named(names[session]) from error
 
 
 def join(
-    parts: Sequence[SessionData], names: Sequence[str], check: Callable[[SessionData], object]
+    parts: Sequence[SessionData], names: Sequence[str], *, model: SensorModel, table: Table
 ) -> SessionData:
     """
     Return the merged SessionData of several recordings.
@@ -506,18 +500,21 @@ def join(
         One per recording, in order.
     names : sequence of str
         Names of the recordings.
-    check : callable
-        Called with each part; raises when it cannot be used.
+    model : SensorModel
+        Defines the columns.
+    table : Table
+        The reference.
 
     Raises
     ------
     InputError
-        When a recording has no window, another frame than the first, or does not pass the check,
-        with its name.
+        When a recording has no window, another frame than the first, or other units or axes than
+        the table (`check_units`), with its name.
 
     """
     for session, part in enumerate(parts):
-        naming(names, session)(check, part)
+        with naming(names, session):
+            check_units(part, model, table)
         if len(parts) > 1:
             part.findings = tuple(finding.named(names[session]) for finding in part.findings)
             _require_like_the_first(parts[0], part, names[0], names[session])
