@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from imu_calibration.calibration.from_solution import possible_motions
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.window_observations import TableResult
+from imu_calibration.calibration.window_observations import TableResult, WindowObservations
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.document.outcome import parameter_count
 from imu_calibration.effects.base import Role
@@ -222,8 +223,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
 
     after = np.array([left(base + added(rest_with_up(up))) for up in DIRECTIONS])
     worth = share_gained(left(base), after)
-    assert result.data.table is not None, 'the result is of a table'
-    possible = possible_motions(result.data.table)
+    possible = possible_motions(cast(WindowObservations, result.data).table)
     motions = [
         motion
         for motion in (MOTIONS if possible is None else possible)

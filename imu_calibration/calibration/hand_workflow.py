@@ -48,6 +48,11 @@ def calibrate_without_table(
         When more than one recording is given, or a requested effect needs a table.
 
     """
+    return calibrate_by_evidence(gather_poses(sources, options), options, provenance=provenance)
+
+
+def gather_poses(sources: Sequence[Callable], options: CalibrationOptions) -> PoseRecording:
+    """Return the poses and turns of one recording; raises as `calibrate_without_table`."""
     if len(sources) != 1:
         raise InputError(
             f'calibration by hand needs one recording, got {len(sources)}; calibrate them'
@@ -55,7 +60,7 @@ def calibrate_without_table(
         )
     preflight = Preflight(options.gravity, one_sensor=True)
     recording = read_by_hand(sources[0](), options.nominal, preflight)
-    return calibrate_poses(recording, options, provenance)
+    return PoseRecording(PoseObservations.of(recording, hand_options(options)))
 
 
 def calibrate_poses(

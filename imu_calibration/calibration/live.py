@@ -114,6 +114,10 @@ class LiveSnapshot:
         )
 
 
+Place = tuple[float | None, float]
+"""Local gravity (None: unknown) and its standard deviation, m/s^2."""
+
+
 @dataclass(frozen=True)
 class LiveSettings:
     """Solving interval, storage and published data."""
@@ -193,7 +197,7 @@ class LiveByHandSettings:
     )
 
     @property
-    def place(self) -> tuple[float | None, float]:
+    def place(self) -> Place:
         """The local gravity (None: unknown) and its standard deviation, m/s^2."""
         gravity, spread = gravity_of_settings(self.gravity, self.latitude, self.height)
         return gravity or None, spread
@@ -322,9 +326,11 @@ class LiveCalibration:
         ]
         return next(filter(None, known), '')
 
-    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> bool:
         """
-        Use other settings from now on, by hand without effect.
+        Use other settings from now on, those of gravity without effect.
+
+        Return whether the windows have to be solved again.
 
         Raises an InputError when they cannot be changed any more.
         """
@@ -334,11 +340,19 @@ class LiveCalibration:
             if self._collector is not None:
                 self._collector.gatherer.change(settings)
             self.options = replace(self.options, windows=settings)
+        return False
+
+    n_covered = 0
+    """Observations that the coverage shows before they are solved."""
 
     @property
-    def on_table(self) -> 'LiveCalibration':
-        """The session itself: model errors can be diagnosed while it runs."""
-        return self
+    def diagnosis_period(self) -> float:
+        """Shortest time between diagnoses while it runs, s; 0: none."""
+        return self.settings.diagnosis_period
+
+    def diagnosed(self, state: LiveState) -> LiveState | None:
+        """Return the shown state of the diagnosis."""
+        return state
 
     @property
     def model(self) -> SensorModel | None:

@@ -32,9 +32,15 @@ from imu_calibration.calibration.coverage import (
     is_done,
     waiting_groups,
 )
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_recording import HandRecording, late_gyroscope
 from imu_calibration.calibration.hand_workflow import calibrate_poses
-from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings, SolvePacer
+from imu_calibration.calibration.live import (
+    LiveByHandSettings,
+    LiveCalibration,
+    LiveSettings,
+    SolvePacer,
+)
 from imu_calibration.calibration.pose_observations import HandResult, PoseObservations
 from imu_calibration.core.errors import InputError, NotObservableError, with_hint
 from imu_calibration.core.progress import LiveState
@@ -368,7 +374,10 @@ class LiveByHand:
         )
 
     observations = PoseObservations.unit
-    needs_joints, on_table = False, None
+    needs_joints = False
+    # Nothing is diagnosed while it runs.
+    last: None = None
+    diagnosis_period = 0.0
     needs_linearising = False  # the solution is iterated to its end
     needs_temperature = False  # no temperatures are kept with the poses
 
@@ -378,11 +387,12 @@ class LiveByHand:
         imu = self._store.samples()
         return '' if imu is None else imu.frame_id
 
-    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> bool:
         """
         Use other settings from now on.
 
-        For the poses in all samples, another gravity, another number of samples.
+        For the poses in all samples, another gravity, another number of samples. Return whether
+        the poses have to be solved again.
         """
         if isinstance(settings, LiveSettings):
             self.settings = settings
@@ -391,11 +401,23 @@ class LiveByHand:
             self._search(self._store)
         else:
             self.options, self._store.most = settings.at_place(self.options), settings.hand_samples
+            return True
+        return False
+
+    def adopt(self, extension: ModelExtension) -> bool:
+        """Return False: no effects are found while it runs."""
+        return False
+
+    def diagnosed(self, state: LiveState) -> LiveState | None:
+        """Return None: there is no diagnosis to show."""
+        return None
 
     @property
     def n_windows(self) -> int:
         """Poses at the last search."""
         return len(self.found.rests)
+
+    n_covered = n_windows
 
     @property
     def stamping(self) -> StampLine | None:
@@ -598,6 +620,10 @@ def _frozen(imu: ImuSamples) -> dict[str, str]:
     if len({*found, *imu.absent}) == len(SENSORS) and found:
         raise InputError(next(iter(found.values())), code='frozen')
     return found
+
+
+LiveSession = LiveCalibration | LiveByHand
+"""A calibration during the motion."""
 
 
 def _check_model(model: SensorModel) -> None:

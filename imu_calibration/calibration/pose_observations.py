@@ -59,7 +59,6 @@ class PoseObservations:
     """Gravity that was given, or the standard one, m/s^2."""
 
     unit: ClassVar[str] = 'poses'
-    table: ClassVar[None] = None
     reference: ClassVar[str] = 'gravity, by hand'
     tested: ClassVar[tuple[str, ...]] = CROSS_TERMS
 

@@ -17,7 +17,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.trust import Uncorrected, usage
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions
@@ -93,10 +92,6 @@ class Observations(Protocol[Estimate]):
     @property
     def gathered(self) -> SessionData:
         """Counts, conditions and stored windows of the recordings."""
-
-    @property
-    def table(self) -> Table | None:
-        """The table; None by hand."""
 
     @property
     def reference(self) -> str:

@@ -57,15 +57,15 @@ def run(options: Options) -> VerbResult:
     ):
         if not given:
             raise InputError(f'an export must have {name}, none was given; give it, or see --list')
-    stand = options.stand()
-    if stand is not None and not options.bag:
-        raise InputError('a table or arm needs the recording --bag BAG, none was given; give both')
     from imu_calibration.use_cases.choices import topics_of
     from imu_calibration.use_cases.exporting import export_calibration
+    from imu_calibration.use_cases.recordings import refuse_stand
 
+    if not options.bag:
+        refuse_stand(options.stand(), 'the recording --bag BAG, none was given; give both')
     found = export_calibration(
         options.document,
-        stand=stand,
+        stand=options.stand(),
         topics=topics_of(vars(options)),
         **options.arguments_for(export_calibration),
     )

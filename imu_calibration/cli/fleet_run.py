@@ -35,8 +35,8 @@ from imu_calibration.use_cases.recordings import (
     process_mapper,
     provenance_of,
     source_of,
-    table_of,
 )
+from imu_calibration.use_cases.references import reference_of
 from msg_adapters.storages import suffixes
 
 
@@ -220,16 +220,13 @@ def _table(options, bags):
     Return the chain of joints; a description in recordings is read from the first readable one.
     """
     stand, topics = options.stand(), topics_of(options.choices())
-    if stand is None:
-        raise InputError(
-            'a fleet is calibrated on a table or an arm, got none; describe it', key='table'
-        )
+    purpose = 'a fleet is calibrated on a table or an arm'
     for bag in bags[:-1]:
         try:
-            return table_of(stand, [bag], topics)
+            return reference_of(stand, [bag], topics).table_for(purpose)
         except InputError:
             pass
-    return table_of(stand, bags[-1:], topics)
+    return reference_of(stand, bags[-1:], topics).table_for(purpose)
 
 
 def fleet_parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:

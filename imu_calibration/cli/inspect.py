@@ -35,28 +35,11 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.show import show_findings
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.preprocessing.checks import refuse
-    from imu_calibration.use_cases.choices import calibration_options, topics_of
-    from imu_calibration.use_cases.inspect import imu_topics_of, inspect_recording, split_topics
-    from imu_calibration.use_cases.recordings import Topics, existing, table_of
+    from imu_calibration.use_cases.inspect import inspect_imus, split_topics
+    from imu_calibration.use_cases.recordings import existing
 
-    bag, choices, stand, hints = (
-        existing(options.bag),
-        options.choices(),
-        options.stand(),
-        options.hints(),
-    )
-    topics = imu_topics_of(bag, topics_of(choices))
-    wanted = calibration_options(choices)
-    table = None
-    if stand is not None:
-        table = table_of(
-            stand,
-            [options.bag],
-            Topics(topics[0].imu, frame=topics[0].frame),
-            gravity=wanted.gravity,
-            gravity_sd=wanted.gravity_sd,
-        )
-    looks = inspect_recording(bag, topics, table, options=wanted, exclude=options.exclude)
+    hints = options.hints()
+    looks = inspect_imus(existing(options.bag), options.stand(), options.choices())
     out = Terminal.of()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints)
@@ -71,11 +54,9 @@ def run(options: Options) -> VerbResult:
         show_findings(out, look.findings, hints)
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
-        reason = _judge(out, look, hints)
-        codes.append(look.exit_code or (3 if reason else 0))
-        reasons += [*look.reasons, *([reason] if reason else [])]
-        if look.by_hand is not None:
-            _show_by_hand(out, look.by_hand, hints)
+        missing = _judge(out, look, hints)
+        codes.append(look.exit_code or (3 if missing else 0))
+        reasons += [*look.reasons, *missing]
     for pair in split_topics(looks):
         out.print()
         out.print(
@@ -98,7 +79,7 @@ def run(options: Options) -> VerbResult:
 
 def _document(look):
     """Return the findings, streams and parameter statuses of one Imu topic as data."""
-    found = look.calibrated if look.by_hand is None else look.by_hand
+    found = look.calibrated
     document = {
         'topic': look.recording.imu_topic,
         'frame_id': look.recording.frame_id,
@@ -182,41 +163,18 @@ def _step(step_ns):
 
 
 def _judge(out, look, hints):
-    """Print the motions and parameters that were found; return why there are none, or ''."""
+    """Print data and parameters of the calibration; return why it is missing, a line each."""
     result = look.calibrated
     if result is None or look.refused:
-        return ''
+        return []
     if isinstance(result, ImuCalibrationError):
-        why = f'not usable for calibration: {result.with_hint(hints)}'
+        why = f'{look.reference.not_usable}: {result.with_hint(hints)}'
         out.print(why)
-        return why
-    out.print()
-    for kind, count in result.calibration.statistics['windows'].items():
-        out.print(
-            f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]}'
-            ' samples'
-        )
+        return look.reference.reasons([why], [])
+    for line in look.reference.used_lines(result.calibration):
+        out.print(line)
     _show_parameters(out, result.calibration, hints)
-    return ''
-
-
-def _show_by_hand(out, found, hints):
-    """
-    Print whether the recording can be calibrated by hand, and which parameters that determines.
-    """
-    from imu_calibration.document.rest_noise import motions_at_rest
-
-    if isinstance(found, ImuCalibrationError):
-        out.print(f'not usable for calibration without a table: {found.with_hint(hints)}')
-        return
-    windows = found.calibration.statistics['windows']
-    out.print(
-        f'by hand, without a table, it determines, from {windows["static"]} poses and'
-        f' {windows["turns"]} turns between them:'
-    )
-    for text in motions_at_rest(found.calibration.by_hand, found.calibration.sensors):
-        out.print(f'warning: {text}')
-    _show_parameters(out, found.calibration, hints)
+    return []
 
 
 def _show_parameters(out, calibration, hints):

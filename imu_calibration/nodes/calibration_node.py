@@ -24,13 +24,13 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from imu_calibration.calibration.live import LiveByHandSettings, LiveCalibration, LiveSettings
-from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
+from imu_calibration.calibration.live_poses import LiveSession
+from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
-from imu_calibration.nodes.calibration_worker import CalibrationWorker, LiveSession, SessionFiles
+from imu_calibration.nodes.calibration_worker import CalibrationWorker, SessionFiles
 from imu_calibration.nodes.diagnosis_thread import Listeners, give_arrays_own_pages
 from imu_calibration.nodes.diagnostics import (
     LOG_ERROR,
@@ -42,7 +42,13 @@ from imu_calibration.nodes.diagnostics import (
 )
 from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, watch_inputs
 from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, run_node
-from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
+from imu_calibration.nodes.robot_stand import (
+    RobotSettings,
+    joint_topics,
+    live_reference,
+    stand_path,
+    words_of,
+)
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.use_cases.choices import calibration_options, provenance_with
 from msg_adapters.layout import Packed
@@ -208,19 +214,17 @@ class CalibrationNode(Node):
             {name: chosen or None for name, chosen in self._choices().items()}
         )
         self._session[LiveByHandSettings] = declare_parameters(
-            self, LiveByHandSettings, self._change_session
+            self, LiveByHandSettings, self._change_place
         )
         robot = declare_parameters(self, RobotSettings)
-        joints = (
-            [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
-        )
+        joints = joint_topics(robot, self.settings.table_file)
         announce(
             self,
             ['imu/data_raw', *joints, 'imu/temperature'],
             ['imu/calibration', 'imu/residual', 'imu/coverage'],
         )
         gravity, gravity_sd = self._session[LiveByHandSettings].place
-        self._table = chain_of(
+        self._reference = live_reference(
             self,
             robot,
             self.settings.table_file,
@@ -230,9 +234,8 @@ class CalibrationNode(Node):
         )
         place = SessionFiles(self.settings.save_file)
         live = self._resumed(place) if self.settings.resume else self._make_live()
-        joint_names = None if self._table is None else self._table.joint_names
         self._gatherer = LiveGatherer(
-            joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id
+            self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id
         )
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
@@ -257,16 +260,8 @@ class CalibrationNode(Node):
         for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
-        self._listen()
-        reference = (
-            "by hand, since neither 'table_file' nor 'urdf_file' was given: hold the IMU still in"
-            ' 12 different attitudes and turn it in between'
-            if joint_names is None
-            else (
-                f'on {words_of(robot, self.settings.table_file)} with the joints'
-                f' {", ".join(joint_names)}'
-            )
-        )
+        self._listen(joints)
+        reference = self._reference.live_words(words_of(robot, self.settings.table_file))
         self.get_logger().info(f'calibrates {reference}; ~/save writes {place.calibration}')
         self._guide = CalibrationGuide(
             self._inputs,
@@ -276,13 +271,13 @@ class CalibrationNode(Node):
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
 
-    def _listen(self) -> None:
+    def _listen(self, joints: list[str]) -> None:
         topics = {
             'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu),
             'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature),
         }
-        if self._table is not None:
-            topics['joints'] = (JointState, 'joint_states', self._gatherer.add_joints)
+        for topic in joints:
+            topics['joints'] = (JointState, topic, self._gatherer.add_joints)
         self._inputs = {
             name: BatchInput(self, kind, topic, add=add, depth=INPUT_DEPTH, single=name != 'joints')
             for name, (kind, topic, add) in topics.items()
@@ -306,22 +301,13 @@ class CalibrationNode(Node):
         }
 
     def _provenance(self, robot: RobotSettings) -> dict[str, Any]:
-        stand = robot.urdf_file or self.settings.table_file
-        return provenance_with(
-            'calibration_node',
-            (),
-            self._choices(),
-            stand=None if stand in NO_TABLE else files.user_path(stand),
-        )
+        stand = stand_path(robot, self.settings.table_file)
+        return provenance_with('calibration_node', (), self._choices(), stand=stand)
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
-        options, live = (
-            replace(self._options, windows=self._session[WindowSettings]),
-            self._session[LiveSettings],
-        )
-        if self._table is None:
-            return LiveByHand(options, live, self._session[LiveByHandSettings], saved=saved)
-        return LiveCalibration(self._table, options, live, saved=saved)
+        options = replace(self._options, windows=self._session[WindowSettings])
+        live, by_hand = self._session[LiveSettings], self._session[LiveByHandSettings]
+        return self._reference.live(options, live, by_hand, saved=saved)
 
     def _resumed(self, place: SessionFiles) -> LiveSession:
         try:
@@ -364,16 +350,11 @@ class CalibrationNode(Node):
     def _change_files(self, group: CalibrationNodeSettings) -> None:
         self.worker.autosave_period, self.settings = group.autosave_period, group
 
+    def _change_place(self, group: LiveByHandSettings) -> None:
+        self._reference.check_place(self._session[LiveByHandSettings].place, group.place)
+        self._change_session(group)
+
     def _change_session(self, group: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
-        before = self._session[type(group)]
-        if self._table is not None and isinstance(group, LiveByHandSettings):
-            if group.place != before.place:
-                raise InputError(
-                    'gravity is part of the reference of a session on a table or an arm, it cannot'
-                    ' change while the node runs; start the node with it',
-                    key='gravity',
-                    code='gravity_fixed',
-                )
         self._session[type(group)] = group
         self.worker.ask(lambda: self.worker.change(group))
 

@@ -20,11 +20,10 @@ from typing import Any
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import (
     LiveByHandSettings,
-    LiveCalibration,
     LiveSettings,
     SolvePacer,
 )
-from imu_calibration.calibration.live_poses import LiveByHand
+from imu_calibration.calibration.live_poses import LiveSession
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.document import files
@@ -37,8 +36,6 @@ from imu_calibration.preprocessing.window import WindowSettings
 from msg_adapters.live import LiveGatherer
 
 DEFAULT_FILE = 'calibration.yaml'
-LiveSession = LiveCalibration | LiveByHand
-"""A calibration during the motion, on a table or by hand."""
 
 
 class SessionFiles:
@@ -275,7 +272,7 @@ class CalibrationWorker(threading.Thread):
 
     @property
     def _diagnosis_period(self) -> float:
-        return self.live.settings.diagnosis_period if self.live.on_table is not None else 0.0
+        return self.live.diagnosis_period
 
     def ask(self, what: str | Callable[[], tuple[bool, str]]) -> Future:
         """
@@ -391,9 +388,7 @@ class CalibrationWorker(threading.Thread):
 
     def _diagnose_when_due(self) -> None:
         n_windows = self.live.n_windows
-        self._diagnosis.ask_when_due(
-            lambda: question_about(self.live.on_table), n_windows > self._diagnosed
-        )
+        self._diagnosis.ask_when_due(lambda: question_about(self.live), n_windows > self._diagnosed)
         if self._diagnosis.is_running:
             self._diagnosed = max(n_windows, self._diagnosed)
 
@@ -403,8 +398,8 @@ class CalibrationWorker(threading.Thread):
 
     def _adopt(self) -> bool:
         """Apply the last result of the diagnosis to the model; return whether the model changes."""
-        extension, session = self._diagnosis.take_extension(), self.live.on_table
-        return extension is not None and session is not None and session.adopt(extension)
+        extension = self._diagnosis.take_extension()
+        return extension is not None and self.live.adopt(extension)
 
     def _settled_solution(self) -> tuple[CalibrationResult, str]:
         """
@@ -415,7 +410,7 @@ class CalibrationWorker(threading.Thread):
         published = self._publish_solution(pending=True)
         if not self._diagnosis_period:
             return published
-        self._diagnosis.settle(question_about(self.live.on_table))
+        self._diagnosis.settle(question_about(self.live))
         return self._publish_solution(pending=True) if self._adopt() else published
 
     def _publish_solution(self, pending: bool) -> tuple[CalibrationResult, str]:
@@ -494,12 +489,11 @@ class CalibrationWorker(threading.Thread):
         self, settings: LiveSettings | WindowSettings | LiveByHandSettings
     ) -> tuple[bool, str]:
         """Use other settings from now on; another gravity by hand changes the solution at once."""
-        self.live.change(settings)
+        if self.live.change(settings):
+            self._new_windows = self.live.n_windows > 0
         if isinstance(settings, LiveSettings):
             self._pacer = SolvePacer(settings.solve_share)
             self._diagnosis.change(self._diagnosis_period)
-        elif isinstance(settings, LiveByHandSettings):
-            self._new_windows = self.live.n_windows > 0
         return True, ''
 
     def _autosave(self) -> None:
@@ -541,10 +535,8 @@ class CalibrationWorker(threading.Thread):
         )
         groups = self.live.groups() if stale else self.state.groups
         found = self._diagnosis.state
-        diagnosis = (
-            None
-            if self.live.on_table is None
-            else replace(
+        diagnosis = self.live.diagnosed(
+            replace(
                 found,
                 values={
                     **found.values,
@@ -573,7 +565,7 @@ class CalibrationWorker(threading.Thread):
         """Update the picture of the coverage after a change."""
         seen = (
             id(self.live),
-            self.live.n_windows if self.live.on_table is None else 0,
+            self.live.n_covered,
             self._n_solutions,
         )
         if seen != self._covered:

@@ -62,7 +62,7 @@ from imu_calibration.nodes.lifecycle import (
     run_node,
 )
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
-from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
+from imu_calibration.nodes.robot_stand import RobotSettings, live_reference
 from imu_calibration.planning.campaign import Campaign, CampaignSettings, Suspect, separator_of
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.motion_library import up_at
@@ -185,14 +185,9 @@ class PlannerNode(Node):
             ['joint_trajectory', 'imu/coverage'],
             note=NOT_CHECKED,
         )
-        table = chain_of(self, robot, settings.table_file)
-        if table is None:
-            raise InputError(
-                "planner_node requires the joints that it moves, got neither 'table_file' nor"
-                " 'urdf_file'; give one of them",
-                code='table_missing',
-            )
-        self._table = table
+        self._table = live_reference(self, robot, settings.table_file).table_for(
+            "planner_node moves the joints of 'table_file' or 'urdf_file'", 'table_missing'
+        )
         own = settings.tolerances_file
         tolerances = files.read_tolerances(
             files.user_path(own) if own else config_file('tolerances.yaml')

@@ -3,7 +3,8 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
@@ -20,6 +21,9 @@ from imu_calibration.kinematics.urdf import StaticTransforms, root_of, table_fro
 from imu_calibration.nodes.diagnostics import LOG_WARN, say
 from imu_calibration.nodes.inputs import latched_qos
 from msg_adapters.layout import clean_name
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.reference import MotionReference
 
 TF_STATIC = '/tf_static'
 TRANSFORM_DEPTH = 100
@@ -194,6 +198,29 @@ def chain_of(
     if robot.world_frame:
         site['up'] = _up(node, robot.world_frame, root_of(text))
     return table_from_urdf(text, link, site, gravity=gravity, gravity_sd=gravity_sd)
+
+
+def live_reference(
+    node: Node, robot: RobotSettings, table_file: str, **known: Any
+) -> 'MotionReference':
+    """Return the reference that a node's parameters describe; arguments as for `chain_of`."""
+    # Here, because simulator_node does not need them.
+    from imu_calibration.calibration.gravity_reference import GravityReference
+    from imu_calibration.calibration.table_reference import TableReference
+
+    table = chain_of(node, robot, table_file, **known)
+    return GravityReference() if table is None else TableReference(table)
+
+
+def stand_path(robot: RobotSettings, table_file: str) -> Path | None:
+    """Return the file of the arm or the table, None without one."""
+    stand = robot.urdf_file or table_file
+    return None if stand in NO_TABLE else files.user_path(stand)
+
+
+def joint_topics(robot: RobotSettings, table_file: str) -> list[str]:
+    """Return the topics of the joints, none without a table or an arm."""
+    return ['joint_states'] if stand_path(robot, table_file) else []
 
 
 def words_of(robot: RobotSettings, table_file: str) -> str:

@@ -15,12 +15,8 @@ from typing import TYPE_CHECKING
 from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.check import check_errors
 from imu_calibration.calibration.check_result import CheckResult
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
-from imu_calibration.calibration.pose_readings import errors_by_hand
+from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.calibration.result import CalibrationResult, summary
-from imu_calibration.calibration.table_calibration import TableRecordings
-from imu_calibration.calibration.window_readings import errors_on_table
-from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.readings import STATED_KEYS
 from imu_calibration.core.samples import SampleBlock
@@ -36,7 +32,6 @@ from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import (
     Choices,
-    inputs_of,
     made_from,
     provenance_with,
     readings_for,
@@ -49,6 +44,7 @@ from imu_calibration.use_cases.recordings import (
     process_mapper,
     provenance_of,
 )
+from imu_calibration.use_cases.references import inputs_of
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
     from typing_extensions import Unpack
@@ -64,6 +60,8 @@ class Calibrated:
 
     result: CalibrationResult
     """The calibration with all data of a report."""
+    reference: MotionReference
+    """The reference of its recordings."""
 
     @property
     def calibration(self) -> Calibration:
@@ -168,27 +166,18 @@ def calibrate_recordings(
     """
     given = {**choices, 'earlier': earlier}
     earlier = None if earlier is None else files.given_calibration(earlier)
-    if earlier is not None and table is None:
-        raise InputError(
-            'an earlier calibration must be compared on a table, none was given; give its'
-            ' description',
-            key='table',
-            code='table_missing',
-        )
     recordings = (
         [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
     )
-    stand, (options, table, sources) = table, inputs_of(recordings, table, choices)
+    options, reference, sources = inputs_of(recordings, table, choices)
+    if earlier is not None:
+        reference.table_for('an earlier calibration must be compared on a table', 'table_missing')
     jobs = jobs_for(jobs, len(recordings))
     with ThreadPoolExecutor(1) as hashing:  # reads the files during the calibration, not before it
-        provenance = hashing.submit(provenance_with, 'calibrate', recordings, given, stand=stand)
-        if table is None:
-            result = calibrate_without_table(sources, options)
-        else:
-            result = _side_by_side(sources, table, options, recordings, jobs)
-            if earlier is not None and result.calibration.proof:
-                errors = errors_on_table(sources, table, earlier, options=options)
-                result = _beside(result, errors.proof)
+        provenance = hashing.submit(provenance_with, 'calibrate', recordings, given, stand=table)
+        result = _side_by_side(sources, reference, options, recordings, jobs)
+        if earlier is not None and result.calibration.proof:
+            result = _beside(result, reference.errors(sources, earlier, options).proof)
         calibration = result.calibration
         return Calibrated(
             replace(
@@ -196,7 +185,8 @@ def calibrate_recordings(
                 calibration=replace(
                     calibration, provenance=calibration.provenance | provenance.result()
                 ),
-            )
+            ),
+            reference,
         )
 
 
@@ -213,8 +203,8 @@ def _beside(result, proof):
     )
 
 
-def _side_by_side(sources, table, options, recordings, jobs):
-    """Calibrate with the table, recordings in several processes if `jobs` is above 1."""
+def _side_by_side(sources, reference, options, recordings, jobs):
+    """Calibrate, recordings in several processes if `jobs` is above 1."""
     names = [name_of(recording) for recording in recordings]
     names = [
         (
@@ -230,8 +220,8 @@ def _side_by_side(sources, table, options, recordings, jobs):
     ]
     advance = counter('recordings', len(recordings) if jobs > 1 else 0)
     mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-    recordings = TableRecordings.of(sources, table, mapper=mapper, names=names, keep_windows=True)
-    return calibrate_by_evidence(recordings, options)
+    gathered = reference.gather(sources, options, names=names, mapper=mapper)
+    return calibrate_by_evidence(gathered, options)
 
 
 def check_recording(
@@ -273,11 +263,7 @@ def check_recording(
     described = {**choices, 'nominal': readings_for(calibration, choices)}
     for name in STATED_KEYS:
         described.pop(name, None)
-    options, table, sources = inputs_of([recording], table, described)
-    if table is None:
-        errors = errors_by_hand(sources[0], calibration, options)
-    else:
-        names = [name_of(recording)]
-        errors = errors_on_table(sources, table, calibration, options=options, names=names)
+    options, reference, sources = inputs_of([recording], table, described)
+    errors = reference.errors(sources, calibration, options, names=[name_of(recording)])
     own = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
     return check_errors(errors, calibration, change_limit=limit, own_recording=bool(own))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from hashlib import sha256
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core.documents import to_text
@@ -33,14 +33,9 @@ from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.recordings import (
     Arm,
-    Source,
     Stand,
     Topics,
-    open_bag,
     provenance_of,
-    source_of,
-    sources_without,
-    table_of,
 )
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.csv_log import SENSOR_OF, LogOptions
@@ -130,61 +125,6 @@ class Choices(TypedDict, total=False):
     """Serial number of the IMU, for the document."""
     operator: str | None
     """Who recorded and calibrated, for the document."""
-
-
-class Inputs(NamedTuple):
-    """What a use case on recordings works with."""
-
-    options: CalibrationOptions
-    """Of estimation and validation."""
-    table: Table | None
-    """The chain of joints; None: by hand."""
-    sources: list[Source]
-    """One for each recording."""
-
-
-def inputs_of(
-    recordings: Sequence[str | PathLike | SampleBlock],
-    stand: Stand | None,
-    choices: Mapping[str, Any],
-) -> Inputs:
-    """
-    Return the inputs that the user has chosen; each recording can be opened.
-
-    Parameters
-    ----------
-    recordings : sequence
-        Bags, or samples in memory.
-    stand : path-like, Table or Arm, optional
-        The reference, see `table_of`; None: by hand.
-    choices : mapping
-        See `Choices`.
-
-    Raises
-    ------
-    InputError
-        When a choice does not exist, or a file cannot be used.
-
-    """
-    strange = sorted(set(choices) - set(Choices.__annotations__))
-    if strange:
-        raise InputError(
-            f'{", ".join(strange)} cannot be chosen; the choices are'
-            f' {", ".join(Choices.__annotations__)}',
-            code='choice_unknown',
-        )
-    options, topics = calibration_options(choices), topics_of(choices)
-    table = None
-    if stand is not None:
-        table = table_of(
-            stand, recordings, topics, gravity=options.gravity, gravity_sd=options.gravity_sd
-        )
-    for path in recordings:
-        if not isinstance(path, SampleBlock):
-            open_bag(path, topics, want_joints=table is not None).close()
-    joint_names = None if table is None else table.joint_names
-    sources = [source_of(item, topics, joint_names) for item in recordings]
-    return Inputs(options, table, sources_without(sources, recordings, choices.get('exclude')))
 
 
 def topics_of(choices: Mapping[str, Any]) -> Topics:

@@ -6,11 +6,7 @@ from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
-    DiagnosisResult,
-    diagnose_recording,
-    diagnose_without_table,
-)
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
@@ -20,11 +16,11 @@ from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import (
     Choices,
-    inputs_of,
     provenance_with,
     require_same_inputs,
 )
 from imu_calibration.use_cases.recordings import Stand
+from imu_calibration.use_cases.references import inputs_of
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
     from typing_extensions import Unpack
@@ -178,8 +174,6 @@ def diagnose(
         When the recording cannot be used, or no parameter can be determined from it.
 
     """
-    stand, (options, table, (source,)) = table, inputs_of([recording], table, choices)
-    provenance = provenance_with('diagnose', [recording], choices, stand=stand)
-    if table is None:
-        return Diagnosed(diagnose_without_table(source, options, provenance))
-    return Diagnosed(diagnose_recording(source, table, options, provenance=provenance))
+    options, reference, (source,) = inputs_of([recording], table, choices)
+    provenance = provenance_with('diagnose', [recording], choices, stand=table)
+    return Diagnosed(reference.diagnose(source, options, provenance))

@@ -5,19 +5,11 @@ from os import PathLike
 from pathlib import Path
 
 from imu_calibration.core.readings import combined
-from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.exports.export import Export, export, find_target
-from imu_calibration.document.exports.loss import (
-    TrialMotion,
-    import_file,
-    measured_temperature,
-    motion_of,
-    recorded_motion,
-)
-from imu_calibration.preprocessing.window_finder import session_truth
+from imu_calibration.document.exports.loss import TrialMotion, import_file
 from imu_calibration.use_cases.choices import log_options
 from imu_calibration.use_cases.recordings import (
     Stand,
@@ -25,9 +17,9 @@ from imu_calibration.use_cases.recordings import (
     name_of,
     source_of,
     sources_without,
-    table_of,
     temperatures,
 )
+from imu_calibration.use_cases.references import reference_of
 
 
 def export_calibration(
@@ -99,28 +91,11 @@ def export_calibration(
 
 
 def _motion(calibration, bag, stand, *, topics, exclude) -> TrialMotion:
-    """Return the motion of a recording: from the table, otherwise from its compensated readings."""
+    """Return the motion of a recording by its reference."""
+    reference = reference_of(stand, [bag], topics)
+    (source,) = sources_without([source_of(bag, topics, reference.joint_names)], [bag], exclude)
     temperature = temperatures(bag, topics)
-    if stand is None:
-        (source,) = sources_without([source_of(bag, topics)], [bag], exclude)
-        blocks = [block.imu for block in source() if block.imu is not None]
-        return recorded_motion(
-            calibration,
-            calibration.readings.apply(ImuSamples.concatenate(blocks)),
-            temperature,
-            name=name_of(bag),
-        )
-    table = table_of(stand, [bag], topics)
-    (source,) = sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude)
-    imu, ref = session_truth(source(), table)
-    warmth = measured_temperature(calibration, temperature, imu.stamp_ns)
-    return motion_of(
-        ref.force_s,
-        ref.rate_s,
-        ref.alpha_s,
-        temperature_c=warmth,
-        text=f'{name_of(bag)}, moved as its table says ({len(imu)} samples)',
-    )
+    return reference.trial_motion(source, calibration, temperature, name=name_of(bag))
 
 
 def import_calibration(

@@ -8,32 +8,31 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
+from typing import Any
 
-from imu_calibration.calibration.calibrate import conclude
-from imu_calibration.calibration.hand_recording import read_by_hand
-from imu_calibration.calibration.pose_observations import PoseObservations
+from imu_calibration.calibration.gravity_reference import GravityReference
+from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.solved import Solved
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.document.outcome import STATED_CHECKS, shortcomings
-from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import JOINT_STATES, Preflight, unusable, warnings
+from imu_calibration.document.outcome import shortcomings
+from imu_calibration.preprocessing.checks import unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
-from imu_calibration.references.gravity.hand_calibration import solve_by_hand
-from imu_calibration.references.gravity.hand_parameters import hand_options
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.use_cases.choices import calibration_options, topics_of
 from imu_calibration.use_cases.recordings import (
+    Stand,
     Topics,
     open_bag,
     source_of,
     sources_without,
 )
+from imu_calibration.use_cases.references import reference_of
 from msg_adapters.bag import Recording, list_topics
 from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
@@ -55,12 +54,9 @@ class RecordingSummary:
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
     calibrated: CalibrationResult | ImuCalibrationError | None
-    """Result of a calibration on the motions, or the error; None without a table."""
-    by_hand: CalibrationResult | ImuCalibrationError | None = None
-    """
-    Result of a calibration by hand, or the error; None with a table, and where a calibration would
-    be wrong.
-    """
+    """Result of a calibration, or the error; None by hand where it would be wrong."""
+    reference: MotionReference = GravityReference()
+    """The reference of that calibration."""
 
     @property
     def refused(self) -> bool:
@@ -79,19 +75,12 @@ class RecordingSummary:
 
     @property
     def result(self) -> CalibrationResult | None:
-        """Result of the calibration on a table or by hand; None without one."""
-        for result in (self.calibrated, self.by_hand):
-            if result is not None and not isinstance(result, ImuCalibrationError):
-                return result
-        return None
+        """Result of the calibration; None without one."""
+        return None if isinstance(self.calibrated, ImuCalibrationError) else self.calibrated
 
     @property
     def reasons(self) -> list[str]:
         """Why the exit code is not 0, a line each."""
-        if self.result is not None:
-            lacking = shortcomings(self.result.calibration)
-            if not lacking or self.result is self.calibrated:
-                return lacking
         lines = [finding.text for finding in warnings(self.findings)]
         received = self.streams['imu'].count if 'imu' in self.streams else 0
         dropped = dict(self.lost)
@@ -99,7 +88,9 @@ class RecordingSummary:
             dropped['unusable'] = count
         if lost := dropped_text(dropped, received):
             lines.append(lost)
-        return lines
+        if self.result is None:
+            return lines
+        return self.reference.reasons(shortcomings(self.result.calibration), lines)
 
 
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
@@ -145,10 +136,33 @@ def _by_frame(bag, topics):
     return [topics._replace(frame=frame) for frame in frames] if len(frames) > 1 else [topics]
 
 
+def inspect_imus(
+    recording: str | PathLike | SampleBlock, stand: Stand | None, choices: Mapping[str, Any]
+) -> list[RecordingSummary]:
+    """
+    Inspect the chosen Imu topic of a recording, or each one; see `inspect_recording`.
+
+    Parameters
+    ----------
+    recording : path-like or SampleBlock
+    stand : path-like, Table or Arm, optional
+        The reference, see `reference_of`.
+    choices : mapping
+        See `Choices`.
+
+    """
+    options, topics = calibration_options(choices), [topics_of(choices)]
+    if not isinstance(recording, SampleBlock):
+        topics = imu_topics_of(recording, *topics)
+    reference = reference_of(stand, [recording], topics[0], options=options)
+    exclude = choices.get('exclude')
+    return inspect_recording(recording, topics, reference, options=options, exclude=exclude)
+
+
 def inspect_recording(
     bag: str | PathLike | SampleBlock,
     topics: Iterable[Topics],
-    table: Table | None,
+    reference: MotionReference,
     *,
     options: CalibrationOptions,
     exclude: str | None = None,
@@ -158,7 +172,7 @@ def inspect_recording(
 
     `exclude`: times that are not used, as in `Choices`.
     """
-    looks = [_look(bag, each, table, options=options, exclude=exclude) for each in topics]
+    looks = [_look(bag, each, reference, options=options, exclude=exclude) for each in topics]
     notes = {}
     for pair in split_topics(looks):
         note = CheckFinding(
@@ -214,48 +228,21 @@ def _closest_name(name, candidates):
     return closest[0] if len(closest) == 1 else None
 
 
-def _look(bag, topics, table, *, options, exclude):
+def _look(bag, topics, reference, *, options, exclude):
     recording = None
     if not isinstance(bag, SampleBlock):
         recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
         recording.close()
-    gravity = None if table is None else table.gravity_value
-    preflight = Preflight(gravity, strict=table is not None, one_sensor=table is not None)
-    calibrated = None
-    by_hand = None
-    error_findings: tuple[CheckFinding, ...] = ()
-    if table is not None:
-        # here, because a recording by hand does not need its import
-        from imu_calibration.calibration.table_calibration import WatchedRecording
-        from imu_calibration.calibration.table_errors import calibrate_with_table_errors
-
-        try:
-            sources = sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude)
-            watched = replace(WatchedRecording.of(sources, table), preflight=preflight)
-            table_errors = calibrate_with_table_errors(watched, options)
-            calibrated = table_errors.result
-            stated = [
-                finding
-                for finding in calibrated.gathered.findings
-                if finding.check in STATED_CHECKS
-            ]
-            error_findings = (*stated, *table_errors.findings)
-        except ImuCalibrationError as error:
-            calibrated = error
-    if not preflight.streams:  # not read to its end: no data to calibrate from
-        preflight = Preflight(gravity, strict=False, one_sensor=table is None)
-        source = source_of(bag, topics, want_joints='optional', want_temperature='optional')
-        (source,) = sources_without([source], [bag], exclude)
-        by_hand = _by_hand(source, options, preflight)
-    own_findings = preflight.findings
-    if isinstance(calibrated, ImuCalibrationError) and calibrated.code == 'on_table':
-        # Joints that rest while the IMU turns follow from the stated cause, such as two clocks.
-        own_findings = tuple(each for each in own_findings if each.sensor != JOINT_STATES)
-    findings = (*own_findings, *error_findings, *_axes_question(bag, options))
-    look = RecordingSummary(
-        recording, preflight.streams, findings, preflight.lost, calibrated, by_hand
+    source = source_of(bag, topics, reference.joint_names)
+    lenient = source_of(bag, topics, want_joints='optional', want_temperature='optional')
+    (source,) = sources_without([source], [bag], exclude)
+    (lenient,) = sources_without([lenient], [bag], exclude)
+    found = reference.inspect(source, lenient, options)
+    preflight = found.preflight
+    findings = (*found.findings, *_axes_question(bag, options))
+    return RecordingSummary(
+        recording, preflight.streams, findings, preflight.lost, found.calibrated, reference
     )
-    return look if table is None and not look.refused else replace(look, by_hand=None)
 
 
 def _axes_question(bag, options):
@@ -277,17 +264,3 @@ def _axes_question(bag, options):
             value='frd',
         )
     ]
-
-
-def _by_hand(source, options, preflight):
-    """Run the checks on a recording and return its calibration without a table, or the error."""
-    try:
-        recording = read_by_hand(source(), options.nominal, preflight)
-        if any(finding.severity == REFUSE for finding in recording.findings):
-            return None
-        asked = hand_options(options)
-        poses = PoseObservations.of(recording, asked)
-        solved = Solved(solve_by_hand(poses.data, asked), poses)
-        return conclude(solved, options, is_judged=False)
-    except ImuCalibrationError as error:
-        return error

@@ -21,15 +21,15 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.use_cases.calibrate import Calibrated
 from imu_calibration.use_cases.calibrate import calibrate_recordings as _calibrate
 from imu_calibration.use_cases.calibrate import check_recording as _check
-from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
+from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.compensate import Compensated
 from imu_calibration.use_cases.compensate import compensate_recording as _compensate
 from imu_calibration.use_cases.diagnose import diagnose as _diagnose
-from imu_calibration.use_cases.inspect import RecordingSummary, imu_topics_of
-from imu_calibration.use_cases.inspect import inspect_recording as _inspect
+from imu_calibration.use_cases.inspect import RecordingSummary
+from imu_calibration.use_cases.inspect import inspect_imus as _inspect
 from imu_calibration.use_cases.noise import IdentifiedNoise
 from imu_calibration.use_cases.noise import identify_recording as _noise
-from imu_calibration.use_cases.recordings import Stand, table_of
+from imu_calibration.use_cases.recordings import Stand
 from imu_calibration.use_cases.simulate import simulate as _simulate
 
 Arguments = ParamSpec('Arguments')
@@ -223,15 +223,7 @@ def inspect(
     """
     arrays = Arrays(time, force, rate, joints, temperature_c)
     block = arrays.or_given('inspect', recording)
-    topics = topics_of(choices)
-    chosen = [topics] if isinstance(block, SampleBlock) else imu_topics_of(block, topics)
-    options = calibration_options(choices)
-    stand = None
-    if table is not None:
-        stand = table_of(
-            table, [block], chosen[0], gravity=options.gravity, gravity_sd=options.gravity_sd
-        )
-    return _inspect(block, chosen, stand, options=options)
+    return _inspect(block, table, choices)
 
 
 @_for_notebooks

@@ -582,6 +582,12 @@ def table_of(
     )
 
 
+def refuse_stand(stand: Stand | None, recording: str) -> None:
+    """Refuse a table or an arm, which needs a recording; `recording`: which, and why it misses."""
+    if stand is not None:
+        raise InputError(f'a table or arm needs {recording}')
+
+
 def _description(arm, bag):
     """Return the text of the robot description: of the file, otherwise of the recording's topic."""
     if arm.urdf is not None:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from imu_calibration.core import documents
-from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -33,8 +32,9 @@ from imu_calibration.simulation.session import (
     true_imu,
 )
 from imu_calibration.simulation.session import simulate_session as run_session
-from imu_calibration.use_cases.choices import Choices, catalogue_of, inputs_of
+from imu_calibration.use_cases.choices import Choices, catalogue_of
 from imu_calibration.use_cases.recordings import LIKELY_LINK, Arm, Stand, name_of, table_of
+from imu_calibration.use_cases.references import inputs_of
 from imu_calibration.use_cases.resources import config_file
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
@@ -218,15 +218,8 @@ def replay(
         motion.
 
     """
-    if table is None:
-        raise InputError(
-            'a replay needs the motion of the IMU, no table or arm was given; give one (by hand'
-            ' only the gyroscope measures the turns)',
-            key='table',
-            code='replay_by_hand',
-        )
-    _, given, (source,) = inputs_of([recording], table, choices)
-    assert given is not None  # because a table or arm is given
+    _, reference, (source,) = inputs_of([recording], table, choices)
+    given = reference.table_for('a replay needs the motion of a table or an arm', 'replay_by_hand')
     known = files.given_calibration(calibration)
     require_joints(known.model, given)
     noise = None

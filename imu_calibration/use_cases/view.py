@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
@@ -17,10 +17,8 @@ from imu_calibration.calibration.coverage import (
     label_of,
     seen_of,
     sphere_cells,
-    table_coverage,
 )
 from imu_calibration.calibration.diagnosis.traces import Traces
-from imu_calibration.calibration.live_poses import EMPTY_SCAN, hand_coverage
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
@@ -29,11 +27,10 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import tolerances_of
-from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.report.diagnosis_page import histogram
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.choices import Choices
-from imu_calibration.use_cases.recordings import Stand
+from imu_calibration.use_cases.recordings import Stand, refuse_stand
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -455,7 +452,8 @@ def view(
     """
     path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
     if path is None:
-        result = calibrate_recordings(source, table, **choices).result
+        made = calibrate_recordings(source, table, **choices)
+        result = made.result
         contents = {
             PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances),
             RESIDUAL_TOPIC: residual(result),
@@ -469,11 +467,10 @@ def view(
         return View(
             result.calibration,
             contents,
-            _coverage(result),
+            made.reference.coverage(result),
             contents[RESIDUAL_TOPIC]['windows'][-1]['time'],
         )
-    if table is not None:
-        raise InputError('a table or arm needs a recording, a calibration file was given; omit one')
+    refuse_stand(table, 'a recording, a calibration file was given; omit one')
     calibration = files.read_calibration(path)
     return View(
         calibration,
@@ -486,13 +483,3 @@ def _document_of(path):
     """Return the calibration file that a path means, None where it means a recording."""
     path = path / 'calibration.yaml' if (path / 'calibration.yaml').is_file() else path
     return path if path.suffix in ('.yaml', '.yml') else None
-
-
-def _coverage(result: CalibrationResult) -> Coverage:
-    if result.data.table is not None:
-        return table_coverage(result)
-    return hand_coverage(
-        replace(EMPTY_SCAN, poses=result.applied.poses),
-        result,
-        HandOptions(tolerances=result.options.tolerances),
-    )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.cli.show import warn
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
@@ -55,7 +56,7 @@ def session():
 
 def inspected(block, options=OPTIONS):
     """Return the summary of a recording on the table."""
-    (summary,) = inspect_recording(block, [Topics()], TABLE, options=options)
+    (summary,) = inspect_recording(block, [Topics()], TableReference(TABLE), options=options)
     return summary
 
 

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.gravity_reference import GravityReference
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT, dropped_text
@@ -184,14 +186,17 @@ def test_a_warning_changes_the_code_of_inspect_only_without_a_complete_calibrati
     whole, lacking = SimpleNamespace(calibration=complete), SimpleNamespace(calibration=weak)
     refusal = InputError('no interval at rest', code='no_rest')
     assert exit_code(complete) == 0
-    for on_table, by_hand, code in (
-        (None, None, 3),
-        (refusal, None, 3),
-        (whole, None, 0),
-        (None, whole, 0),
-        (lacking, None, 3),
-        (None, lacking, 3),
+    by_hand = GravityReference()
+    on_table = TableReference(SimpleNamespace())
+    for reference, calibrated, code in (
+        (by_hand, None, 3),
+        (on_table, refusal, 3),
+        (on_table, whole, 0),
+        (by_hand, whole, 0),
+        (on_table, lacking, 3),
+        (by_hand, lacking, 3),
     ):
-        assert replace(look, calibrated=on_table, by_hand=by_hand).exit_code == code
-    assert replace(look, calibrated=lacking).reasons == shortcomings(weak)
-    assert replace(look, findings=(), by_hand=lacking).exit_code == 0
+        assert replace(look, calibrated=calibrated, reference=reference).exit_code == code
+    on_table_reasons = replace(look, calibrated=lacking, reference=on_table).reasons
+    assert on_table_reasons == shortcomings(weak)
+    assert replace(look, findings=(), calibrated=lacking).exit_code == 0

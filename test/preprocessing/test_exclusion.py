@@ -15,8 +15,9 @@ from imu_calibration.preprocessing.exclusion import (
     without_excluded,
 )
 from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.choices import inputs_of
+from imu_calibration.use_cases.inspect import inspect_imus
 from imu_calibration.use_cases.noise import identify_recording
+from imu_calibration.use_cases.references import inputs_of
 
 from worlds.hand_sessions import GRAVITY
 from worlds.physics_hand import hold_and_turn
@@ -91,5 +92,7 @@ def test_the_use_cases_leave_it_out():
     assert found.exit_code == 3
     (source,) = inputs_of([block], None, {'exclude': '1:2'}).sources
     assert sum((each.dropped or {}).get(EXCLUDED, 0) for each in source()) == 80
+    (look,) = inspect_imus(block, None, {'exclude': '1:2'})
+    assert look.lost[EXCLUDED] == 80 and look.streams['imu'].count == len(imu) - 80
     with refused(InputError, 'exclude_outside', '70:71'):
         identify_recording(block, exclude='70:71')

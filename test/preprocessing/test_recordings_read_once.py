@@ -12,8 +12,10 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files, verdict
@@ -69,9 +71,10 @@ def test_calibration_by_hand_cleans_each_sample_once(seen):
 
 @pytest.mark.parametrize('with_table', [True, False], ids=['table', 'no table'])
 def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, seen, with_table):
-    (look,) = inspect_recording(BAG, [Topics()], table if with_table else None, options=PLAIN)
+    reference = TableReference(table) if with_table else GravityReference()
+    (look,) = inspect_recording(BAG, [Topics()], reference, options=PLAIN)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] == look.streams['imu'].count
-    assert (look.calibrated is not None) == with_table and (look.by_hand is not None) != with_table
+    assert look.calibrated is not None
 
 
 def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, monkeypatch):

@@ -7,6 +7,7 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import STANDARD_GRAVITY
@@ -149,7 +150,9 @@ def test_live_is_as_from_the_recording(sensor):
 def test_it_is_inspected():
     session, block = alone('gyroscope')
     table = Table.from_mapping(session.table)
-    (look,) = inspect_recording(block, [Topics()], table, options=CalibrationOptions(as_asked=True))
+    (look,) = inspect_recording(
+        block, [Topics()], TableReference(table), options=CalibrationOptions(as_asked=True)
+    )
     assert not look.refused
     assert [finding.check for finding in look.findings if finding.check == 'absent'] == ['absent']
 

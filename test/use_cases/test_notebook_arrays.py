@@ -9,6 +9,7 @@ import pytest
 from refusal import refused
 
 import imu_calibration as imu
+from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
@@ -129,7 +130,10 @@ def test_results_of_other_inputs_are_replaced_only_by_force(tmp_path):
     second.save(tmp_path, report=False, force=True)
     assert (tmp_path / 'noise.yaml').read_bytes() != before
     one, other = (
-        Calibrated(SimpleNamespace(calibration=random_calibration(2, (), provenance=provenance)))
+        Calibrated(
+            SimpleNamespace(calibration=random_calibration(2, (), provenance=provenance)),
+            GravityReference(),
+        )
         for provenance in (
             {'verb': 'calibrate', 'bags': [{'name': name, 'sha256': 16 * name}]} for name in 'ab'
         )

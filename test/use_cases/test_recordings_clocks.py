@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
@@ -19,7 +20,9 @@ def test_joints_do_not_seem_constant_where_the_clocks_differ(offset):
     shifted = session.imu.stamp_ns + round(offset * 1e9)
     block = SampleBlock(replace(session.imu, stamp_ns=shifted), session.joints)
     table = Table.from_mapping(session.table)
-    (look,) = inspect_recording(block, [Topics()], table, options=CalibrationOptions())
+    (look,) = inspect_recording(
+        block, [Topics()], TableReference(table), options=CalibrationOptions()
+    )
     assert look.calibrated.code == 'on_table'
     assert f'{abs(offset):.1f} s' in str(look.calibrated)
     assert 'clocks' in [finding.check for finding in look.findings]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
@@ -140,7 +141,9 @@ def test_each_of_several_pairs_is_proposed(tmp_path):
             topic = writer.add_topic(name, standard_definition(IMU_TYPE))
             writer.write(np.full(800, topic), stamps, packed)
     each = imu_topics_of(tmp_path / 'bag', Topics())
-    looks = inspect_recording(tmp_path / 'bag', each, None, options=calibration_options({}))
+    looks = inspect_recording(
+        tmp_path / 'bag', each, GravityReference(), options=calibration_options({})
+    )
     pairs = [(pair.imu, pair.gyroscope) for pair in split_topics(looks)]
     assert pairs == [('/cam1/accel', '/cam1/gyro'), ('/cam2/accel', '/cam2/gyro')]
     noted = []

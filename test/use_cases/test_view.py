@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.coverage import label_of
+from imu_calibration.calibration.coverage import label_of, table_coverage
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import UNKNOWN_SD
@@ -27,7 +27,6 @@ from imu_calibration.use_cases.view import (
     RESIDUAL_TOPIC,
     SPECTRUM_TOPIC,
     SPHERE_TOPIC,
-    _coverage,
     _from_x,
     residual_spectrum,
     scene_of,
@@ -116,7 +115,8 @@ def test_parameters_have_value_band_and_tolerance(written, result):
 
 
 def test_the_sphere_says_what_is_next_and_shows_every_cell_and_rest(written, result):
-    scene, found = shown_of(written, SPHERE_TOPIC), _coverage(result)
+    scene = shown_of(written, SPHERE_TOPIC)
+    found = table_coverage(result)
     drawn = str(scene_of(found, 'imu_link'))
     assert (
         scene == scene_of(found, result.calibration.frame_id).encode()

@@ -64,7 +64,6 @@ class PoseBlocks:
 
     unit: ClassVar[str] = 'windows'
     reference: ClassVar[str] = 'poses of motion capture'
-    table: ClassVar[None] = None
     gravity: ClassVar[float] = 9.81
     absent: ClassVar[tuple[str, ...]] = ABSENT
     tested: ClassVar[tuple[str, ...]] = ()

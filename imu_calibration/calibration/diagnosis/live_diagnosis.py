@@ -11,7 +11,8 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
 )
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.live import LiveCalibration, LiveSnapshot
+from imu_calibration.calibration.live import LiveSnapshot
+from imu_calibration.calibration.live_poses import LiveSession
 from imu_calibration.calibration.window_search import windows_to_ask
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.progress import LiveState
@@ -92,15 +93,15 @@ class DiagnosisQuestion:
             return Answer(LiveState(WAITING, str(error)))
 
 
-def question_about(live: LiveCalibration | None) -> DiagnosisQuestion | None:
+def question_about(live: LiveSession) -> DiagnosisQuestion | None:
     """
     Return the DiagnosisQuestion about the last solution of a session.
 
-    Or None without a table or while there are too few windows.
+    Or None without one or while there are too few windows.
     """
     return (
         DiagnosisQuestion(live.last)
-        if live is not None and live.last is not None and windows_to_ask(live.last.gathered)
+        if live.last is not None and windows_to_ask(live.last.gathered)
         else None
     )
 

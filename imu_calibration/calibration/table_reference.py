@@ -1,0 +1,172 @@
+"""The joints of a table or an arm as the reference."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from imu_calibration.calibration.check import ReadingErrors
+from imu_calibration.calibration.coverage import Coverage, table_coverage
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
+    DiagnosisResult,
+    diagnose_recording,
+)
+from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.live import (
+    LiveByHandSettings,
+    LiveCalibration,
+    LiveSettings,
+    Place,
+)
+from imu_calibration.calibration.reference import Inspection
+from imu_calibration.calibration.table_calibration import TableRecordings, WatchedRecording
+from imu_calibration.calibration.table_errors import calibrate_with_table_errors
+from imu_calibration.calibration.window_observations import TableResult
+from imu_calibration.calibration.window_readings import errors_on_table
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.samples import TemperatureSamples
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.exports.loss import TrialMotion, measured_temperature, motion_of
+from imu_calibration.document.outcome import STATED_CHECKS
+from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import JOINT_STATES, Preflight
+from imu_calibration.preprocessing.window_finder import session_truth
+from imu_calibration.references.options import CalibrationOptions
+
+
+@dataclass(frozen=True, eq=False)
+class TableReference:
+    """A table or an arm; the methods as in `MotionReference`."""
+
+    table: Table
+    """The chain of joints."""
+
+    not_usable: ClassVar[str] = 'not usable for calibration'
+
+    @property
+    def joint_names(self) -> JointNames:
+        """Names of the joints."""
+        return self.table.joint_names
+
+    def table_for(self, purpose: str, code: str = '') -> Table:
+        """Return the table."""
+        return self.table
+
+    def gather(
+        self,
+        sources: Sequence[Callable],
+        options: CalibrationOptions,
+        *,
+        names: Sequence[str] | None = None,
+        mapper: Callable = map,
+    ) -> TableRecordings:
+        """Return the recordings, which each pass reads."""
+        return TableRecordings.of(
+            sources, self.table, mapper=mapper, names=names, keep_windows=True
+        )
+
+    def errors(
+        self,
+        sources: Sequence[Callable],
+        calibration: Calibration,
+        options: CalibrationOptions,
+        *,
+        names: Sequence[str] = (),
+    ) -> ReadingErrors:
+        """Return the errors of window means."""
+        return errors_on_table(sources, self.table, calibration, options=options, names=names)
+
+    def diagnose(
+        self, source: Callable, options: CalibrationOptions, provenance: dict[str, Any]
+    ) -> DiagnosisResult:
+        """Identify the errors of the model in windows."""
+        return diagnose_recording(source, self.table, options, provenance=provenance)
+
+    def inspect(
+        self, source: Callable, lenient: Callable, options: CalibrationOptions
+    ) -> Inspection:
+        """Calibrate with the checks of a calibration; without data for it, only check."""
+        gravity = self.table.gravity_value
+        preflight = Preflight(gravity, one_sensor=True)
+        recordings = WatchedRecording.of([source], self.table)
+        calibrated: TableResult | ImuCalibrationError
+        shown = []
+        try:
+            found = calibrate_with_table_errors(replace(recordings, preflight=preflight), options)
+            calibrated = found.result
+            for finding in calibrated.gathered.findings:
+                if finding.check in STATED_CHECKS:
+                    shown.append(finding)
+            shown += found.findings
+        except ImuCalibrationError as error:
+            calibrated = error
+        if not preflight.streams:  # not read to its end
+            preflight = Preflight(gravity, strict=False)
+            with suppress(ImuCalibrationError):
+                read_by_hand(lenient(), options.nominal, preflight)
+        findings = preflight.findings
+        if isinstance(calibrated, ImuCalibrationError) and calibrated.code == 'on_table':
+            # Joints that rest while the IMU turns follow from the cause that the error states,
+            # such as two clocks.
+            findings = tuple(each for each in findings if each.sensor != JOINT_STATES)
+        return Inspection(preflight, (*findings, *shown), calibrated)
+
+    def reasons(self, lacking: list[str], doubts: list[str]) -> list[str]:
+        """Return what the calibration lacks: a table moves for nothing else."""
+        return lacking
+
+    def used_lines(self, calibration: Calibration) -> list[str]:
+        """Return the number of windows and samples of each kind, after an empty line."""
+        used = calibration.statistics['samples_used']
+        lines = ['']
+        for kind, count in calibration.statistics['windows'].items():
+            lines.append(f'{kind}: {count} windows, {used[kind]} samples')
+        return lines
+
+    def coverage(self, result: TableResult) -> Coverage:
+        """Return the gain of each attitude, and the motion with the largest gain."""
+        return table_coverage(result)
+
+    def check_place(self, before: Place, after: Place) -> None:
+        """Refuse another gravity, which is a part of the table."""
+        if after != before:
+            raise InputError(
+                'gravity is part of the reference of a session on a table or an arm, it cannot'
+                ' change while the node runs; start the node with it',
+                key='gravity',
+                code='gravity_fixed',
+            )
+
+    def live_words(self, stand: str) -> str:
+        """Return the joints."""
+        return f'on {stand} with the joints {", ".join(self.joint_names)}'
+
+    def live(
+        self,
+        options: CalibrationOptions,
+        settings: LiveSettings,
+        by_hand: LiveByHandSettings,
+        *,
+        saved: bytes | None = None,
+    ) -> LiveCalibration:
+        """Return a live session on the table."""
+        return LiveCalibration(self.table, options, settings, saved=saved)
+
+    def trial_motion(
+        self,
+        source: Callable,
+        calibration: Calibration,
+        temperature: TemperatureSamples | None,
+        *,
+        name: str,
+    ) -> TrialMotion:
+        """Return the motion that the joints have."""
+        imu, ref = session_truth(source(), self.table)
+        return motion_of(
+            ref.force_s,
+            ref.rate_s,
+            ref.alpha_s,
+            temperature_c=measured_temperature(calibration, temperature, imu.stamp_ns),
+            text=f'{name}, moved as its table says ({len(imu)} samples)',
+        )

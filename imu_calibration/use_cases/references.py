@@ -1,0 +1,93 @@
+"""The reference that the user has chosen, and the inputs of a use case on recordings."""
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from typing import Any, NamedTuple
+
+from imu_calibration.calibration.gravity_reference import GravityReference
+from imu_calibration.calibration.reference import MotionReference
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
+from imu_calibration.use_cases.recordings import (
+    Source,
+    Stand,
+    Topics,
+    open_bag,
+    source_of,
+    sources_without,
+    table_of,
+)
+
+
+def reference_of(
+    stand: Stand | None,
+    recordings: Sequence[str | PathLike | SampleBlock] = (),
+    topics: Topics = Topics(),
+    *,
+    options: CalibrationOptions = CalibrationOptions(),
+) -> MotionReference:
+    """
+    Return the reference: gravity without a table or an arm.
+
+    Arguments and errors as for `table_of`, with the local gravity of `options`.
+    """
+    if stand is None:
+        return GravityReference()
+    # Here, because by hand its import is not needed.
+    from imu_calibration.calibration.table_reference import TableReference
+
+    gravity, spread = options.gravity, options.gravity_sd
+    return TableReference(table_of(stand, recordings, topics, gravity=gravity, gravity_sd=spread))
+
+
+class Inputs(NamedTuple):
+    """What a use case on recordings works with."""
+
+    options: CalibrationOptions
+    """Of estimation and validation."""
+    reference: MotionReference
+    """A table or an arm, or gravity."""
+    sources: list[Source]
+    """One for each recording."""
+
+
+def inputs_of(
+    recordings: Sequence[str | PathLike | SampleBlock],
+    stand: Stand | None,
+    choices: Mapping[str, Any],
+) -> Inputs:
+    """
+    Return the inputs that the user has chosen; each recording can be opened.
+
+    Parameters
+    ----------
+    recordings : sequence
+        Bags, or samples in memory.
+    stand : path-like, Table or Arm, optional
+        The reference, see `reference_of`.
+    choices : mapping
+        See `Choices`.
+
+    Raises
+    ------
+    InputError
+        When a choice does not exist, or a file cannot be used.
+
+    """
+    strange = sorted(set(choices) - set(Choices.__annotations__))
+    if strange:
+        raise InputError(
+            f'{", ".join(strange)} cannot be chosen; the choices are'
+            f' {", ".join(Choices.__annotations__)}',
+            code='choice_unknown',
+        )
+    options, topics = calibration_options(choices), topics_of(choices)
+    reference = reference_of(stand, recordings, topics, options=options)
+    names = reference.joint_names
+    for path in recordings:
+        if not isinstance(path, SampleBlock):
+            open_bag(path, topics, want_joints=names is not None).close()
+    sources = [source_of(item, topics, names) for item in recordings]
+    return Inputs(options, reference, sources_without(sources, recordings, choices.get('exclude')))
