@@ -6,8 +6,6 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
 
 EXAMPLES = ('--table table.yaml --output plan', '--by-hand --output plan')
-MAX_PRINTED_MOTIONS = 12
-"""Motions of joints that are printed; plan.yaml has all."""
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -97,14 +95,13 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.planning.planner import plan_to_mapping
     from imu_calibration.use_cases.plan import by_hand, plan, require_no_plan
 
-    stand = None if options.by_hand and options.motion == 'any' else _stand(options)
     require_no_plan(options.output, report=not options.no_report, force=options.force)
     with files.output_folder(options.output) as folder:
-        if stand is None:
+        if options.by_hand and options.motion == 'any':
             made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **options.choices())
         else:
             made = plan(
-                stand,
+                _stand(options),
                 calibration=options.calibration,
                 grade=options.grade,
                 imu_rate=options.imu_rate,
@@ -145,24 +142,18 @@ def _stand(options):
     if options.motion == 'yaw-only':
         gravity, _ = local_gravity(options.gravity, options.latitude, options.height)
         return yaw_table(gravity)
-    stand = options.stand()
-    if stand is None:
-        raise InputError(
-            'a table or a robot description is required, none was given; give one', key='table'
-        )
-    return stand
+    return options.stand()
 
 
 def _show(planned, folder):
     from imu_calibration.use_cases.plan import plan_summary
 
-    made, most = planned.plan, None if planned.table is None else MAX_PRINTED_MOTIONS
+    made, most = planned.plan, planned.plan.most_printed
     for end, motion in list(zip(made.ends, made.motions, strict=True))[:most]:
         print_line(f'until {end:6.1f} s  {motion.words}', ' ' * 16)
     if most is not None and len(made.motions) > most:
         print(f'... and {len(made.motions) - most} more, in plan.yaml')
     for line in [*plan_summary(made), *planned.notes]:
         print_line(line, '    ')
-    print_line(
-        f'written: plan.yaml{"" if planned.table is None else " and the trajectory"} in {folder}'
-    )
+    trajectory = ' and the trajectory' if made.moved_joints else ''
+    print_line(f'written: plan.yaml{trajectory} in {folder}')

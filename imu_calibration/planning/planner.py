@@ -175,6 +175,10 @@ class Decision:
     """Whether to diagnose."""
 
 
+MAX_PRINTED_MOTIONS = 12
+"""Motions of joints that are printed; plan.yaml has all."""
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """Consecutive motions and their predicted standard deviations."""
@@ -208,19 +212,17 @@ class Plan:
     told_apart: str = ''
     """The causes that the plan separates, if that is its goal."""
 
-    @property
-    def noun(self) -> str:
-        """Plural of its motions."""
-        return 'poses and turns' if self.start is None else 'motions'
+    noun: str = 'motions'
+    """Plural of its motions."""
+    scope: str = 'for every motion of these joints within their limits'
+    """Motions to choose from, in a sentence about what is out of reach."""
+    most_printed: int | None = MAX_PRINTED_MOTIONS
+    """Number of motions that are printed at most; None: all, for a person who makes them."""
 
     @property
-    def scope(self) -> str:
-        """Motions to choose from, in a sentence about what is out of reach."""
-        return (
-            'by hand'
-            if self.start is None
-            else 'for every motion of these joints within their limits'
-        )
+    def moved_joints(self) -> tuple[str, ...]:
+        """Names of the joints that move."""
+        return tuple(self.model.joint_names) if self.motions else ()
 
     @property
     def seconds(self) -> float:
@@ -516,6 +518,9 @@ def plan_by_hand(
         wanted,
         np.array(history)[:, wanted] / tolerances[wanted],
         tuple(missing),
+        noun='poses and turns',
+        scope='by hand',
+        most_printed=None,
     )
 
 
@@ -532,7 +537,7 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
         if plan.start is None
         else {
             'probability': PROBABILITY,
-            'joints': list(plan.model.joint_names) if plan.motions else [],
+            'joints': list(plan.moved_joints),
         }
     )
     return {

@@ -33,6 +33,7 @@ from imu_calibration.report.figures import (
     log_axis,
 )
 from imu_calibration.report.navigation_section import navigation_section
+from imu_calibration.report.observation_texts import OBSERVATION_TEXTS
 from imu_calibration.report.page import render
 
 ROW = 0.155
@@ -402,6 +403,7 @@ def calibration_report(result: CalibrationResult) -> str:
     return render(
         'calibration.html',
         title='IMU calibration',
+        texts=OBSERVATION_TEXTS[result.observations],
         result=result,
         usage=usage(result.calibration),
         harmed=harmed,

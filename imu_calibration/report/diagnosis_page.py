@@ -22,6 +22,7 @@ from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.verdict import judge, unexplained_text
 from imu_calibration.effects.base import AXES, UNITS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
+from imu_calibration.report.observation_texts import OBSERVATION_TEXTS
 from imu_calibration.report.page import render
 from imu_calibration.selection.proposals import Proposal
 
@@ -31,8 +32,6 @@ FEW = 200
 Below this number of points the effect is drawn against its own prediction, with points that can be
 seen.
 """
-SPAN = {'windows': 'over 0.25 s', 'poses': 'of each pose'}
-"""Averaging span of a point of a residual over time."""
 MIN_DRAWN_FIT = 0.5
 """
 Share of the fitted effect that a single variable must explain for the effect to be drawn against
@@ -67,6 +66,7 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     return render(
         'diagnosis.html',
         title='IMU diagnosis',
+        texts=OBSERVATION_TEXTS[result.observations],
         word=word,
         result=result,
         diagnosis=diagnosis,
@@ -124,7 +124,7 @@ def draw_over_time(result: DiagnosisResult) -> Drawn:
         (8.6, 4.2),
         _over_time,
         result.diagnosis.traces,
-        SPAN[result.observations],
+        OBSERVATION_TEXTS[result.observations].span,
         label='Residuals over time before and after the extension',
     )
 

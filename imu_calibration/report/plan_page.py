@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -195,11 +196,50 @@ def _progress(figure, plan):
         )
 
 
+@dataclass(frozen=True)
+class PlanTexts:
+    """Texts of the page of a plan."""
+
+    order: str
+    """What to do; '': the number of motions of each kind."""
+    drawing: str
+    """Under the drawing of the motions."""
+    column: str
+    """Heading of the labels of the motions."""
+    least_time: str
+    """How the least time is meant; '': there is none."""
+
+
+OF_JOINTS = PlanTexts(
+    '',
+    'Positions of the joints; the band above shows the kind of motion. Angles of endless joints are'
+    ' drawn within one turn.',
+    'until, s',
+    'The least time is a lower bound: information is counted as if the biases of different windows'
+    ' were independent, and motions as if fractions of them and moves of zero length were possible.'
+    ' No plan made of the same motions is shorter.',
+)
+OF_POSES = PlanTexts(
+    'Do the steps in this order, each by the turn that is named',
+    'The IMU as a box, x its longest side, z its thinnest; as it is held at the end of each step.',
+    'step',
+    '',
+)
+
+
 def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     within = plan.sd <= plan.tolerances * (1 + 1e-6)
+    if plan.start is None:
+        texts, motion = OF_POSES, draw_steps(plan.motions)
+        labels = [str(number) for number, _ in enumerate(plan.motions, 1)]
+    else:
+        texts, motion = OF_JOINTS, draw_motion(plan)
+        labels = [f'{end:.1f}' for end in plan.ends]
     return render(
         'plan.html',
+        texts=texts,
+        labels=labels,
         title='Plan of a calibration',
         plan=plan,
         within=within,
@@ -207,5 +247,5 @@ def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
         count=int(plan.wanted.sum()),
         provenance=provenance,
         progress=draw_progress(plan),
-        motion=draw_steps(plan.motions) if plan.start is None else draw_motion(plan),
+        motion=motion,
     )

@@ -22,6 +22,7 @@ from imu_calibration.document.calibration import Calibration, listed
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
 from imu_calibration.estimation.solution import GRAVITY, REMEDIES, tolerances_of
+from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.motion_limits import (
     NOT_CHECKED,
     limit_words,
@@ -42,7 +43,8 @@ from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import calibration_options
-from imu_calibration.use_cases.recordings import Stand, table_of
+from imu_calibration.use_cases.recordings import Stand
+from imu_calibration.use_cases.references import reference_of
 
 ACCUMULATOR = '.npz'
 """Suffix of the accumulator that a live session saves with its calibration."""
@@ -62,10 +64,12 @@ class Planned:
 
     plan: Plan
     """Motions, predicted standard deviations, time and its lower bound."""
-    table: Table | None
-    """What moves; None: by hand."""
     provenance: dict[str, Any]
     """Options that it was made with."""
+    unbounded: Sequence[str] = ()
+    """Joints without a range."""
+    notes: Sequence[str] = ()
+    """Checks and doubts about the limits, and an unknown gravity, a line each."""
 
     @property
     def exit_code(self) -> int:
@@ -82,23 +86,8 @@ class Planned:
         lines = []
         if self.plan.missing:
             lines.append(f'above the tolerance after this plan: {listed(self.plan.missing)}')
-        if self.table is not None and (unbounded := missing_ranges(self.table)):
-            lines.append(f'joints without a range: {", ".join(unbounded)}')
-        return lines
-
-    @property
-    def notes(self) -> list[str]:
-        """Checks and doubts about the limits, and an unknown gravity, a line each."""
-        if self.table is None:
-            return []
-        lines = [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
-        # No motion determines the scales better than gravity is known.
-        if self.table.gravity_sd_value >= STANDARD_GRAVITY_SD:
-            share = self.table.gravity_sd_value / self.table.gravity_value
-            lines.append(
-                f'warning: the scales of the accelerometer are known to {100 * share:.2g} %, as'
-                f' gravity is; {REMEDIES[GRAVITY,]}'
-            )
+        if self.unbounded:
+            lines.append(f'joints without a range: {", ".join(self.unbounded)}')
         return lines
 
     @cached_property
@@ -135,7 +124,7 @@ class Planned:
 
         require_no_plan(folder, report=report, force=force)
         place = files.make_folder(folder)
-        moves_joints = self.table is not None and bool(self.plan.motions)
+        moves_joints = bool(self.plan.moved_joints)
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
 
@@ -157,10 +146,7 @@ class Planned:
     def _messages(self):
         from imu_calibration.planning.motion_library import trajectory
 
-        names, begins = (
-            tuple(self.plan.model.joint_names),
-            np.concatenate([[0.0], self.plan.ends[:-1]]),
-        )
+        names, begins = self.plan.moved_joints, np.concatenate([[0.0], self.plan.ends[:-1]])
         return [
             (PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
             for begin, segments in zip(begins, self.plan.segments, strict=True)
@@ -168,7 +154,7 @@ class Planned:
         ]
 
     def __str__(self):
-        return '\n'.join(plan_summary(self.plan) + self.notes)
+        return '\n'.join([*plan_summary(self.plan), *self.notes])
 
 
 def require_no_plan(folder: str | PathLike, *, report: bool, force: bool) -> None:
@@ -181,7 +167,7 @@ def require_no_plan(folder: str | PathLike, *, report: bool, force: bool) -> Non
 
 
 def plan(
-    stand: Stand,
+    stand: Stand | None,
     *,
     calibration: str | PathLike | Calibration | None = None,
     grade: str = 'industrial',
@@ -235,7 +221,8 @@ def plan(
     """
     report('planning')
     options = calibration_options(choices)
-    table = table_of(stand, gravity=options.gravity, gravity_sd=options.gravity_sd)
+    reference = reference_of(stand, options=options)
+    table = reference.table_for('a plan of motions needs a table or a robot description')
     noise = expected_noise(options.noise, grade, imu_rate)
     limits, start = limits_of(table), None
     if around or reach is not None:
@@ -288,9 +275,23 @@ def plan(
         provenance['tells_apart'] = ', '.join(causes)
     return Planned(
         planner.plan(start, with_bound=with_bound, longest=longest if causes else np.inf),
-        table,
         provenance,
+        missing_ranges(table),
+        notes_on(table),
     )
+
+
+def notes_on(table: Table) -> list[str]:
+    """Return the notes of a plan for a table, a line each."""
+    lines = [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(table))]
+    # No motion determines the scales better than gravity is known.
+    if table.gravity_sd_value >= STANDARD_GRAVITY_SD:
+        share = table.gravity_sd_value / table.gravity_value
+        lines.append(
+            f'warning: the scales of the accelerometer are known to {100 * share:.2g} %, as'
+            f' gravity is; {REMEDIES[GRAVITY,]}'
+        )
+    return lines
 
 
 def _neighbourhood(limits, names, around, reach):
@@ -338,7 +339,9 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
         for sensor in SENSORS
     )
     model = HandModel(
-        SensorModel(accelerometer, gyroscope, catalogue=options.catalogue),
+        SensorModel(
+            accelerometer, gyroscope, joint_names=JointNames.of(()), catalogue=options.catalogue
+        ),
         options.gravity or STANDARD_GRAVITY,
     )
     noise = expected_noise(options.noise, grade, imu_rate)
@@ -348,7 +351,6 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     )
     return Planned(
         found,
-        None,
         {
             'noise': grade if options.noise is None else 'as identified',
             'imu_rate': imu_rate,

@@ -17,7 +17,7 @@ from imu_calibration.core.samples import ImuSamples, JointSamples
 from imu_calibration.document.files import read_calibration, read_robot_description
 from imu_calibration.kinematics.urdf import up_of
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.use_cases.plan import Planned
+from imu_calibration.use_cases.plan import notes_on
 from imu_calibration.use_cases.recordings import Arm, Topics, table_of
 from imu_calibration.use_cases.simulate import simulate
 from msg_adapters.bag import DESCRIPTION_TOPIC, STATIC_TOPIC
@@ -123,7 +123,7 @@ def test_a_stated_gravity_and_its_sd_hold_where_the_site_states_none(home):
     with refused(InputError, 'gravity_twice', 9.81, 9.8):
         table_of(known, gravity=9.8, gravity_sd=1e-3)
     # a plan for the arm does not hide that the scales stay weak without it
-    notes = ['; '.join(Planned(None, table, {}).notes) for table in (unknown, stated)]
+    notes = ['; '.join(notes_on(table)) for table in (unknown, stated)]
     assert ['0.2 %' in each for each in notes] == [True, False]
 
 
