@@ -187,12 +187,13 @@ def test_killed_in_mid_session_it_goes_on_where_it_was_saved(station, session, t
     station.until(lambda: station.figure('windows') > 4 and saved.is_file(), 'windows to be saved')
     station.spin_for(1.0)
     n_saved = station.figure('windows')
+    killed = publisher.subscriptions()
     assert station.processes.end(first, signal.SIGKILL) == -signal.SIGKILL
 
     second = station.calibration_node(tmp_path, resume=True)
     station.status.clear()
     station.until(lambda: station.figure('windows') == n_saved, 'the saved windows')
-    publisher.wait()
+    publisher.wait(ended=killed)
     send_all(station, publisher, *(s.select(s.stamp_ns >= half) for s in (imu, joints)))
     live = answer_of(station, tmp_path)
     assert sum(live.statistics['windows'].values()) > n_saved + 5

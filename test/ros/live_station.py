@@ -227,13 +227,33 @@ class Publisher:
             for kind, topic in ((Imu, imu_topic), (JointState, joint_topic))
         )
 
-    def wait(self, subscribers=1):
-        """Wait until both topics have subscribers."""
-        self.station.until(
-            lambda: min(p.get_subscription_count() for p in (self.imu, self.joints)) >= subscribers,
-            'subscribers',
-        )
+    def wait(self, subscribers=1, ended=()):
+        """
+        Wait until both topics have so many subscribers besides those that have ended.
+
+        A killed node remains among the subscribers until its lease of 20 s is over, so that a node
+        which follows it may miss the first messages.
+        """
+
+        def are_matched():
+            for publisher in (self.imu, self.joints):
+                known = self._subscriptions(publisher)
+                if len(known.difference(ended)) < subscribers:
+                    return False
+                if publisher.get_subscription_count() < len(known):
+                    return False
+            return True
+
+        self.station.until(are_matched, 'subscribers')
         self.station.spin_for(0.3)
+
+    def subscriptions(self):
+        """Return the identifiers of all subscriptions of both topics."""
+        return self._subscriptions(self.imu) | self._subscriptions(self.joints)
+
+    def _subscriptions(self, publisher):
+        found = self.station.node.get_subscriptions_info_by_topic(publisher.topic_name)
+        return {bytes(each.endpoint_gid) for each in found}
 
     def send(self, imu, joints, per_second=4000):
         """
