@@ -82,6 +82,7 @@ def test_the_finding_is_told_drawn_and_measured(result):
         .strip(),
         '',
     )
+    assert 'Leon Sorokin' in plain  # the notice of the embedded library
     assert len(page) - len(plain) > 50_000 and page.count('<script>') == page.count('<script') == 1
     assert not re.search(r'https?://(?!www\.w3\.org)|\bsrc=|fetch\(|import\(', plain)
     assert len(page.encode()) < 4e6

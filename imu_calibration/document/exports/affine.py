@@ -143,8 +143,23 @@ def undone(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineIm
     Return the IMU whose readings ``matrix @ readings - offset`` corrects.
 
     From sensor -> (matrix, offset); other sensors are perfect.
+
+    Raises
+    ------
+    InputError
+        When a matrix has no inverse (code `matrix_singular`).
+
     """
-    matrix = {sensor: np.linalg.inv(turn) for sensor, (turn, _) in corrections.items()}
+    matrix = {}
+    for sensor, (correction, _) in corrections.items():
+        try:
+            matrix[sensor] = np.linalg.inv(correction)
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                f'the correction matrix of the {sensor} must have an inverse, got'
+                f' {np.asarray(correction).tolist()}; calibrate again',
+                code='matrix_singular',
+            ) from error
     bias = {sensor: matrix[sensor] @ offset for sensor, (_, offset) in corrections.items()}
     perfect = AffineImu()
     return replace(perfect, matrix=perfect.matrix | matrix, bias=perfect.bias | bias)
