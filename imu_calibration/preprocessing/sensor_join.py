@@ -13,7 +13,16 @@ MAX_GAP_PERIODS = 5.0
 MIN_OVERLAP_SAMPLES = 100
 """Joined samples, at least."""
 MAX_DELAY = 0.25
-"""s; larger delays are not searched."""
+"""s; delays that are searched first."""
+WIDE_DELAY = 3.0
+"""s; delays that are searched where a smaller one does not explain the rotation of gravity."""
+WIDE_STEP = 0.05
+"""s; distance of these delays."""
+MIN_PREDICTED = 0.8
+"""
+Share of the rotation of gravity in each part that the rates predict with A and b of the other
+parts, at a delay beyond `MAX_DELAY`: among many delays one may fit a few turns by chance.
+"""
 DELAY_STEP = 0.01
 """s; distance of the delays among which the search begins: short against turns by hand."""
 FINE_DELAY_STEP = 0.001
@@ -214,8 +223,17 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
     start, stop, middle, change = windows
     if np.linalg.norm(change, axis=1).sum() < MIN_DELAY_ROTATION:
         return None
-    time = (gyroscope.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
-    inside = (start > time[0] + MAX_DELAY) & (stop < time[-1] - MAX_DELAY)
+    delay = _found_delay(gyroscope, accelerometer.stamp_ns[0], windows, MAX_DELAY)
+    if delay is None:
+        delay = _found_delay(gyroscope, accelerometer.stamp_ns[0], windows, WIDE_DELAY)
+    return delay
+
+
+def _found_delay(gyroscope, origin_ns, windows, reach):
+    """Return the GyroscopeDelay up to `reach` s that explains the rotation of gravity, or None."""
+    start, stop, middle, change = windows
+    time = (gyroscope.stamp_ns - origin_ns) * 1e-9
+    inside = (start > time[0] + reach) & (stop < time[-1] - reach)
     if np.count_nonzero(inside) < 20 * DELAY_PARTS:
         return None
     # Windows in which gravity rotates most determine the delay.
@@ -232,14 +250,23 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
     )
 
     # The least residual, first among widely spaced delays, then near the best of them.
-    coarse = np.arange(-MAX_DELAY, MAX_DELAY + DELAY_STEP / 2, DELAY_STEP)
-    near = coarse[int(np.argmin([cost.residual(delay) for delay in coarse]))]
+    near, around = 0.0, reach
+    steps = [DELAY_STEP]
+    if reach > MAX_DELAY:
+        steps = [WIDE_STEP, DELAY_STEP]
+    for step in steps:
+        coarse = near + np.arange(-around, around + step / 2, step)
+        near = coarse[int(np.argmin([cost.residual(delay) for delay in coarse]))]
+        around = step
     fine = near + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)
     residuals = np.array([cost.without_each_part(delay) for delay in fine])
-    if residuals[:, 0].min() > (1.0 - MIN_EXPLAINED) * float(np.sum(change[used] ** 2)):
+    total = float(np.sum(change[used] ** 2))
+    if residuals[:, 0].min() > (1.0 - MIN_EXPLAINED) * total:
+        return None
+    if reach > MAX_DELAY and cost.prediction_error(near) > (1.0 - MIN_PREDICTED) * total:
         return None
     delay = _least_place(fine, residuals[:, 0])
-    if abs(delay) > MAX_DELAY - DELAY_STEP:
+    if abs(delay) > reach - steps[0]:
         return None
 
     # Jackknife over parts of the recording, because the residuals are correlated in time.
@@ -293,6 +320,20 @@ class _DelayCost:
             _all_and_without_each(applied),
             _all_and_without_each(observed),
         )
+
+    def prediction_error(self, delay: float) -> float:
+        """Return the sum of squares of each part with A and b of the other parts."""
+        normal, applied, observed = self._equations(delay)
+        error = float(observed.sum())
+        for part, (own_normal, own_applied) in enumerate(zip(normal, applied, strict=True)):
+            others = np.delete(normal, part, axis=0).sum(axis=0)
+            scale = np.sqrt(np.maximum(np.diagonal(others), np.finfo(float).tiny))
+            inverse = np.linalg.pinv(
+                others / np.outer(scale, scale), MIN_EIGENVALUE, hermitian=True
+            )
+            fit = inverse @ (np.delete(applied, part, axis=0).sum(axis=0) / scale) / scale
+            error += float(fit @ own_normal @ fit - 2.0 * fit @ own_applied)
+        return error
 
     def _equations(self, delay: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return (N, b, y'y) of the normal equations of each part, (k, 12, 12), (k, 12), (k,)."""

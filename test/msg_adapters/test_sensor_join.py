@@ -50,6 +50,20 @@ def test_the_slower_stamps_are_kept_and_the_delay_is_estimated(streams):
     assert gyroscope_delay(streams[0], turned).delay == pytest.approx(joined.delay.delay, abs=1e-4)
 
 
+@pytest.mark.parametrize('late', [-2.4, 0.4, 1.3])
+def test_a_delay_of_seconds_is_found_and_readings_of_another_motion_have_none(streams, late):
+    """Logs whose sensors count from their own start."""
+    moved = SensorStream(streams[1].stamp_ns + round((late - LATE) * 1e9), streams[1].values)
+    found = gyroscope_delay(streams[0], moved)
+    assert abs(found.delay - late) < 4 * found.sd < 0.02
+    backwards = SensorStream(streams[1].stamp_ns, streams[1].values[::-1])
+    assert gyroscope_delay(streams[0], backwards) is None
+    # Among many delays one fits the few turns of another time.
+    few = SensorStream(streams[0].stamp_ns[:1600], streams[0].values[:1600])
+    rates = streams[1].values[2200:4760]
+    assert gyroscope_delay(few, SensorStream(streams[1].stamp_ns[:2560], rates)) is None
+
+
 def test_without_rotation_there_is_no_delay():
     generator, n = np.random.default_rng(52), 4000
     stamps = START_NS + np.arange(n) * 10_000_000
