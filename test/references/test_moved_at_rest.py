@@ -7,6 +7,7 @@ import pytest
 from refusal import refused
 from scipy.ndimage import gaussian_filter1d
 
+from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.rest_noise import (
@@ -100,8 +101,8 @@ def test_a_slow_sway_is_named_by_calibrate_and_inspect():
     assert lacking and {entry['needs'] for entry in found.undetermined} == {MOVED_REMEDY}
 
     options = CalibrationOptions(gravity=GRAVITY)
-    (look,) = inspect_recording(SampleBlock(imu), [Topics()], None, options=options)
-    assert look.by_hand.calibration.by_hand['sway'] == found.by_hand['sway']
+    (look,) = inspect_recording(SampleBlock(imu), [Topics()], GravityReference(), options=options)
+    assert look.calibrated.calibration.by_hand['sway'] == found.by_hand['sway']
 
 
 @pytest.mark.parametrize('amplitude', [3e-3, 1e-2])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
@@ -76,7 +77,7 @@ def test_each_verb_refuses_with_the_key(
 ):
     bag = tmp_path / 'bag'
     write_session(bag, fault(session), storage=storage)
-    (look,) = inspect_recording(bag, [Topics()], None, options=CalibrationOptions())
+    (look,) = inspect_recording(bag, [Topics()], GravityReference(), options=CalibrationOptions())
     assert look.refused
     refusals = [finding.check for finding in look.findings if finding.severity == 'refuse']
     assert refusals[0] == code
@@ -98,7 +99,9 @@ def test_a_dead_band_is_named(storage, tmp_path):
     rate = imu.rate_s - GYROSCOPE.bias  # the chip estimates its own bias
     rate = np.where(np.abs(rate) < 0.01, 0.0, rate)
     write_session(tmp_path / 'bag', replace(imu, rate_s=rate), storage=storage)
-    (look,) = inspect_recording(tmp_path / 'bag', [Topics()], None, options=CalibrationOptions())
+    (look,) = inspect_recording(
+        tmp_path / 'bag', [Topics()], GravityReference(), options=CalibrationOptions()
+    )
     assert 'dead_band' in [finding.check for finding in look.findings]
     found = calibrate_recordings(tmp_path / 'bag', gravity=GRAVITY)
     assert found.exit_code == 3
@@ -140,7 +143,9 @@ def test_wrapped_rates_are_named(storage, calibration, tmp_path):
     assert corrected.wrapped >= n_wrapped
     assert corrected.exit_code == 3
     assert any(str(corrected.wrapped) in line for line in corrected.warnings)
-    (look,) = inspect_recording(tmp_path / 'bag', [Topics()], None, options=CalibrationOptions())
+    (look,) = inspect_recording(
+        tmp_path / 'bag', [Topics()], GravityReference(), options=CalibrationOptions()
+    )
     assert look.streams['imu'].dropped['wrapped'] == corrected.wrapped
     # Readings within the range are not named.
     assert compensate_recording(imu, calibration).wrapped == 0
