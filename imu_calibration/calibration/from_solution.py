@@ -27,6 +27,7 @@ from imu_calibration.estimation.solution import (
     HELD_PRIORS,
     PLACE_REMEDY,
     REJECTED,
+    WANDER_REMEDY,
     Solution,
     reasons_held,
     remedy,
@@ -165,6 +166,7 @@ def motions_needed(
         possible=possible_motions(table),
     )
     data_sd = observability.sd_of_data(solution, prior_sd)
+    of_bias_process = np.diag(solution.terms[BIAS_PROCESS])
     counted = _counted(solution)
     is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
     of_place = PLACE_REMEDY if table.latitude is None else AZIMUTH_REMEDY
@@ -191,9 +193,24 @@ def motions_needed(
             # A parameter that the motions determine is held for a misfit, not for their lack.
             of_misfit = (BIAS_PROCESS, HELD_PRIORS)
         text = remedy(solution.terms, index, tolerances[index], of_misfit=of_misfit)
+        wanders = any(_wanders(solution, sensor) for sensor in sensors)
+        if not text and wanders and of_bias_process[index] > tolerances[index] ** 2:
+            # The mean of the bias over the recording is as uncertain after more motions.
+            text = WANDER_REMEDY
         if text:
             needed[name] = (text, float('nan'))
     return needed
+
+
+def _wanders(solution: Solution, sensor: str) -> bool:
+    """
+    Return whether the scatter of window means is that of a bias that wanders.
+
+    The offsets of windows are independent, so that more windows reduce their part; a bias that
+    wanders keeps its value from window to window.
+    """
+    noise = solution.noise.get(sensor)
+    return noise is not None and noise.bias_variance > noise.offset_sd**2
 
 
 def possible_motions(table: Table) -> tuple[Motion, ...] | None:

@@ -46,6 +46,8 @@ REMEDIES = {
 """Terms that more data do not reduce -> what does."""
 EXCESS_REMEDY = 'find the cause of the residual, which exceeds the noise at rest'
 """Remedy where the data would suffice if the residual were as small as the noise."""
+WANDER_REMEDY = 'find the cause of the change of the bias: more motions do not help'
+"""Remedy where the data would suffice if the bias were constant during the recording."""
 TURNS_REMEDY = (
     'check that both sensors have the same axes, and that the recording contains each complete turn'
 )
@@ -62,6 +64,7 @@ REMEDY_KEYS = {
     REMEDIES[GRAVITY,]: 'gravity',
     REMEDIES[MODEL_ERROR, DRIFT, REJECTED]: 'diagnose',
     EXCESS_REMEDY: 'diagnose',
+    WANDER_REMEDY: 'diagnose',
 }
 """Remedy that is no motion -> the key of its input or program (`errors.ERROR_KEYS`)."""
 NO_STEP = (*REMEDY_KEYS, TURNS_REMEDY, MOVED_REMEDY)

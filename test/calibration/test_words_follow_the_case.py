@@ -14,12 +14,15 @@ from imu_calibration.document.decision import NOTE
 from imu_calibration.document.verdict import incomplete_windows, motion_misfits
 from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
+    DRIFT,
     GRAVITY,
     MODEL_ERROR,
     PLACE_REMEDY,
+    REJECTED,
     REMEDIES,
     REMEDY_KEYS,
     SAMPLE_NOISE,
+    WANDER_REMEDY,
     remedy,
 )
 from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
@@ -223,6 +226,7 @@ def test_needs_and_verdict_have_one_rule_for_an_incomplete_model():
     louder = misfit | {'slow_over_fast': {'spin': 0.9}}
     of_stamps = {'stamp_jitter': {'variance_ratio': {'gyroscope': {'spin': 15.0}}}}
     rests, none = {'windows': {'static': 9}}, {'windows': {'spin': 9}}
+    of_model = REMEDIES[MODEL_ERROR, DRIFT, REJECTED]
     tilting = {'attitude': {'variance_ratio': 9.0, 'p_value': 1e-9}}
     by_chance = {'attitude': {'variance_ratio': 9.0, 'p_value': 0.1}}
     for quality, is_incomplete in (
@@ -237,9 +241,17 @@ def test_needs_and_verdict_have_one_rule_for_an_incomplete_model():
             result, solution=wandering, calibration=replace(result.calibration, statistics=quality)
         )
         need, _ = needed_motions(found, table)['gyroscope.bias.x']
-        assert (REMEDY_KEYS.get(need) == 'diagnose') is is_incomplete
+        assert need == (of_model if is_incomplete else WANDER_REMEDY)
         keys = {reason.key for reason in motion_misfits(found.calibration)}
         assert ('diagnose' in keys) is is_incomplete
+
+    # More windows reduce independent offsets, and not the uncertainty of a bias that wanders.
+    noise = wandering.noise['gyroscope']
+    for offset_sd, is_motion in ((0.0, False), (2.0 * noise.bias_variance**0.5, True)):
+        noises = wandering.noise | {'gyroscope': replace(noise, offset_sd=offset_sd)}
+        found = replace(result, solution=replace(wandering, noise=noises))
+        need, _ = needed_motions(found, table)['gyroscope.bias.x']
+        assert (need in {motion.text for motion in MOTIONS}) is is_motion
 
 
 def test_compare_says_that_off_diagonal_terms_include_the_mounting():
