@@ -387,6 +387,12 @@ def _compared(
         reference_agree = not rejected_reference
         word = 'agree' if reference_agree else 'differ'
         lines.append(f'table and clock {word}, which is no property of the IMU')
+    if not of_imu:
+        lines.append(
+            'agreement of the calibrations cannot be tested: no parameter of the IMU is determined'
+            ' in both'
+        )
+        return Comparison(rows, None, tuple(lines), reference_agree)
     verdict = 'the calibrations disagree' if rejected else 'the calibrations agree'
     if in_other_axes.any():
         verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'

@@ -98,6 +98,12 @@ def test_held_and_fixed_parameters_are_not_compared(status):
     assert any(re.search(r'\b1\b', line) for line in result.lines)
 
 
+def test_nothing_determined_in_both_is_undecided():
+    first = draw(np.random.default_rng(5))
+    found = compare(first, replace(moved(first, 'gyroscope.bias.x', 1.0), status=(HELD,) * COUNT))
+    assert found.agree is None and found.exit_code == 0 and len(found.lines) == 2
+
+
 def test_only_common_parameters_are_compared_and_conventions_are_noted():
     one = draw(np.random.default_rng(5))
     small = SensorModel()
