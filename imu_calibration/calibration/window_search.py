@@ -31,7 +31,7 @@ def search_windows(
         Of the requested model.
 
     """
-    baseline = _baseline_model(options, table, solved)
+    baseline = baseline_model(options, table, solved)
     for windows in windows_to_ask(gathered):
         found = inquire(windows, table, baseline, bias_processes=options.bias_processes)
         found.unexplained_rests()
@@ -62,7 +62,7 @@ def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
     )
 
 
-def _baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
+def baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
     """
     Return the baseline model of the search.
 
@@ -75,6 +75,10 @@ def _baseline_model(options: CalibrationOptions, table: Table, solved: SensorMod
 
     """
     model = choose_model(baseline_options(options), table)
+    for effect in solved.effects:
+        # What the search may not test it cannot find: the residual would show it as unexplained.
+        if effect.key not in model.slices and not model.catalogue.is_candidate(effect):
+            model = model.with_effect(*effect.key)
     names = {effect.name for effect in model.effects}
     return replace(
         model,

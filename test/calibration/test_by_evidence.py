@@ -22,11 +22,12 @@ from imu_calibration.calibration.by_evidence import (
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
+from imu_calibration.calibration.window_search import baseline_model
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.references.turntable.session_data import DecimatedWindows
 from imu_calibration.report.diagnosis_page import diagnosis_report
 from imu_calibration.selection import investigation, questions
@@ -99,6 +100,16 @@ def test_a_clean_session_adds_nothing():
     pair = make_pair(None, 12, **COARSE)
     found = imu.calibrate(pair.first.block, Table.from_mapping(pair.table), candidates=FEW)
     assert not set(found.calibration.statistics) & {'added', 'denied'}
+
+
+def test_the_search_begins_with_the_effects_that_it_may_not_test():
+    """Their part of the residual would be unexplained, and the exit code 3, without a cause."""
+    for names, begins_with_it in (('none', True), ('accel_size_effect', False), (None, False)):
+        options = CalibrationOptions(catalogue=CATALOGUE.with_candidates(names))
+        solved = choose_model(options, TABLE)
+        baseline = baseline_model(options, TABLE, solved)
+        assert ('accel_size_effect' in baseline.accelerometer) is begins_with_it
+        assert 'accel_size_effect' in solved.accelerometer
 
 
 def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations():
