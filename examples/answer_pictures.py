@@ -32,7 +32,7 @@ def figure(columns=1, height=3.2):
 
 def readings(bag) -> ImuSamples:
     return ImuSamples.concatenate(
-        [block.imu for block in source_of(bag, want_joints=False)() if block.imu is not None]
+        [block.imu for block in source_of(bag, want_joints=False) if block.imu is not None]
     )
 
 

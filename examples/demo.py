@@ -47,7 +47,7 @@ def run(folder):
         files.read_table(second / 'table.yaml'),
         files.read_calibration(folder / 'calibration.yaml'),
     )
-    truth = session_truth(source_of(second, joint_names=table.joint_names)(), table)
+    truth = session_truth(source_of(second, joint_names=table.joint_names), table)
     show(before_and_after(*truth, calibration))
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     print(

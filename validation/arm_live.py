@@ -79,7 +79,7 @@ def prepare(folder, name, arm_from, *, seconds, pair=PAIR):
     found = []
     for topic in topics:
         with open_recording(folder / name, topic, want_joints=False) as recording:
-            result = calibrate_without_table([recording.blocks])
+            result = calibrate_without_table([recording.blocks()])
             found.append((result.calibration, result.applied))
     arm = estimate_arm(*(load(folder, arm_from, topic) for topic in topics))
     a, b = imus

@@ -34,7 +34,7 @@ DRAWS = 2000
 
 def halves(imu):
     """Return the samples before and after the middle of the time at rest."""
-    parts = read_rest(lambda: iter([SampleBlock(imu)])).parts
+    parts = read_rest([SampleBlock(imu)]).parts
     ends = np.cumsum([part.seconds for part in parts])
     middle = parts[int(np.searchsorted(ends, ends[-1] / 2))].end_ns
     at = int(np.searchsorted(imu.stamp_ns, middle))
@@ -75,7 +75,7 @@ def compare(imu):
     lies inside, and whether a model explains the first half.
     """
     before, after = (SampleBlock(half) for half in halves(imu))
-    first, second = identify_noise(lambda: iter([before])), read_rest(lambda: iter([after]))
+    first, second = identify_noise([before]), read_rest([after])
     found = []
     for axis in range(6):
         moments, fit = second.moments[axis], first.axes[axis]

@@ -30,7 +30,7 @@ def calibrations(folder, name):
     found: dict[str, Calibration | str] = {}
     for what, options in (('default', CalibrationOptions()), ('with lag', WITH_LAG)):
         try:
-            found[what] = calibrate_on_table([lambda: iter(blocks)], table, options).calibration
+            found[what] = calibrate_on_table([blocks], table, options).calibration
         except ImuCalibrationError as error:
             found[what] = str(error)
     return found

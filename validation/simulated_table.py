@@ -129,7 +129,7 @@ def calibrate_through_a_bag(imu, joints):
         write_session(path, imu, joints)
         with open_recording(path) as recording:
             blocks = list(recording.blocks(table.joint_names))
-    return calibrate_on_table([lambda: iter(blocks)], table).calibration
+    return calibrate_on_table([blocks], table).calibration
 
 
 def compare(calibration):

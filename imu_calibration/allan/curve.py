@@ -1,6 +1,6 @@
 """Allan deviation of samples, and the curve of a recording."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby
 from operator import itemgetter
@@ -13,7 +13,7 @@ from imu_calibration.allan.reading_faults import NO_FAULTS, FaultSearch, Reading
 from imu_calibration.allan.still_parts import StillPart
 from imu_calibration.allan.trends import AxisTrend, Parts, TrendReference
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.samples import BlockSource
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 FULL = 65536
@@ -348,8 +348,8 @@ class Sink(Protocol):
 class RestReader:
     """Reads the parts at rest of a recording."""
 
-    source: Callable[[], Iterable[SampleBlock]]
-    """Returns the blocks of the recording, from the beginning at each call."""
+    source: BlockSource
+    """The recording."""
     parts: list[list[StillPart]]
     """For each epoch of the clock, in order."""
     period: float
@@ -393,7 +393,7 @@ class RestReader:
             ends = [(part.first_ns, part.end_ns) for part in parts]
             bounds.append(np.array(ends, np.int64).reshape(-1, 2))
         cleaner = BlockCleaner(nominal=self.nominal, one_sensor=True)
-        for cleaned in without_outliers(cleaner.all_of(self.source()), outliers):
+        for cleaned in without_outliers(cleaner.all_of(self.source), outliers):
             for epoch, imu in cleaned.imu:
                 for number, (first, last) in enumerate(
                     np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()

@@ -1,6 +1,5 @@
 """Identification of the noise figures from a recording at rest: the public functions."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from itertools import chain
 
@@ -25,7 +24,7 @@ from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import reported
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import LARGEST_STEP, SampleBlock
+from imu_calibration.core.samples import LARGEST_STEP, BlockSource
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
@@ -277,17 +276,14 @@ class NoiseIdentification:
         )
 
 
-def identify_noise(
-    source: Callable[[], Iterable[SampleBlock]], nominal: RawReadings | None = None
-) -> NoiseIdentification:
+def identify_noise(source: BlockSource, nominal: RawReadings | None = None) -> NoiseIdentification:
     """
     Identify the noise of an IMU from a recording that holds rest.
 
     Parameters
     ----------
-    source : callable
-        Returns the blocks of the recording, from the beginning at each call; it is read twice, and
-        again where a curve has a hump.
+    source : BlockSource
+        The recording; it is read twice, and again where a curve has a hump.
     nominal : RawReadings, optional
         For recordings in volts or counts.
 
@@ -320,16 +316,14 @@ def identify_noise(
     return NoiseIdentification(record, tuple(with_lines))
 
 
-def read_rest(
-    source: Callable[[], Iterable[SampleBlock]], nominal: RawReadings | None = None
-) -> RestingRecord:
+def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> RestingRecord:
     """
     Read a recording twice, first for parts at rest and trends, then for the Allan curves.
 
     Arguments as for `identify_noise`.
     """
     # First pass: pieces of the recording without motion.
-    found = survey(source(), nominal)
+    found = survey(source, nominal)
     if found.period > LARGEST_STEP:
         raise InputError(
             f'the IMU must be read at least once in {LARGEST_STEP:g} s, the median step is'

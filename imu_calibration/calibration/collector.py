@@ -5,7 +5,7 @@ import io
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import chain, islice
 from typing import Any
@@ -16,7 +16,7 @@ from imu_calibration.calibration.from_solution import ModelChanges, ModelExtensi
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.core.samples import BlockSource, ImuSamples, SampleBlock
 from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -393,9 +393,7 @@ class Collector:
 
 @dataclass(frozen=True)
 class GatherStep:
-    """
-    The map step with its arguments bound, so that it can be sent to another process or machine.
-    """
+    """How recordings are read and reduced; it can be sent to another process or machine."""
 
     table: Table
     """The reference."""
@@ -414,21 +412,18 @@ class GatherStep:
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
-    def __call__(self, numbered: tuple[int, Callable]) -> SessionData:
-        """
-        Return the SessionData of a recording, given (its number, callable that yields its blocks).
-        """
-        session, source = numbered
+    def gather(self, source: BlockSource, session: int) -> SessionData:
+        """Return the SessionData of a recording and its number."""
         with naming(self.names, session):
             return self.read(source, session, Preflight(self.table.gravity_value, one_sensor=True))
 
-    def blocks(self, source: Callable[[], Iterable[SampleBlock]]) -> Iterable[SampleBlock]:
+    def blocks(self, source: BlockSource) -> Iterable[SampleBlock]:
         """Return the blocks of a recording as they are gathered."""
-        return source()
+        return source
 
     def read(
         self,
-        source: Callable[[], Iterable[SampleBlock]],
+        source: BlockSource,
         session: int,
         preflight: Preflight,
         *,

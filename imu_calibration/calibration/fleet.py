@@ -1,5 +1,5 @@
 """
-Many units: the map step calibrates one, the merge step compares them.
+Many units: each is calibrated on its own, then they are compared.
 
 Plain functions, for any scheduler.
 """
@@ -13,6 +13,7 @@ from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.samples import BlockSource
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import decisions_text
@@ -30,11 +31,8 @@ class Unit:
 
     name: str
     """Name of the unit."""
-    sources: tuple
-    """
-    Callables that yield the blocks of a recording from its start at each call; must be picklable
-    for another process.
-    """
+    sources: tuple[BlockSource, ...]
+    """Its recordings; must be picklable for another process."""
     bags: tuple = ()
     """Names of the recordings."""
     provenance: Callable[[], dict] | None = None
@@ -81,7 +79,7 @@ class UnitResult:
 
 @dataclass(frozen=True)
 class FleetStep:
-    """The map step with its arguments bound."""
+    """How units are calibrated; it can be sent to another process or machine."""
 
     table: Table
     """The table on which every unit was recorded."""
@@ -90,7 +88,7 @@ class FleetStep:
     report: Callable[[CalibrationResult], str] | None = None
     """Returns report.html; must survive pickling when sent elsewhere."""
 
-    def __call__(self, unit: Unit) -> UnitResult:
+    def calibrate(self, unit: Unit) -> UnitResult:
         """Return the UnitResult of a unit; every error of it is part of the result."""
         try:
             return self._calibrated(unit)

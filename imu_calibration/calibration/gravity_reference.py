@@ -1,6 +1,6 @@
 """Gravity as the reference: an IMU that is held still, and turned in between."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -15,7 +15,7 @@ from imu_calibration.calibration.pose_observations import HandResult, PoseObserv
 from imu_calibration.calibration.pose_readings import errors_by_hand
 from imu_calibration.calibration.reference import Inspection
 from imu_calibration.core.errors import ImuCalibrationError, InputError
-from imu_calibration.core.samples import ImuSamples, TemperatureSamples
+from imu_calibration.core.samples import BlockSource, ImuSamples, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.loss import TrialMotion, recorded_motion
 from imu_calibration.document.rest_noise import motions_at_rest
@@ -43,18 +43,18 @@ class GravityReference:
 
     def gather(
         self,
-        sources: Sequence[Callable],
+        sources: Sequence[BlockSource],
         options: CalibrationOptions,
         *,
         names: Sequence[str] | None = None,
-        mapper: Callable = map,
+        jobs: int = 1,
     ) -> PoseRecording:
         """Return the poses and turns of one recording."""
         return gather_poses(sources, options)
 
     def errors(
         self,
-        sources: Sequence[Callable],
+        sources: Sequence[BlockSource],
         calibration: Calibration,
         options: CalibrationOptions,
         *,
@@ -65,7 +65,7 @@ class GravityReference:
         return errors_by_hand(source, calibration, options)
 
     def diagnose(
-        self, source: Callable, options: CalibrationOptions, provenance: dict[str, Any]
+        self, source: BlockSource, options: CalibrationOptions, provenance: dict[str, Any]
     ) -> 'DiagnosisResult':
         """Identify the errors of the model in poses and turns."""
         # Here, because its import is slow.
@@ -74,13 +74,13 @@ class GravityReference:
         return diagnose_without_table(source, options, provenance)
 
     def inspect(
-        self, source: Callable, lenient: Callable, options: CalibrationOptions
+        self, source: BlockSource, lenient: BlockSource, options: CalibrationOptions
     ) -> Inspection:
         """Check a recording, and calibrate where no check refuses it."""
         preflight = Preflight(strict=False, one_sensor=True)
         calibrated: HandResult | ImuCalibrationError | None = None
         try:
-            recording = read_by_hand(lenient(), options.nominal, preflight)
+            recording = read_by_hand(lenient, options.nominal, preflight)
             if not any(finding.severity == REFUSE for finding in recording.findings):
                 asked = hand_options(options)
                 poses = PoseRecording(PoseObservations.of(recording, asked))
@@ -121,12 +121,12 @@ class GravityReference:
 
     def trial_motion(
         self,
-        source: Callable,
+        source: BlockSource,
         calibration: Calibration,
         temperature: TemperatureSamples | None,
         *,
         name: str,
     ) -> TrialMotion:
         """Return the motion that the compensated readings have."""
-        imu = ImuSamples.concatenate([block.imu for block in source() if block.imu is not None])
+        imu = ImuSamples.concatenate([block.imu for block in source if block.imu is not None])
         return recorded_motion(calibration, calibration.readings.apply(imu), temperature, name=name)

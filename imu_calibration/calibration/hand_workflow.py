@@ -1,6 +1,6 @@
 """A calibration by hand: gravity is the reference."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from imu_calibration.calibration.calibrate import calibrate_by_evidence
@@ -8,6 +8,7 @@ from imu_calibration.calibration.hand_recording import HandRecording, read_by_ha
 from imu_calibration.calibration.pose_observations import HandResult, PoseObservations
 from imu_calibration.calibration.solved import Solved
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import BlockSource
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import hand_options
@@ -27,7 +28,7 @@ class PoseRecording:
 
 
 def calibrate_without_table(
-    sources: Sequence[Callable],
+    sources: Sequence[BlockSource],
     options: CalibrationOptions = CalibrationOptions(),
     provenance: dict | None = None,
 ) -> HandResult:
@@ -36,8 +37,8 @@ def calibrate_without_table(
 
     Parameters
     ----------
-    sources : sequence of callables
-        One, which returns an iterator of SampleBlock.
+    sources : sequence of BlockSource
+        One recording.
     options : CalibrationOptions
     provenance : dict, optional
         Bag names, hashes and options for the document.
@@ -51,7 +52,7 @@ def calibrate_without_table(
     return calibrate_by_evidence(gather_poses(sources, options), options, provenance=provenance)
 
 
-def gather_poses(sources: Sequence[Callable], options: CalibrationOptions) -> PoseRecording:
+def gather_poses(sources: Sequence[BlockSource], options: CalibrationOptions) -> PoseRecording:
     """Return the poses and turns of one recording; raises as `calibrate_without_table`."""
     if len(sources) != 1:
         raise InputError(
@@ -59,7 +60,7 @@ def gather_poses(sources: Sequence[Callable], options: CalibrationOptions) -> Po
             ' separately and compare the results'
         )
     preflight = Preflight(options.gravity, one_sensor=True)
-    recording = read_by_hand(sources[0](), options.nominal, preflight)
+    recording = read_by_hand(sources[0], options.nominal, preflight)
     return PoseRecording(PoseObservations.of(recording, hand_options(options)))
 
 

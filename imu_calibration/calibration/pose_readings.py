@@ -1,6 +1,6 @@
 """Errors of raw and of corrected readings by hand: at rest, and in the turns between rests."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from imu_calibration.calibration.held_out_poses import (
 from imu_calibration.calibration.proof import entry_of
 from imu_calibration.compensation.stream import compensate_samples
 from imu_calibration.core.errors import NotObservableError
-from imu_calibration.core.samples import ImuSamples, TemperatureSamples
+from imu_calibration.core.samples import BlockSource, ImuSamples, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.change import with_kinds_by_hand
@@ -30,7 +30,9 @@ from imu_calibration.references.options import CalibrationOptions
 
 
 def errors_by_hand(
-    source: Callable, calibration: Calibration, options: CalibrationOptions = CalibrationOptions()
+    source: BlockSource,
+    calibration: Calibration,
+    options: CalibrationOptions = CalibrationOptions(),
 ) -> ReadingErrors:
     """
     Return the errors of a calibration on a recording of its IMU held still in some attitudes.
@@ -44,8 +46,8 @@ def errors_by_hand(
 
     Parameters
     ----------
-    source : callable
-        Returns an iterator of SampleBlock.
+    source : BlockSource
+        The recording.
     calibration : Calibration
         From a table or by hand.
     options : CalibrationOptions
@@ -66,7 +68,7 @@ def errors_by_hand(
             ' differs',
         )
     preflight = Preflight(options.gravity, one_sensor=True)
-    recording = read_by_hand(source(), options.nominal, preflight)
+    recording = read_by_hand(source, options.nominal, preflight)
     errors = ReadingErrors(
         proof={},
         # A table compares components, rests by hand the length: only these errors are alike.

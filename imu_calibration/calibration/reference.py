@@ -1,6 +1,6 @@
 """What a verb asks of the reference of its recordings, whichever it is."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -15,7 +15,7 @@ from imu_calibration.calibration.live_poses import LiveSession
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.solved import ModelSource
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.samples import TemperatureSamples
+from imu_calibration.core.samples import BlockSource, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.loss import TrialMotion
 from imu_calibration.kinematics.joint import JointNames
@@ -64,17 +64,17 @@ class MotionReference(Protocol):
 
     def gather(
         self,
-        sources: Sequence[Callable],
+        sources: Sequence[BlockSource],
         options: CalibrationOptions,
         *,
         names: Sequence[str] | None = None,
-        mapper: Callable = map,
+        jobs: int = 1,
     ) -> ModelSource[Any]:
         """Return the recordings as source of solutions; arguments as for `TableRecordings.of`."""
 
     def errors(
         self,
-        sources: Sequence[Callable],
+        sources: Sequence[BlockSource],
         calibration: Calibration,
         options: CalibrationOptions,
         *,
@@ -83,12 +83,12 @@ class MotionReference(Protocol):
         """Return the errors of readings before and after a calibration; as `errors_on_table`."""
 
     def diagnose(
-        self, source: Callable, options: CalibrationOptions, provenance: dict[str, Any]
+        self, source: BlockSource, options: CalibrationOptions, provenance: dict[str, Any]
     ) -> 'DiagnosisResult':
         """Calibrate a recording, and identify the errors of the model; as `diagnose_recording`."""
 
     def inspect(
-        self, source: Callable, lenient: Callable, options: CalibrationOptions
+        self, source: BlockSource, lenient: BlockSource, options: CalibrationOptions
     ) -> Inspection:
         """
         Check a recording, and calibrate from it as far as it allows.
@@ -131,7 +131,7 @@ class MotionReference(Protocol):
 
     def trial_motion(
         self,
-        source: Callable,
+        source: BlockSource,
         calibration: Calibration,
         temperature: TemperatureSamples | None,
         *,

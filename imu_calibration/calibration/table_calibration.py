@@ -1,6 +1,6 @@
 """Calibration on a table."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,7 +11,9 @@ from imu_calibration.calibration.collector import GatherStep, from_bytes
 from imu_calibration.calibration.solved import Solved
 from imu_calibration.calibration.window_observations import TableResult, WindowObservations
 from imu_calibration.core.errors import DocumentError, InputError
-from imu_calibration.core.progress import report
+from imu_calibration.core.processes import in_processes
+from imu_calibration.core.progress import counter, report
+from imu_calibration.core.samples import BlockSource
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import (
     end_of,
@@ -36,12 +38,12 @@ if TYPE_CHECKING:  # in the standard library from Python 3.11 on
 
 
 def calibrate_on_table(
-    sources: Sequence[Callable],
+    sources: Sequence[BlockSource],
     table: Table,
     options: CalibrationOptions = CalibrationOptions(),
     *,
     provenance: dict | None = None,
-    mapper: Callable = map,
+    jobs: int = 1,
     names: Sequence[str] | None = None,
 ) -> TableResult:
     """
@@ -49,16 +51,15 @@ def calibrate_on_table(
 
     Parameters
     ----------
-    sources : sequence of callables
-        Each returns an iterator of SampleBlock when called; called again when effects must be
-        linearised again.
+    sources : sequence of BlockSource
+        Read again when effects must be linearised again.
     table : Table
         The reference.
     options : CalibrationOptions
     provenance : dict, optional
         Bag names, hashes and options for the document.
-    mapper : callable
-        Applies the map step to the recordings; `map`, or the `map` of a pool.
+    jobs : int
+        Number of processes that read recordings.
     names : sequence of str, optional
         Names of the recordings for messages.
 
@@ -73,7 +74,7 @@ def calibrate_on_table(
         several.
 
     """
-    recordings = TableRecordings.of(sources, table, mapper=mapper, names=names)
+    recordings = TableRecordings.of(sources, table, jobs=jobs, names=names)
     return conclude(recordings.solved(options), options, provenance=provenance)
 
 
@@ -115,30 +116,30 @@ class WindowSource(Protocol):
 class TableRecordings:
     """Recordings of one IMU on a table, which each pass reads."""
 
-    sources: Sequence[Callable]
-    """Each returns a new iterator of SampleBlock."""
+    sources: Sequence[BlockSource]
+    """The recordings."""
     table: Table
     """The reference."""
     names: tuple[str, ...]
     """Names of the recordings for messages."""
-    mapper: Callable = map
-    """Applies the map step to the recordings; `map`, or the `map` of a pool."""
+    jobs: int = 1
+    """Number of processes that read them."""
     keep_windows: bool = False
     """Whether windows are kept for the search of effects."""
 
     @classmethod
     def of(
         cls,
-        sources: Sequence[Callable],
+        sources: Sequence[BlockSource],
         table: Table,
         *,
-        mapper: Callable = map,
+        jobs: int = 1,
         names: Sequence[str] | None = None,
         keep_windows: bool = False,
     ) -> 'Self':
         """Return recordings with their numbers as names where none are given."""
         numbered = [f'recording {number}' for number in range(1, len(sources) + 1)]
-        return cls(sources, table, tuple(names or numbered), mapper, keep_windows)
+        return cls(sources, table, tuple(names or numbered), jobs, keep_windows)
 
     def solved(self, options: CalibrationOptions) -> SolvedWindows:
         """Return the solution of the model that options request, at a valid linearisation."""
@@ -169,7 +170,9 @@ class TableRecordings:
 
     def reduced(self, step: GatherStep) -> list[SessionData]:
         """Return the windows of each recording, reduced with the columns of a model."""
-        return list(self.mapper(step, enumerate(self.sources)))
+        numbered = [(source, session) for session, source in enumerate(self.sources)]
+        advance = counter('recordings', len(numbered) if self.jobs > 1 else 0)
+        return in_processes(step.gather, numbered, self.jobs, advance=advance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,9 +262,9 @@ def _at_time_constants(
     return model
 
 
-def _first_temperature(sources: Sequence[Callable]) -> float:
+def _first_temperature(sources: Sequence[BlockSource]) -> float:
     """Return the first temperature of the first recording."""
-    for block in sources[0]():
+    for block in sources[0]:
         if block.temperature is not None and len(block.temperature):
             return float(block.temperature.temperature_c[0])
     raise InputError(

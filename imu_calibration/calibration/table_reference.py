@@ -1,6 +1,6 @@
 """The joints of a table or an arm as the reference."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -24,7 +24,7 @@ from imu_calibration.calibration.table_errors import calibrate_with_table_errors
 from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.calibration.window_readings import errors_on_table
 from imu_calibration.core.errors import ImuCalibrationError, InputError
-from imu_calibration.core.samples import TemperatureSamples
+from imu_calibration.core.samples import BlockSource, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.loss import TrialMotion, measured_temperature, motion_of
 from imu_calibration.document.outcome import STATED_CHECKS
@@ -55,20 +55,18 @@ class TableReference:
 
     def gather(
         self,
-        sources: Sequence[Callable],
+        sources: Sequence[BlockSource],
         options: CalibrationOptions,
         *,
         names: Sequence[str] | None = None,
-        mapper: Callable = map,
+        jobs: int = 1,
     ) -> TableRecordings:
         """Return the recordings, which each pass reads."""
-        return TableRecordings.of(
-            sources, self.table, mapper=mapper, names=names, keep_windows=True
-        )
+        return TableRecordings.of(sources, self.table, jobs=jobs, names=names, keep_windows=True)
 
     def errors(
         self,
-        sources: Sequence[Callable],
+        sources: Sequence[BlockSource],
         calibration: Calibration,
         options: CalibrationOptions,
         *,
@@ -78,13 +76,13 @@ class TableReference:
         return errors_on_table(sources, self.table, calibration, options=options, names=names)
 
     def diagnose(
-        self, source: Callable, options: CalibrationOptions, provenance: dict[str, Any]
+        self, source: BlockSource, options: CalibrationOptions, provenance: dict[str, Any]
     ) -> DiagnosisResult:
         """Identify the errors of the model in windows."""
         return diagnose_recording(source, self.table, options, provenance=provenance)
 
     def inspect(
-        self, source: Callable, lenient: Callable, options: CalibrationOptions
+        self, source: BlockSource, lenient: BlockSource, options: CalibrationOptions
     ) -> Inspection:
         """Calibrate with the checks of a calibration; without data for it, only check."""
         gravity = self.table.gravity_value
@@ -104,7 +102,7 @@ class TableReference:
         if not preflight.streams:  # not read to its end
             preflight = Preflight(gravity, strict=False)
             with suppress(ImuCalibrationError):
-                read_by_hand(lenient(), options.nominal, preflight)
+                read_by_hand(lenient, options.nominal, preflight)
         findings = preflight.findings
         if isinstance(calibrated, ImuCalibrationError) and calibrated.code == 'on_table':
             # Joints that rest while the IMU turns follow from the cause that the error states,
@@ -155,14 +153,14 @@ class TableReference:
 
     def trial_motion(
         self,
-        source: Callable,
+        source: BlockSource,
         calibration: Calibration,
         temperature: TemperatureSamples | None,
         *,
         name: str,
     ) -> TrialMotion:
         """Return the motion that the joints have."""
-        imu, ref = session_truth(source(), self.table)
+        imu, ref = session_truth(source, self.table)
         return motion_of(
             ref.force_s,
             ref.rate_s,

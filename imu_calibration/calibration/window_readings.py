@@ -1,6 +1,6 @@
 """Errors of raw and of corrected readings on a table."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from imu_calibration.calibration.held_out_windows import (
 from imu_calibration.compensation.compensate import invertible
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import BlockSource, SampleBlock, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.table import Table
@@ -28,7 +28,7 @@ from imu_calibration.references.turntable.window_statistics import reduce_window
 
 
 def errors_on_table(
-    sources: Sequence[Callable],
+    sources: Sequence[BlockSource],
     table: Table,
     calibration: Calibration,
     *,
@@ -42,8 +42,8 @@ def errors_on_table(
 
     Parameters
     ----------
-    sources : sequence of callables
-        Each returns an iterator of SampleBlock.
+    sources : sequence of BlockSource
+        The recordings.
     table : Table
         The reference; it need not be the one on which the calibration was made.
     calibration : Calibration
@@ -102,14 +102,14 @@ class BothReadings(GatherStep):
     calibration: Calibration = field(kw_only=True)
     """Corrects the readings, as compensation writes them into a bag."""
 
-    def blocks(self, source: Callable[[], Iterable[SampleBlock]]) -> Iterator[SampleBlock]:
+    def blocks(self, source: BlockSource) -> Iterator[SampleBlock]:
         """Yield the blocks of a recording with corrected readings."""
         temperature = None
         if invertible(self.calibration.model).needs_temperature:
-            known = [block.temperature for block in source() if block.temperature is not None]
+            known = [block.temperature for block in source if block.temperature is not None]
             temperature = TemperatureSamples.concatenate(known) if known else None
         stream = CompensationStream(self.calibration, temperature=temperature)
-        for block in source():
+        for block in source:
             if block.imu is not None and len(block.imu):
                 # The cleaner converts the raw readings of the block afterwards.
                 readings = self.nominal or RawReadings()

@@ -69,7 +69,7 @@ def run(options: Options) -> VerbResult:
     for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
         (source,) = sources_without([source_of(options.bag, topic)], [options.bag], options.exclude)
-        recording = read_by_hand(source(), readings, Preflight())
+        recording = read_by_hand(source, readings, Preflight())
         imus.append(recording.imu)
         findings = visible_findings(recording.findings)
         warn(finding.named(str(topic.imu)).to_mapping() for finding in findings)

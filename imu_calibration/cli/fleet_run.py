@@ -13,6 +13,7 @@ from imu_calibration.cli.parser import Options, VerbResult
 from imu_calibration.cli.show import show_table, warn
 from imu_calibration.cli.terminal import Terminal
 from imu_calibration.core.errors import ImuCalibrationError, InputError, printable, with_hint
+from imu_calibration.core.processes import in_processes
 from imu_calibration.core.progress import counter
 from imu_calibration.core.units import for_people, significant, with_sd
 from imu_calibration.document import files
@@ -20,9 +21,9 @@ from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.preprocessing.exclusion import (
     Exclusion,
+    WithoutExcluded,
     exclusions_of_units,
     parse_exclusions,
-    without_excluded,
 )
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_sections import calibration_report
@@ -30,9 +31,8 @@ from imu_calibration.report.page import render
 from imu_calibration.use_cases.choices import provenance_with, require_same_inputs, topics_of
 from imu_calibration.use_cases.recordings import (
     Topics,
-    cluster_mapper,
     jobs_for,
-    process_mapper,
+    on_cluster,
     provenance_of,
     source_of,
 )
@@ -118,7 +118,7 @@ def fleet_unit(
     for number, path in enumerate(paths):
         source = source_of(path, topics, joint_names, quiet=True)
         if exclusions and exclusions[number]:
-            source = partial(without_excluded, source, exclusions[number])
+            source = WithoutExcluded(source, exclusions[number])
         sources.append(source)
     return Unit(
         name,
@@ -173,12 +173,13 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
         _require_same_units(Path(options.output), units, report=not options.no_report)
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
-        if options.scheduler:
-            mapper = cluster_mapper(options.scheduler, lambda result: advance(1))
-        else:
-            mapper = process_mapper(jobs_for(options.jobs, len(units)), lambda result: advance(1))
         step = FleetStep(table, settings, None if options.no_report else calibration_report)
-        results = mapper(step, units)
+        if options.scheduler:
+            results = on_cluster(options.scheduler, step.calibrate, units, advance=advance)
+        else:
+            jobs = jobs_for(options.jobs, len(units))
+            each = [(unit,) for unit in units]
+            results = in_processes(step.calibrate, each, jobs, advance=advance)
         spreads = summarise(results)
         reasons = []
         for result in results:

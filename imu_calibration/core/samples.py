@@ -360,3 +360,7 @@ def rounding_variance(readings: np.ndarray) -> np.ndarray:
     """
     step = smallest_step(readings, 1e-12)
     return np.where(np.isfinite(step), step, 0.0) ** 2 / 12
+
+
+BlockSource = Iterable[SampleBlock]
+"""Blocks of a recording; each iteration begins at its start, so that it can be read repeatedly."""

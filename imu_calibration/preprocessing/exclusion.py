@@ -1,12 +1,12 @@
 """Times of a recording that its user excludes."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
-from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.samples import BlockSource, SampleBlock
 
 EXCLUDED = 'imu excluded'
 """Reason under which the samples are counted."""
@@ -156,29 +156,36 @@ class ExclusionMask:
                 )
 
 
-def without_excluded(
-    source: Callable[[], Iterable[SampleBlock]], exclusions: Sequence[Exclusion]
-) -> Iterator[SampleBlock]:
-    """
-    Yield the blocks of a recording without the excluded samples of the IMU, which are counted.
+@dataclass(frozen=True, eq=False)
+class WithoutExcluded:
+    """A recording without the excluded samples of the IMU, which are counted."""
 
-    Raises
-    ------
-    InputError
-        At the end, when no sample lies in an excluded time.
+    source: BlockSource
+    """The whole recording."""
+    exclusions: Sequence[Exclusion]
+    """Times that are not used."""
 
-    """
-    mask = ExclusionMask(exclusions)
-    for block in source():
-        if block.imu is None or not len(block.imu):
-            yield block
-            continue
-        kept = mask.kept(block.imu.stamp_ns)
-        if kept.all():
-            yield block
-            continue
-        dropped = dict(block.dropped or {})
-        dropped[EXCLUDED] = dropped.get(EXCLUDED, 0) + int(np.count_nonzero(~kept))
-        imu = block.imu.select(kept) if kept.any() else None
-        yield replace(block, imu=imu, dropped=dropped)
-    mask.require_used()
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """
+        Yield the blocks.
+
+        Raises
+        ------
+        InputError
+            At the end, when no sample lies in an excluded time.
+
+        """
+        mask = ExclusionMask(self.exclusions)
+        for block in self.source:
+            if block.imu is None or not len(block.imu):
+                yield block
+                continue
+            kept = mask.kept(block.imu.stamp_ns)
+            if kept.all():
+                yield block
+                continue
+            dropped = dict(block.dropped or {})
+            dropped[EXCLUDED] = dropped.get(EXCLUDED, 0) + int(np.count_nonzero(~kept))
+            imu = block.imu.select(kept) if kept.any() else None
+            yield replace(block, imu=imu, dropped=dropped)
+        mask.require_used()

@@ -17,7 +17,7 @@ from imu_calibration.calibration.check import check_errors
 from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.calibration.result import CalibrationResult, summary
-from imu_calibration.core.progress import counter, report
+from imu_calibration.core.progress import report
 from imu_calibration.core.readings import STATED_KEYS
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import CHANGE
@@ -41,7 +41,6 @@ from imu_calibration.use_cases.recordings import (
     Stand,
     jobs_for,
     name_of,
-    process_mapper,
     provenance_of,
 )
 from imu_calibration.use_cases.references import inputs_of
@@ -218,9 +217,7 @@ def _side_by_side(sources, reference, options, recordings, jobs):
         )
         for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)
     ]
-    advance = counter('recordings', len(recordings) if jobs > 1 else 0)
-    mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-    gathered = reference.gather(sources, options, names=names, mapper=mapper)
+    gathered = reference.gather(sources, options, names=names, jobs=jobs)
     return calibrate_by_evidence(gathered, options)
 
 

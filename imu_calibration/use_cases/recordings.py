@@ -1,23 +1,22 @@
-"""Recordings by path, the table or arm that carried the IMU, and a pool of processes."""
+"""Recordings by path, and the table or arm that carried the IMU."""
 
 from __future__ import annotations
 
 import os
-import signal
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, fields
-from functools import partial
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.processes import Returned
 from imu_calibration.core.progress import counter, remark
 from imu_calibration.core.samples import (
+    BlockSource,
     ImuSamples,
     JointSamples,
     SampleBlock,
@@ -27,9 +26,9 @@ from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import root_of, table_from_urdf, up_of
 from imu_calibration.preprocessing.exclusion import (
+    WithoutExcluded,
     exclusions_by_recording,
     parse_exclusions,
-    without_excluded,
 )
 from imu_calibration.preprocessing.sensor_join import (
     JoinedSensors,
@@ -40,9 +39,6 @@ from imu_calibration.preprocessing.sensor_join import (
 from msg_adapters.bag import Recording, description_in, frame_of, open_recording, static_transforms
 from msg_adapters.csv_log import LogOptions
 from msg_adapters.storage import read_ahead
-
-Source = Callable[[], Iterator[SampleBlock]]
-"""Yields the blocks of a recording; can be called repeatedly."""
 
 
 class Topics(NamedTuple):
@@ -101,48 +97,49 @@ def open_bag(
     )
 
 
-def read_blocks(
-    path: str,
-    topics: Topics,
-    joint_names: Iterable[str] | None,
-    *,
-    want_joints: bool | str,
-    want_temperature: bool | str,
-    quiet: bool,
-) -> Iterator[SampleBlock]:
-    """
-    Yield the blocks of a recording and report the progress unless `quiet`.
+@dataclass(frozen=True, eq=False)
+class RecordingFile:
+    """A recording in a file or folder, which any process reads from its start."""
 
-    A plain function, so that another process can run it.
-    """
-    if topics.gyroscope is not None:
-        plain = partial(
-            read_blocks,
-            path,
-            joint_names=joint_names,
-            want_joints=want_joints,
-            want_temperature=want_temperature,
-            quiet=True,
+    path: str
+    """Its path."""
+    topics: Topics
+    """Topics of the recording."""
+    joint_names: Iterable[str] | None
+    """Joints to read; None: all."""
+    want_joints: bool | str
+    """As for `msg_adapters.bag.open_recording`."""
+    want_temperature: bool | str
+    """As for `msg_adapters.bag.open_recording`."""
+    quiet: bool = False
+    """Whether no progress is reported."""
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Yield the blocks and report the progress."""
+        gyroscope = self.topics.gyroscope
+        if gyroscope is not None:
+            of_force = replace(self, topics=self.topics._replace(gyroscope=None), quiet=True)
+            yield _with_gyroscope(list(of_force), self.path, gyroscope)
+            return
+        recording = open_recording(
+            self.path,
+            **self.topics.chosen(),
+            want_joints=self.want_joints,
+            want_temperature=self.want_temperature,
         )
-        yield _with_gyroscope(list(plain(topics._replace(gyroscope=None))), path, topics.gyroscope)
-        return
-    recording = open_recording(
-        path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature
-    )
-    advance = counter(
-        f'reading {files.name_of_path(path)}',
-        0 if quiet else recording.message_counts.get(recording.imu_topic, 0),
-    )
-    with recording:
-        with closing(
-            read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())
-        ) as blocks:
-            for block in blocks:
-                if block.imu is not None:
-                    advance(len(block.imu))
-                yield block
-        if recording.lost:
-            yield SampleBlock(dropped=recording.lost)
+        advance = counter(
+            f'reading {files.name_of_path(self.path)}',
+            0 if self.quiet else recording.message_counts.get(recording.imu_topic, 0),
+        )
+        with recording:
+            read = recording.blocks(self.joint_names) if self.want_joints else recording.blocks()
+            with closing(read_ahead(read)) as blocks:
+                for block in blocks:
+                    if block.imu is not None:
+                        advance(len(block.imu))
+                    yield block
+            if recording.lost:
+                yield SampleBlock(dropped=recording.lost)
 
 
 def _with_gyroscope(blocks, path, topic):
@@ -251,9 +248,9 @@ def source_of(
     want_joints: bool | str | None = None,
     want_temperature: bool | str = True,
     quiet: bool = False,
-) -> Source:
+) -> BlockSource:
     """
-    Return a callable, for repeated use, that yields the blocks of a recording.
+    Return a recording to read, also repeatedly.
 
     Samples in memory are a recording of one block.
 
@@ -262,18 +259,10 @@ def source_of(
     """
     want_joints = joint_names is not None if want_joints is None else want_joints
     if isinstance(recording, SampleBlock):
-        return partial(
-            iter,
-            (
-                (
-                    recording
-                    if want_joints
-                    else SampleBlock(recording.imu, None, recording.temperature)
-                ),
-            ),
-        )
-    return partial(
-        read_blocks,
+        if not want_joints:
+            recording = SampleBlock(recording.imu, None, recording.temperature)
+        return [recording]
+    return RecordingFile(
         str(existing(recording)),
         topics,
         joint_names,
@@ -284,10 +273,10 @@ def source_of(
 
 
 def sources_without(
-    sources: Sequence[Source],
+    sources: Sequence[BlockSource],
     recordings: Sequence[str | PathLike | SampleBlock],
     exclude: str | None,
-) -> list[Source]:
+) -> list[BlockSource]:
     """
     Return the sources without the times that the user excludes (`exclusion.parse_exclusions`).
 
@@ -304,7 +293,7 @@ def sources_without(
     for source, exclusions in zip(
         sources, exclusions_by_recording(parse_exclusions(exclude), names), strict=True
     ):
-        found.append(partial(without_excluded, source, exclusions) if exclusions else source)
+        found.append(WithoutExcluded(source, exclusions) if exclusions else source)
     return found
 
 
@@ -363,94 +352,17 @@ def jobs_for(asked: int | None, n_items: int) -> int:
     return max(1, min(asked or os.cpu_count() or 1, n_items))
 
 
-def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
+def on_cluster(
+    address: str,
+    function: Callable[[Any], Returned],
+    items: Sequence[Any],
+    *,
+    advance: Callable[[int], object],
+) -> list[Returned]:
     """
-    Return a function like `map` that runs in `jobs` processes.
+    Return the results of a function on the workers of a dask scheduler, in the order of the items.
 
-    It returns a list in the order of the items.
-
-    Parameters
-    ----------
-    jobs : int
-        Number of processes; one runs in this process.
-    done : callable
-        Called with each result as soon as it is available.
-
-    """
-
-    def mapped(function, items):
-        items = list(items)
-        if min(jobs, len(items)) <= 1:
-            return [_reported(function(item), done) for item in items]
-        # Here, because most verbs need no pool, and the imports are slow.
-        import multiprocessing
-        from concurrent.futures import ProcessPoolExecutor
-
-        # Spawned, not forked: a fork of a process with threads can stop for ever.
-        with ProcessPoolExecutor(
-            min(jobs, len(items)), mp_context=multiprocessing.get_context('spawn')
-        ) as pool:
-            return _in_order(pool, function, items, done)
-
-    return mapped
-
-
-@contextmanager
-def _interruptions_blocked():
-    """
-    Keep Ctrl+C, which a terminal sends to all its processes, from those that are started here.
-
-    This process ends them.
-    """
-    from multiprocessing import resource_tracker  # here, because its import is slow
-
-    resource_tracker.ensure_running()  # its start would end the block
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _until_sigterm(function, item):
-    """
-    Run in a worker.
-
-    SIGTERM interrupts the item, so that its temporary files are removed, and otherwise ends the
-    process.
-    """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        return function(item)
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-def _reported(result, done):
-    done(result)
-    return result
-
-
-def _in_order(pool, function, items, done):
-    try:
-        with _interruptions_blocked():
-            futures = [pool.submit(_until_sigterm, function, item) for item in items]
-        for future in as_completed(futures):
-            done(future.result())
-    except BaseException:
-        # Public from Python 3.14: terminate_workers.
-        for worker in list((pool._processes or {}).values()):
-            worker.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
-        raise
-    return [future.result() for future in futures]
-
-
-def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: None) -> Callable:
-    """
-    Return a function like `map` that runs on the workers of a dask scheduler.
-
-    They must see the same paths and have this package.
+    They must see the same paths and have this package. `advance` as for `in_processes`.
 
     Raises
     ------
@@ -467,22 +379,19 @@ def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: No
             key='scheduler',
         ) from error
 
-    def mapped(function, items):
-        try:
-            client = distributed.Client(address, timeout='10s', set_as_default=False)
-        except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(
-                f'a dask scheduler must be reachable at {address}: {" ".join(str(error).split())}; '
-                'start one with dask scheduler',
-                key='scheduler',
-            ) from error
-        with client, client.as_current():
-            futures = client.map(function, list(items), pure=False)
-            for future in distributed.as_completed(futures):
-                done(future.result())
-            return [future.result() for future in futures]
-
-    return mapped
+    try:
+        client = distributed.Client(address, timeout='10s', set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(
+            f'a dask scheduler must be reachable at {address}: {" ".join(str(error).split())}; '
+            'start one with dask scheduler',
+            key='scheduler',
+        ) from error
+    with client, client.as_current():
+        futures = client.map(function, list(items), pure=False)
+        for _ in distributed.as_completed(futures):
+            advance(1)
+        return [future.result() for future in futures]
 
 
 LIKELY_LINK = 'imu_link'

@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.samples import BlockSource, SampleBlock
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
 from imu_calibration.use_cases.recordings import (
-    Source,
     Stand,
     Topics,
     open_bag,
@@ -49,7 +48,7 @@ class Inputs(NamedTuple):
     """Of estimation and validation."""
     reference: MotionReference
     """A table or an arm, or gravity."""
-    sources: list[Source]
+    sources: list[BlockSource]
     """One for each recording."""
 
 

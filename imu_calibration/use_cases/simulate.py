@@ -232,7 +232,7 @@ def replay(
         }
     report('simulating')
     samples, lost = run_replay(
-        source(), given, known.model, values=known.values, noise=noise, seed=seed
+        source, given, known.model, values=known.values, noise=noise, seed=seed
     )
     truth = replace(
         known,

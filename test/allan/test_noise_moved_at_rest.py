@@ -58,5 +58,5 @@ def test_noise_of_a_tilted_rest_is_refused():
         10**18 + np.round(time * 1e9).astype(np.int64), values[:, :3], values[:, 3:], 'imu'
     )
     with refused(InputError, 'moved_at_rest') as caught:
-        identify_noise(lambda: iter([SampleBlock(imu)]))
+        identify_noise([SampleBlock(imu)])
     assert caught.value.key == 'exclude'

@@ -21,7 +21,7 @@ SCALE = {'accelerometer': 8192 / 9.80665, 'gyroscope': 65.5 * 180 / np.pi}
 def recording(values, rate):
     """Readings, shape (n, 6), as one block."""
     stamps = 10**18 + np.round(np.arange(len(values)) / rate * 1e9).astype(np.int64)
-    return lambda: iter([SampleBlock(ImuSamples(stamps, values[:, :3], values[:, 3:], 'imu'))])
+    return [SampleBlock(ImuSamples(stamps, values[:, :3], values[:, 3:], 'imu'))]
 
 
 def torn_readings(seconds, share, level, times=1.0):

@@ -58,20 +58,29 @@ def resting(seconds, seed=0, walk=WALK, period=PERIOD):
 
 
 def source(imu, temperature=None, size=20_000):
-    """Blocks of a recording, each time anew."""
-
-    def blocks():
-        for start in range(0, len(imu), size):
-            part = imu.select(slice(start, start + size))
-            warm = None
-            if temperature is not None:
-                warm = temperature.select(
-                    (temperature.stamp_ns >= part.stamp_ns[0])
-                    & (temperature.stamp_ns <= part.stamp_ns[-1])
-                )
-            yield SampleBlock(part, temperature=warm)
-
+    """Blocks of a recording."""
+    blocks = []
+    for start in range(0, len(imu), size):
+        part = imu.select(slice(start, start + size))
+        warm = None
+        if temperature is not None:
+            warm = temperature.select(
+                (temperature.stamp_ns >= part.stamp_ns[0])
+                & (temperature.stamp_ns <= part.stamp_ns[-1])
+            )
+        blocks.append(SampleBlock(part, temperature=warm))
     return blocks
+
+
+class Repeated:
+    """100 s of samples, several times in succession, which are never all in memory."""
+
+    def __init__(self, imu, times):
+        self.imu, self.times = imu, times
+
+    def __iter__(self):
+        for k in range(self.times):
+            yield SampleBlock(replace(self.imu, stamp_ns=self.imu.stamp_ns + k * 100_000_000_000))
 
 
 def changed(imu, columns, start, values):
@@ -332,20 +341,7 @@ def test_memory_is_that_of_a_shorter_recording():
     """
     peaks = []
     for seconds in (400.0, 1600.0):
-        blocks = [resting(100.0, 9)]
-
-        def stream(blocks=blocks, seconds=seconds):
-            part = blocks[0]
-            for k in range(int(seconds / 100)):
-                yield SampleBlock(
-                    ImuSamples(
-                        part.stamp_ns + k * 100_000_000_000,
-                        part.force_s,
-                        part.rate_s,
-                        part.frame_id,
-                    )
-                )
-
+        stream = Repeated(resting(100.0, 9), int(seconds / 100))
         tracemalloc.start()
         read_rest(stream)
         peaks.append(tracemalloc.get_traced_memory()[1])

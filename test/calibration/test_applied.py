@@ -102,7 +102,7 @@ def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
     checked = imu.check(tmp_path / 'bag', known, gravity=GRAVITY)
     imu.compensate(tmp_path / 'bag', known, output=tmp_path / 'corrected', anyway=True)
     raw, corrected = (
-        read_by_hand(source_of(tmp_path / 'corrected', Topics(topic), want_joints=False)()).imu
+        read_by_hand(source_of(tmp_path / 'corrected', Topics(topic), want_joints=False)).imu
         for topic in ('/imu/data_raw', '/imu/data_corrected')
     )
     written = prove_hand_readings(gather_by_hand(raw), raw, corrected, gravity=GRAVITY)

@@ -411,7 +411,7 @@ def test_what_a_rest_may_move_biases_by():
 
 def diagnosed(session):
     return diagnose_recording(
-        lambda: iter([session.block]),
+        [session.block],
         Table.from_mapping(session.table),
         CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW)),
     )

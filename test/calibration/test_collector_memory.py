@@ -67,7 +67,7 @@ def peak(imu, joints, repetitions):
     """Return (what was gathered, peak of allocated memory in bytes)."""
     tracemalloc.start()
     try:
-        gathered = GatherStep(TABLE, MODEL)((0, lambda: stream(imu, joints, repetitions)))
+        gathered = GatherStep(TABLE, MODEL).gather(stream(imu, joints, repetitions), 0)
         return gathered, tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

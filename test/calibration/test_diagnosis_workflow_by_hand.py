@@ -359,7 +359,7 @@ def test_xsens_counts_tells_no_stories(recordings):
     )
     with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:
         found = diagnose_without_table(
-            recording.blocks, replace(options, gravity=9.81744)
+            recording.blocks(), replace(options, gravity=9.81744)
         ).diagnosis
     assert [f.effect for f in found.findings] == ['gyro_g_sensitivity']
     gain = found.findings[0].gain

@@ -79,9 +79,7 @@ def blocks(*streams, seed=0, mean_seconds=0.2):
 
 def offline(*sessions, options=CalibrationOptions()):
     """Return what the offline tool says."""
-    return calibrate_on_table(
-        [lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, options
-    )
+    return calibrate_on_table([[SampleBlock(*s)] for s in sessions], TABLE, options)
 
 
 def run(live, *streams, seed=0):

@@ -65,7 +65,7 @@ def hidden():
 def expected(hidden):
     """What the verb diagnose says of it, and hands over."""
     return diagnose_recording(
-        lambda: iter([SampleBlock(hidden.imu, hidden.joints)]),
+        [SampleBlock(hidden.imu, hidden.joints)],
         Table.from_mapping(hidden.table),
         OPTIONS,
     )
@@ -145,7 +145,7 @@ def test_a_delay_is_taken_at_its_size_like_offline():
         live.push(block)
     live.solve(pending=True)
     assert live.adopt(question_about(live).answer().extension)
-    recordings = TableRecordings.of([lambda: iter([pair.first.block])], table, keep_windows=True)
+    recordings = TableRecordings.of([[pair.first.block]], table, keep_windows=True)
     expected = calibrate_by_evidence(recordings, OPTIONS).calibration
     found = live.solve(pending=True).calibration
     assert 'time_offset' in found.statistics['added']

@@ -120,7 +120,7 @@ def world(kind, seed, gyroscope_model='bias+matrix'):
 
 
 def source(session):
-    return lambda: iter([session.block])
+    return [session.block]
 
 
 def calibrated(kind, seed, **changes):

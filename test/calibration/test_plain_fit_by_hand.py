@@ -33,7 +33,7 @@ def twisted(force, rate, time, pose):
 
 
 def source(imu):
-    return lambda: iter([SampleBlock(imu)])
+    return [SampleBlock(imu)]
 
 
 def with_plain_values(calibration, imu):

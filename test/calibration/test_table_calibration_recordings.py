@@ -37,7 +37,7 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings):
     the lag in the model.
     """
     table, blocks = opened(recordings / 'shaft_yaw_medium')
-    calibration = calibrate_on_table([lambda: iter(blocks)], table, BOTH).calibration
+    calibration = calibrate_on_table([blocks], table, BOTH).calibration
     values, sds = (
         dict(zip(calibration.param_names, numbers))
         for numbers in (calibration.values, calibration.sd)
@@ -58,16 +58,15 @@ def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
     folder = recordings / name
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
 
-    def source():
-        with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-            start = None
-            for block in recording.blocks(table.joint_names):
-                start = block.imu.stamp_ns[0] if start is None else start
-                if block.imu.stamp_ns[0] > start + 150 * 10**9:
-                    return
-                yield block
+    blocks = []
+    with open_recording(folder, imu_topic='/imu/data_raw') as recording:
+        for block in recording.blocks(table.joint_names):
+            blocks.append(block)
+            if block.imu.stamp_ns[0] > blocks[0].imu.stamp_ns[0] + 150 * 10**9:
+                blocks.pop()
+                break
 
-    document = diagnose_recording(source, table).document
+    document = diagnose_recording(blocks, table).document
     effects = {finding['effect'] for finding in document['findings']}
     assert effects and effects <= {'time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter'}
     lag = sum(
@@ -91,7 +90,7 @@ def test_what_one_axis_cannot_show_is_held(recordings):
     folder = recordings / 'shaft_yaw_medium'
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
     with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-        result = calibrate_on_table([lambda: recording.blocks(table.joint_names)], table)
+        result = calibrate_on_table([recording.blocks(table.joint_names)], table)
     status = dict(zip(result.calibration.param_names, result.calibration.status))
     assert all(
         status[f'gyroscope.matrix.{name}'] == 'held'

@@ -131,7 +131,7 @@ def test_an_added_delay_gives_the_result_of_a_requested_one(session):
         replace(OPTIONS, added=(('reference', 'time_offset'),)),
         replace(OPTIONS, reference_model='table_tilt+earth_rate+time_offset'),
     ):
-        found = calibrate_on_table([lambda: iter([block])], TABLE, options).calibration
+        found = calibrate_on_table([[block]], TABLE, options).calibration
         results.append({n: (v, sd) for n, v, sd in zip(found.param_names, found.values, found.sd)})
     added, requested = results
     assert added.keys() == requested.keys()

@@ -58,7 +58,7 @@ def recording():
 def calibrated(recording, table, options=NO_TILT):
     """Calibrate against a table, without a search for effects."""
     options = replace(options, as_asked=True)
-    return calibrate_on_table([lambda: iter([recording])], table, options)
+    return calibrate_on_table([[recording]], table, options)
 
 
 @pytest.fixture(scope='module')
@@ -69,7 +69,7 @@ def result(recording):
 
 def moved(recording, result, false_table):
     """Return how the estimate moves when the reference is wrong, at the same weights."""
-    gathered = GatherStep(false_table, result.model)((0, lambda: iter([recording])))
+    gathered = GatherStep(false_table, result.model).gather([recording], 0)
     return (
         solve(gathered.accumulator, result.model, noise=result.solution.noise).values
         - result.solution.values

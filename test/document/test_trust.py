@@ -165,9 +165,7 @@ def test_a_rest_in_one_attitude_is_unproven():
     from worlds.live_sessions import OPTIONS, TABLE, make_session
 
     imu, joints, _, _ = make_session(3, seconds=8.0)
-    found = calibrate_on_table(
-        [lambda: iter([SampleBlock(imu, joints)])], TABLE, OPTIONS
-    ).calibration
+    found = calibrate_on_table([[SampleBlock(imu, joints)]], TABLE, OPTIONS).calibration
     assert set(found.decisions.values()) == {UNPROVEN}
     assert any('accelerometer' in line for line in found.notes)
     assert calibration_from_text(calibration_to_text(found)).decisions == found.decisions

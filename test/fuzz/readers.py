@@ -319,9 +319,7 @@ def noise_seeds(_folder):
         10**9 + 20_000_000 * np.arange(n), readings[:, :3], readings[:, 3:], 'imu_link'
     )
     return [
-        noise_to_text(
-            figures_of(identify_noise(lambda: [SampleBlock(imu, None, None)])), 3600.0
-        ).encode()
+        noise_to_text(figures_of(identify_noise([SampleBlock(imu, None, None)])), 3600.0).encode()
     ]
 
 

@@ -77,7 +77,7 @@ def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
         gyroscope_model='bias+matrix+bias_while_warming',
         catalogue=CATALOGUE.with_effects(FOLLOWS).with_candidates(FEW),
     )
-    result = calibrate_on_table([lambda: iter([block])], table, options)
+    result = calibrate_on_table([[block]], table, options)
     value = result.calibration.value('gyroscope', 'bias_while_warming')
     np.testing.assert_allclose(value, SIZE, rtol=0.2)
     # Compensation replaces it by its mean: the slope of another session is another one.
@@ -86,7 +86,7 @@ def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
 
     without = replace(block, temperature=None)
     with pytest.raises(InputError) as refused:
-        calibrate_on_table([lambda: iter([without])], table, options)
+        calibrate_on_table([[without]], table, options)
     assert refused.value.key == 'temperature_topic' and refused.value.code == 'temperature_missing'
 
 
@@ -113,7 +113,7 @@ def test_the_diagnosis_names_the_slope_of_the_temperature():
     block, table = session_that_warms()
     catalogue = CATALOGUE.with_candidates('gyro_thermal_bias+gyro_bias_drift+gyro_bias_trend')
     options = CalibrationOptions(catalogue=catalogue)
-    diagnosis = diagnose_recording(lambda: iter([block]), table, options).diagnosis
+    diagnosis = diagnose_recording([block], table, options).diagnosis
     assert not diagnosis.findings
     rest = diagnosis.unexplained['gyroscope']
     assert rest.significant and rest.correlates_with == 'temperature rate' and rest.share > 0.5

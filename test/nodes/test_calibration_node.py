@@ -82,7 +82,7 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bags / 'session') as recording:
             expected = calibrate_on_table(
-                [lambda: recording.blocks(TABLE.joint_names)], TABLE, OPTIONS
+                [list(recording.blocks(TABLE.joint_names))], TABLE, OPTIONS
             ).calibration
         check_the_answer(station, live, expected)
         assert sorted(path.name for path in tmp_path.iterdir()) == [
@@ -172,7 +172,7 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
     table = Table.from_mapping(session.table)
     with open_recording(tmp_path / 'bag') as recording:
-        offline = diagnose_recording(lambda: recording.blocks(table.joint_names), table, OPTIONS)
+        offline = diagnose_recording(recording.blocks(table.joint_names), table, OPTIONS)
     expected = offline.diagnosis
     first = expected.findings[0]
     with Station() as station:
@@ -282,7 +282,7 @@ def test_poses_by_hand_through_the_node(tmp_path):
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bag, want_joints=False) as recording:
             expected = calibrate_without_table(
-                [recording.blocks], replace(OPTIONS, gravity=GRAVITY)
+                [recording.blocks()], replace(OPTIONS, gravity=GRAVITY)
             ).calibration
         assert (
             live.statistics['samples_used'] == expected.statistics['samples_used']

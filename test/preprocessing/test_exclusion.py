@@ -7,12 +7,12 @@ from refusal import refused
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.preprocessing.exclusion import (
+    WithoutExcluded,
     EXCLUDED,
     Exclusion,
     exclusions_by_recording,
     exclusions_of_units,
     parse_exclusions,
-    without_excluded,
 )
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.inspect import inspect_imus
@@ -67,7 +67,7 @@ def test_a_time_of_a_fleet_belongs_to_all_units_a_unit_or_a_recording():
 def test_samples_are_left_out_and_counted(cut):
     imu = samples()
     blocks = [SampleBlock(imu.select(slice(a, a + cut))) for a in range(0, len(imu), cut)]
-    found = list(without_excluded(lambda: blocks, parse_exclusions('2:3,6:6.5')))
+    found = list(WithoutExcluded(blocks, parse_exclusions('2:3,6:6.5')))
     stamps = np.concatenate([block.imu.stamp_ns for block in found if block.imu is not None])
     time = (stamps - imu.stamp_ns[0]) * 1e-9
     assert len(time) == 400 - 50 - 25
@@ -77,7 +77,7 @@ def test_samples_are_left_out_and_counted(cut):
 
 def test_a_time_outside_of_the_recording_is_refused():
     with refused(InputError, 'exclude_outside', '9:12', 8.0):
-        list(without_excluded(lambda: [SampleBlock(samples())], parse_exclusions('9:12')))
+        list(WithoutExcluded([SampleBlock(samples())], parse_exclusions('9:12')))
 
 
 def test_the_use_cases_leave_it_out():
@@ -91,7 +91,7 @@ def test_the_use_cases_leave_it_out():
     assert found.calibration.statistics['dropped'][EXCLUDED] == pytest.approx(9.4 * 80, abs=1)
     assert found.exit_code == 3
     (source,) = inputs_of([block], None, {'exclude': '1:2'}).sources
-    assert sum((each.dropped or {}).get(EXCLUDED, 0) for each in source()) == 80
+    assert sum((each.dropped or {}).get(EXCLUDED, 0) for each in source) == 80
     (look,) = inspect_imus(block, None, {'exclude': '1:2'})
     assert look.lost[EXCLUDED] == 80 and look.streams['imu'].count == len(imu) - 80
     with refused(InputError, 'exclude_outside', '70:71'):

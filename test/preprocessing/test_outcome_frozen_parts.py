@@ -86,7 +86,7 @@ def test_check_and_compensate_note_the_part(clean, usual):
     bad = without_output(clean, 20.0, 36.0)
     checked, good = (
         check_errors(
-            errors_by_hand(lambda: iter([SampleBlock(samples)]), usual.calibration, OPTIONS),
+            errors_by_hand([SampleBlock(samples)], usual.calibration, OPTIONS),
             usual.calibration,
         )
         for samples in (bad, clean)
@@ -106,7 +106,7 @@ def test_noise_is_that_of_the_readings():
     force = np.array([0.1, -0.2, GRAVITY]) + rng.normal(0, 0.01, (n, 3))
     imu = ImuSamples(stamp_ns, force, rng.normal(0, 0.001, (n, 3)), 'imu')
     dead = without_output(imu, 200.0, 420.0, 0.0)
-    result = identify_noise(lambda: iter([SampleBlock(dead)]))
+    result = identify_noise([SampleBlock(dead)])
     figures = figures_of(result)
     for sensor, sd in (('accelerometer', 0.01), ('gyroscope', 0.001)):
         density = np.array([axis.white for axis in figures.sensor(sensor)])
@@ -135,7 +135,7 @@ def test_on_a_table_no_window_has_frozen_readings():
     blocks = [SampleBlock(bad, session.joints, session.temperature)]
     windows = []
     step = GatherStep(table, SensorModel(BASE, BASE))
-    gathered = step.read(lambda: iter(blocks), 0, Preflight(GRAVITY), windows=windows)
+    gathered = step.read(blocks, 0, Preflight(GRAVITY), windows=windows)
     used = [window for window in windows if window.kind != 'unused']
     start, stop = bad.stamp_ns[0] + np.array([43.0, 56.5]) * 1e9
     stamps = np.concatenate([window.stamp_ns for window in used])

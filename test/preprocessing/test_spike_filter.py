@@ -151,7 +151,7 @@ def test_one_per_cent_of_spikes_does_not_matter_on_the_table():
 
     def result(imu):
         return calibrate_on_table(
-            [lambda: iter([SampleBlock(imu, session.joints, session.temperature)])],
+            [[SampleBlock(imu, session.joints, session.temperature)]],
             table,
             CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW)),
         ).calibration

@@ -71,9 +71,7 @@ def test_joints_taken_at_their_word_spoil_the_calibration(world):
     true = {name: value for name, value in truth(world).items() if '.matrix.' in name}
     errors = []
     at_their_word = CalibrationOptions(reference_model='table_tilt')
-    spoilt = calibrate_on_table(
-        [lambda: iter([world.block])], world.table, at_their_word
-    ).calibration
+    spoilt = calibrate_on_table([[world.block]], world.table, at_their_word).calibration
     for calibration in (calibrated(world), spoilt):
         found = dict(
             zip(

@@ -50,9 +50,7 @@ def run(live, imu, seed=0):
 
 def offline(imu, gravity=GRAVITY):
     """What the offline tool says."""
-    return calibrate_without_table(
-        [lambda: iter([SampleBlock(imu)])], replace(OPTIONS, gravity=gravity)
-    )
+    return calibrate_without_table([[SampleBlock(imu)]], replace(OPTIONS, gravity=gravity))
 
 
 def all_kept(live):
@@ -294,8 +292,6 @@ def test_further_effects_are_estimated_as_offline(session):
         options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0
     )
     run(live, session)
-    expected = calibrate_without_table(
-        [lambda: iter([SampleBlock(session)])], replace(options, gravity=GRAVITY)
-    )
+    expected = calibrate_without_table([[SampleBlock(session)]], replace(options, gravity=GRAVITY))
     assert any('accel_quadratic' in name for name in expected.calibration.param_names)
     assert_same(live.solve(pending=True), expected)

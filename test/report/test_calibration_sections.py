@@ -83,22 +83,20 @@ def quick():
 @pytest.fixture(scope='module')
 def on_table(quick):
     """Its calibration on the table."""
-    return calibrate_on_table([lambda: iter([quick])], TABLE, OPTIONS, provenance=PROVENANCE)
+    return calibrate_on_table([[quick]], TABLE, OPTIONS, provenance=PROVENANCE)
 
 
 @pytest.fixture(scope='module')
 def by_hand(quick):
     """The same recording calibrated by hand."""
-    return calibrate_without_table(
-        [lambda: iter([SampleBlock(quick.imu)])], OPTIONS, provenance=PROVENANCE
-    )
+    return calibrate_without_table([[SampleBlock(quick.imu)]], OPTIONS, provenance=PROVENANCE)
 
 
 @pytest.fixture(scope='module')
 def demanding(quick):
     """The recording judged by tolerances on the arms that it does not meet."""
     return calibrate_on_table(
-        [lambda: iter([quick])],
+        [[quick]],
         TABLE,
         replace(OPTIONS, tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
         provenance=PROVENANCE,
@@ -302,7 +300,7 @@ def test_a_recording_with_an_unmodelled_effect_recommends_a_diagnosis(quick):
         quick.imu,
         rate_s=np.concatenate([np.repeat(quick.imu.rate_s[:1], 2, axis=0), quick.imu.rate_s[:-2]]),
     )
-    result = calibrate_on_table([lambda: iter([SampleBlock(late, quick.joints)])], TABLE, OPTIONS)
+    result = calibrate_on_table([[SampleBlock(late, quick.joints)]], TABLE, OPTIONS)
     page = calibration_report(result)
     assert 'imu_calibration diagnose' in page
 

@@ -59,7 +59,7 @@ def result():
     )
     block = SampleBlock(imu, joints)
     return diagnose_recording(
-        lambda: iter([block]),
+        [block],
         TABLE,
         CalibrationOptions(),
         provenance={'bags': [{'name': 'session', 'sha256': '0'}]},

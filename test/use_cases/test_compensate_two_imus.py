@@ -82,7 +82,7 @@ def test_two_imus_in_a_text_log_are_refused_and_rows_can_be_chosen(verb, log, ca
 def test_the_chosen_rows_are_those_of_one_imu(log):
     other = still(2)
     (source,) = inputs_of([log], None, {'where': ['I=1']}).sources
-    (imu,) = [block.imu for block in source()]
+    (imu,) = [block.imu for block in source]
     np.testing.assert_allclose(imu.force_s, other.force_s + FORCE, atol=1e-9)
     corrected = compensate_recording(log, 'calibration.yaml', where=['I=1'])
     expected = compensate_recording(imu, 'calibration.yaml')

@@ -266,7 +266,7 @@ def calibrated(world):
     """Return the calibration of a world, which several tests judge."""
     from imu_calibration.calibration.table_calibration import calibrate_on_table
 
-    return calibrate_on_table([lambda: iter([world.block])], world.table).calibration
+    return calibrate_on_table([[world.block]], world.table).calibration
 
 
 def deviations(world):

@@ -11,4 +11,4 @@ OPTIONS = CalibrationOptions(gravity=GRAVITY, as_asked=True)
 
 def calibrated(imu):
     """Return the result for ImuSamples of one recording."""
-    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], OPTIONS)
+    return calibrate_without_table([[SampleBlock(imu)]], OPTIONS)

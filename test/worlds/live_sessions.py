@@ -44,9 +44,7 @@ def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='qui
 
 def offline(*sessions):
     """Return the offline answer for (imu, joints) as they were sent."""
-    return calibrate_on_table(
-        [lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, OPTIONS
-    ).calibration
+    return calibrate_on_table([[SampleBlock(*s)] for s in sessions], TABLE, OPTIONS).calibration
 
 
 def assert_same(live, expected, share=1e-6):

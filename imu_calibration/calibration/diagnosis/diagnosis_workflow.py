@@ -1,6 +1,6 @@
 """Diagnosis as plain functions, on a table and by hand, and its result as lines of text."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +28,7 @@ from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
 from imu_calibration.calibration.table_calibration import StoredRecording, TableRecordings
 from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.calibration.window_search import baseline_options
+from imu_calibration.core.samples import BlockSource
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HARM
@@ -168,7 +169,7 @@ class DiagnosisResult:
 
 
 def diagnose_recording(
-    source: Callable,
+    source: BlockSource,
     table: Table,
     options: CalibrationOptions = CalibrationOptions(),
     *,
@@ -179,8 +180,8 @@ def diagnose_recording(
 
     Parameters
     ----------
-    source : callable
-        Returns a new iterator of SampleBlock at each call.
+    source : BlockSource
+        The recording.
     table : Table
     options : CalibrationOptions
         The initial model; default bias and matrix, so that every other effect is tested.
@@ -364,7 +365,7 @@ def _with_proposals(
 
 
 def diagnose_without_table(
-    source: Callable,
+    source: BlockSource,
     options: CalibrationOptions = CalibrationOptions(),
     provenance: dict[str, Any] | None = None,
 ) -> DiagnosisResult:
@@ -376,8 +377,8 @@ def diagnose_without_table(
 
     Parameters
     ----------
-    source : callable
-        Returns an iterator of SampleBlock.
+    source : BlockSource
+        The recording.
     options : CalibrationOptions
         The initial model; default bias and matrix.
     provenance : optional
@@ -388,7 +389,7 @@ def diagnose_without_table(
     DiagnosisResult
 
     """
-    recording = read_by_hand(source(), options.nominal, Preflight(options.gravity))
+    recording = read_by_hand(source, options.nominal, Preflight(options.gravity))
     result = calibrate_poses(recording, replace(options, as_asked=False), provenance)
     if result.found is None:
         raise too_few_poses(len(result.solution.poses.start))
