@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.check import ReadingErrors
@@ -14,7 +14,7 @@ from imu_calibration.calibration.live_poses import EMPTY_SCAN, LiveByHand, hand_
 from imu_calibration.calibration.pose_observations import HandResult, PoseObservations
 from imu_calibration.calibration.pose_readings import errors_by_hand
 from imu_calibration.calibration.reference import Inspection
-from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.errors import ImuCalibrationError, InputError, NotObservableError
 from imu_calibration.core.samples import BlockSource, ImuSamples, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.loss import TrialMotion, recorded_motion
@@ -22,11 +22,13 @@ from imu_calibration.document.rest_noise import motions_at_rest
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.recording_evidence import REFUSE
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandOptions, hand_options
 from imu_calibration.references.options import CalibrationOptions
 
 if TYPE_CHECKING:
-    from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult
+    from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
+    from imu_calibration.calibration.diagnosis.traces import Traces
 
 
 @dataclass(frozen=True)
@@ -64,14 +66,30 @@ class GravityReference:
         (source,) = sources
         return errors_by_hand(source, calibration, options)
 
-    def diagnose(
-        self, source: BlockSource, options: CalibrationOptions, provenance: dict[str, Any]
-    ) -> 'DiagnosisResult':
-        """Identify the errors of the model in poses and turns."""
-        # Here, because its import is slow.
-        from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_without_table
+    def stored(self, source: BlockSource, options: CalibrationOptions) -> PoseRecording:
+        """Return the poses and turns; the search needs both sensors."""
+        return gather_poses([source], options, one_sensor=False)
 
-        return diagnose_without_table(source, options, provenance)
+    def too_few(self, result: HandResult) -> NotObservableError:
+        """Return the error with the number of poses."""
+        from imu_calibration.references.gravity.model_selection import too_few_poses
+
+        return too_few_poses(len(result.solution.poses.start))
+
+    def identify(self, result: HandResult) -> 'Diagnosis':
+        """Return the errors of the model in poses and turns."""
+        # Here, because its import is slow.
+        from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand
+
+        return diagnosis_by_hand(result.found, result.solution)
+
+    def traces(
+        self, recording: PoseRecording, before: HandCalibration, after: HandCalibration
+    ) -> 'Traces':
+        """Return one point per pose."""
+        from imu_calibration.calibration.diagnosis.findings import traces_of_poses
+
+        return traces_of_poses(before, after)
 
     def inspect(
         self, source: BlockSource, lenient: BlockSource, options: CalibrationOptions

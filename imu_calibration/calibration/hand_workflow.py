@@ -52,14 +52,20 @@ def calibrate_without_table(
     return calibrate_by_evidence(gather_poses(sources, options), options, provenance=provenance)
 
 
-def gather_poses(sources: Sequence[BlockSource], options: CalibrationOptions) -> PoseRecording:
-    """Return the poses and turns of one recording; raises as `calibrate_without_table`."""
+def gather_poses(
+    sources: Sequence[BlockSource], options: CalibrationOptions, *, one_sensor: bool = True
+) -> PoseRecording:
+    """
+    Return the poses and turns of one recording; raises as `calibrate_without_table`.
+
+    `one_sensor`: whether one usable sensor suffices.
+    """
     if len(sources) != 1:
         raise InputError(
             f'calibration by hand needs one recording, got {len(sources)}; calibrate them'
             ' separately and compare the results'
         )
-    preflight = Preflight(options.gravity, one_sensor=True)
+    preflight = Preflight(options.gravity, one_sensor=one_sensor)
     recording = read_by_hand(sources[0], options.nominal, preflight)
     return PoseRecording(PoseObservations.of(recording, hand_options(options)))
 

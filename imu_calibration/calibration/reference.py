@@ -14,7 +14,7 @@ from imu_calibration.calibration.live import (
 from imu_calibration.calibration.live_poses import LiveSession
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.solved import ModelSource
-from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.errors import ImuCalibrationError, NotObservableError
 from imu_calibration.core.samples import BlockSource, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.loss import TrialMotion
@@ -25,7 +25,8 @@ from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.references.options import CalibrationOptions
 
 if TYPE_CHECKING:
-    from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult
+    from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
+    from imu_calibration.calibration.diagnosis.traces import Traces
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +83,21 @@ class MotionReference(Protocol):
     ) -> ReadingErrors:
         """Return the errors of readings before and after a calibration; as `errors_on_table`."""
 
-    def diagnose(
-        self, source: BlockSource, options: CalibrationOptions, provenance: dict[str, Any]
-    ) -> 'DiagnosisResult':
-        """Calibrate a recording, and identify the errors of the model; as `diagnose_recording`."""
+    def stored(self, source: BlockSource, options: CalibrationOptions) -> ModelSource[Any]:
+        """Return a recording for a diagnosis, which is read once."""
+
+    def too_few(self, result: CalibrationResult[Any]) -> NotObservableError:
+        """Return the error where the data of a result do not suffice for a search of effects."""
+
+    def identify(self, result: CalibrationResult[Any]) -> 'Diagnosis':
+        """Return the result of a search as a Diagnosis, without traces."""
+
+    def traces(self, recording: Any, before: Any, after: Any) -> 'Traces':
+        """
+        Return the residuals of two solutions of a recording, for plots.
+
+        `recording`: as `stored` returns it.
+        """
 
     def inspect(
         self, source: BlockSource, lenient: BlockSource, options: CalibrationOptions

@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from imu_calibration.calibration.check import ReadingErrors
 from imu_calibration.calibration.coverage import Coverage, table_coverage
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
-    DiagnosisResult,
-    diagnose_recording,
-)
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
+from imu_calibration.calibration.diagnosis.traces import Traces, residual_traces
 from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.calibration.live import (
     LiveByHandSettings,
@@ -19,20 +18,26 @@ from imu_calibration.calibration.live import (
     Place,
 )
 from imu_calibration.calibration.reference import Inspection
-from imu_calibration.calibration.table_calibration import TableRecordings, WatchedRecording
+from imu_calibration.calibration.table_calibration import (
+    StoredRecording,
+    TableRecordings,
+    WatchedRecording,
+)
 from imu_calibration.calibration.table_errors import calibrate_with_table_errors
 from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.calibration.window_readings import errors_on_table
-from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.errors import ImuCalibrationError, InputError, NotObservableError
 from imu_calibration.core.samples import BlockSource, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.loss import TrialMotion, measured_temperature, motion_of
 from imu_calibration.document.outcome import STATED_CHECKS
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import JOINT_STATES, Preflight
 from imu_calibration.preprocessing.window_finder import session_truth
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.selection.investigation import too_few_windows
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +80,23 @@ class TableReference:
         """Return the errors of window means."""
         return errors_on_table(sources, self.table, calibration, options=options, names=names)
 
-    def diagnose(
-        self, source: BlockSource, options: CalibrationOptions, provenance: dict[str, Any]
-    ) -> DiagnosisResult:
-        """Identify the errors of the model in windows."""
-        return diagnose_recording(source, self.table, options, provenance=provenance)
+    def stored(self, source: BlockSource, options: CalibrationOptions) -> StoredRecording:
+        """Return the recording; its first pass keeps the windows."""
+        return StoredRecording.of([source], self.table, keep_windows=True)
+
+    def too_few(self, result: TableResult) -> NotObservableError:
+        """Return the error with the number of windows."""
+        return too_few_windows(len(result.gathered.spreads[0].windows))
+
+    def identify(self, result: TableResult) -> Diagnosis:
+        """Return the errors of the model in windows."""
+        return build_diagnosis(self.table, result.found, calibrated=result.solution)
+
+    def traces(
+        self, recording: StoredRecording, before: Solution, after: Solution | Calibration
+    ) -> Traces:
+        """Return the residuals of the samples in windows."""
+        return residual_traces(recording.windows, self.table, before, after=after)
 
     def inspect(
         self, source: BlockSource, lenient: BlockSource, options: CalibrationOptions

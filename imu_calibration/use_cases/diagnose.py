@@ -6,6 +6,7 @@ from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING
 
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import SampleBlock
@@ -176,4 +177,4 @@ def diagnose(
     """
     options, reference, (source,) = inputs_of([recording], table, choices)
     provenance = provenance_with('diagnose', [recording], choices, stand=table)
-    return Diagnosed(reference.diagnose(source, options, provenance))
+    return Diagnosed(diagnose_recording(source, reference, options, provenance=provenance))

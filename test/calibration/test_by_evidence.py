@@ -19,9 +19,10 @@ from imu_calibration.calibration.by_evidence import (
     extended_solution,
     stands_out,
 )
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.calibration.window_search import baseline_model
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import predict
@@ -412,7 +413,7 @@ def test_what_a_rest_may_move_biases_by():
 def diagnosed(session):
     return diagnose_recording(
         [session.block],
-        Table.from_mapping(session.table),
+        TableReference(Table.from_mapping(session.table)),
         CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW)),
     )
 

@@ -15,7 +15,7 @@ from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand
+from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand, traces_of_poses
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
@@ -77,7 +77,9 @@ def diagnose_by_hand(data, options):
     found = investigate_by_hand(data, options)
     added = tuple(question.effect.key for question in found.adopted)
     hand = solve_by_hand(data, replace(options, added=added, point=found.point_of_adopted))
-    return SimpleNamespace(diagnosis=diagnosis_by_hand(found, hand), hand=hand, search=found)
+    diagnosis = diagnosis_by_hand(found, hand)
+    traced = replace(diagnosis, traces=traces_of_poses(diagnosis.baseline, diagnosis.solution))
+    return SimpleNamespace(diagnosis=traced, hand=hand, search=found)
 
 
 def diagnosed(seed, spoil=None, n_poses=24, **options):
@@ -349,7 +351,8 @@ def test_xsens_counts_tells_no_stories(recordings):
 
     The gyroscope's answer to gravity is found and predicts.
     """
-    from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_without_table
+    from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
+    from imu_calibration.calibration.gravity_reference import GravityReference
     from imu_calibration.core.readings import RawReadings
     from imu_calibration.references.options import CalibrationOptions
     from msg_adapters.bag import open_recording
@@ -358,8 +361,8 @@ def test_xsens_counts_tells_no_stories(recordings):
         nominal=RawReadings.of_scales(32768, 415, 32768, gyroscope_scale=4770)
     )
     with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:
-        found = diagnose_without_table(
-            recording.blocks(), replace(options, gravity=9.81744)
+        found = diagnose_recording(
+            recording.blocks(), GravityReference(), replace(options, gravity=9.81744)
         ).diagnosis
     assert [f.effect for f in found.findings] == ['gyro_g_sensitivity']
     gain = found.findings[0].gain

@@ -13,7 +13,7 @@ from refusal import refused
 from test_live_calibration import assert_same, blocks
 
 from imu_calibration.calibration.calibrate import calibrate_by_evidence
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.diagnosis.live_diagnosis import (
     Answer,
     live_state_of,
@@ -22,6 +22,7 @@ from imu_calibration.calibration.diagnosis.live_diagnosis import (
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.table_calibration import TableRecordings
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.progress import LiveState, report
 from imu_calibration.core.samples import SampleBlock
@@ -66,7 +67,7 @@ def expected(hidden):
     """What the verb diagnose says of it, and hands over."""
     return diagnose_recording(
         [SampleBlock(hidden.imu, hidden.joints)],
-        Table.from_mapping(hidden.table),
+        TableReference(Table.from_mapping(hidden.table)),
         OPTIONS,
     )
 

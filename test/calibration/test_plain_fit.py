@@ -14,7 +14,7 @@ import pytest
 from scipy.signal import lfilter
 
 from imu_calibration.calibration.calibrate import conclude
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
+from imu_calibration.calibration.diagnosis.diagnose import (
     ProposedExtension,
     _with_proposals,
     helpful_formulas,

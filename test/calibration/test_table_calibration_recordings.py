@@ -7,8 +7,9 @@ One axis, ripple, stamps of whole milliseconds, an encoder of 0.088 deg, no rest
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.documents import from_text
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.kinematics.table import Table
@@ -66,7 +67,7 @@ def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
                 blocks.pop()
                 break
 
-    document = diagnose_recording(blocks, table).document
+    document = diagnose_recording(blocks, TableReference(table)).document
     effects = {finding['effect'] for finding in document['findings']}
     assert effects and effects <= {'time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter'}
     lag = sum(

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.trust import MEAN
 from imu_calibration.effects.catalogue import CATALOGUE, term
@@ -113,7 +114,7 @@ def test_the_diagnosis_names_the_slope_of_the_temperature():
     block, table = session_that_warms()
     catalogue = CATALOGUE.with_candidates('gyro_thermal_bias+gyro_bias_drift+gyro_bias_trend')
     options = CalibrationOptions(catalogue=catalogue)
-    diagnosis = diagnose_recording([block], table, options).diagnosis
+    diagnosis = diagnose_recording([block], TableReference(table), options).diagnosis
     assert not diagnosis.findings
     rest = diagnosis.unexplained['gyroscope']
     assert rest.significant and rest.correlates_with == 'temperature rate' and rest.share > 0.5

@@ -12,8 +12,9 @@ import pytest
 import yaml
 from test_hand_calibration import GRAVITY, simulate
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.kinematics.chain import reference_motion
@@ -172,7 +173,9 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
     table = Table.from_mapping(session.table)
     with open_recording(tmp_path / 'bag') as recording:
-        offline = diagnose_recording(recording.blocks(table.joint_names), table, OPTIONS)
+        offline = diagnose_recording(
+            recording.blocks(table.joint_names), TableReference(table), OPTIONS
+        )
     expected = offline.diagnosis
     first = expected.findings[0]
     with Station() as station:

@@ -7,9 +7,9 @@ from refusal import refused
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.preprocessing.exclusion import (
-    WithoutExcluded,
     EXCLUDED,
     Exclusion,
+    WithoutExcluded,
     exclusions_by_recording,
     exclusions_of_units,
     parse_exclusions,

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.table_calibration import calibrate_on_table
@@ -84,7 +84,7 @@ def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, 
 
     monkeypatch.setattr('imu_calibration.calibration.window_search.inquire', enough)
     with refused(ImuCalibrationError, 'enough'):
-        diagnose_recording(source_of(BAG, Topics(), table.joint_names), table)
+        diagnose_recording(source_of(BAG, Topics(), table.joint_names), TableReference(table))
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
+from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import DECISION, PARAMETERS
@@ -60,7 +61,7 @@ def result():
     block = SampleBlock(imu, joints)
     return diagnose_recording(
         [block],
-        TABLE,
+        TableReference(TABLE),
         CalibrationOptions(),
         provenance={'bags': [{'name': 'session', 'sha256': '0'}]},
     )

@@ -1,12 +1,10 @@
-"""Diagnosis as plain functions, on a table and by hand, and its result as lines of text."""
+"""The result of a diagnosis, and its lines of text."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.calibrate import calibrate_by_evidence, conclude
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
     Diagnosis,
@@ -17,34 +15,16 @@ from imu_calibration.calibration.diagnosis.findings import (
     IMPOSSIBLE,
     LEAVES_MOST,
     UNCERTAIN,
-    build_diagnosis,
-    diagnosis_by_hand,
 )
-from imu_calibration.calibration.diagnosis.traces import residual_traces
-from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.hand_recording import read_by_hand
-from imu_calibration.calibration.hand_workflow import calibrate_poses
-from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
-from imu_calibration.calibration.table_calibration import StoredRecording, TableRecordings
-from imu_calibration.calibration.window_observations import TableResult
-from imu_calibration.calibration.window_search import baseline_options
-from imu_calibration.core.samples import BlockSource
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.decision import HARM
 from imu_calibration.document.verdict import motion_misfits, unsteady
-from imu_calibration.effects.base import SECTIONS, UNITS, Effect, Role
+from imu_calibration.effects.base import UNITS, Effect
 from imu_calibration.effects.reference_effects import total_lags
-from imu_calibration.effects.sensor_model import BARE
-from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.references.gravity.model_selection import too_few_poses
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.gain import Gain
-from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.selection.onset import Onset
 from imu_calibration.selection.search import MIN_GAIN_NATS
-from imu_calibration.selection.unexplained import Unexplained, biases_off
+from imu_calibration.selection.unexplained import Unexplained
 
 MOST_SHOWN = 3
 """Parameters of a change that are printed."""
@@ -79,8 +59,6 @@ class DiagnosisResult:
     """As in `CalibrationResult`."""
     observations: str
     """Unit of the data: 'windows' or 'poses'."""
-    options: CalibrationOptions
-    """The requested models and settings."""
     proposed: Calibration | None = None
     """
     The calibration with the formulas proposed for the unexplained residual; None without a formula.
@@ -120,8 +98,8 @@ class DiagnosisResult:
     def session_terms(self) -> list[str]:
         """Proposed formulas that are not in extended.yaml, a line each."""
         lines = []
-        for effect in _proposed_effects(self.diagnosis):
-            if not _is_transferable(effect):
+        for effect in proposed_effects(self.diagnosis):
+            if not is_transferable(effect):
                 lines.append(
                     f'{effect.groups[0].text[0]} contains a quantity of this session (time, table):'
                     ' compensation of other recordings cannot undo it, it is left out of'
@@ -168,245 +146,6 @@ class DiagnosisResult:
         return total_lags(found.param_names, found.values, found.covariance)
 
 
-def diagnose_recording(
-    source: BlockSource,
-    table: Table,
-    options: CalibrationOptions = CalibrationOptions(),
-    *,
-    provenance: dict[str, Any] | None = None,
-) -> DiagnosisResult:
-    """
-    Calibrate a recording, identify the errors of the model and their causes, and extend it.
-
-    Parameters
-    ----------
-    source : BlockSource
-        The recording.
-    table : Table
-    options : CalibrationOptions
-        The initial model; default bias and matrix, so that every other effect is tested.
-    provenance : dict, optional
-
-    Returns
-    -------
-    DiagnosisResult
-
-    """
-    # Calibrate with the effects of the catalogue that the data support, and identify the causes.
-    recording = StoredRecording.of([source], table, keep_windows=True)
-    result = calibrate_by_evidence(
-        recording, replace(options, as_asked=False), provenance=provenance
-    )
-    if result.found is None:
-        raise too_few_windows(len(result.gathered.spreads[0].windows))
-    diagnosis = build_diagnosis(table, result.found, calibrated=result.solution)
-
-    # The formulas of the residual join the model.
-    formulas = _formula_models(
-        replace(recording, keep_windows=False),
-        ProposedExtension(result, diagnosis, options, provenance),
-    )
-
-    # Measured against simulated, before and after.
-    traces = residual_traces(
-        recording.windows,
-        table,
-        diagnosis.baseline,
-        after=formulas.proposed or diagnosis.solution,
-    )
-    return DiagnosisResult(
-        replace(diagnosis, traces=traces),
-        result.calibration,
-        result.tolerances,
-        result.needed,
-        result.observations,
-        baseline_options(options),
-        formulas.proposed,
-        formulas.transferable,
-        formulas.unhelpful,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _FormulaModels:
-    """Calibrations of the model with formulas of the residual."""
-
-    proposed: Calibration | None
-    """With all formulas; None without one."""
-    transferable: Calibration | None
-    """With those that help and that compensation of another recording can undo."""
-    unhelpful: tuple[str, ...]
-    """Formulas that compensation could undo, but which do not help."""
-
-
-def _formula_models(recordings: TableRecordings, extension: 'ProposedExtension') -> _FormulaModels:
-    """Return the calibrations with the formulas of a diagnosis."""
-    # All of them describe this recording.
-    effects = _proposed_effects(extension.diagnosis)
-    proposed = _with_proposals(recordings, extension, effects)
-
-    # Compensation of another recording: those that it can undo, and of these the ones that help.
-    transferable = proposed
-    transferable_effects = [effect for effect in effects if _is_transferable(effect)]
-    if len(transferable_effects) < len(effects):
-        transferable = _with_proposals(recordings, extension, transferable_effects)
-    helpful = helpful_formulas(transferable_effects, transferable, extension.result.calibration)
-    if len(helpful) < len(transferable_effects):
-        transferable = _with_proposals(recordings, extension, helpful)
-    unhelpful = [effect for effect in transferable_effects if effect not in helpful]
-    return _FormulaModels(
-        proposed, transferable, tuple(effect.groups[0].text[0] for effect in unhelpful)
-    )
-
-
-def helpful_formulas(
-    effects: Sequence[Effect], extended: Calibration | None, calibration: Calibration
-) -> list[Effect]:
-    """
-    Return the formulas with which the error of their sensor on held-out windows is smaller.
-
-    It has to be clearly smaller in total, and not larger in a regime of motion, also not than that
-    of plain least squares.
-
-    Parameters
-    ----------
-    effects : sequence of Effect
-        Formulas of the extended model.
-    extended, calibration : Calibration
-        With the formulas, and without them; None without formulas.
-
-    """
-    helpful: list[Effect] = []
-    if extended is None:
-        return helpful
-    for effect in effects:
-        before = calibration.proof.get(effect.sensor)
-        after = extended.proof.get(effect.sensor)
-        if before is None or after is None:
-            continue
-        if effect.sensor in extended.statistics.get('least_squares', ()):
-            continue
-        if after.after > CLEARLY_BETTER * before.after:
-            continue
-        known = before.regimes
-        grown = [
-            name
-            for name, errors in after.regimes.items()
-            if name in known and errors.after > HARM * known[name].after
-        ]
-        if not grown:
-            helpful.append(effect)
-    return helpful
-
-
-def _is_transferable(effect: Effect) -> bool:
-    """
-    Return whether compensation of another recording can undo an effect.
-
-    Time, joints and attitude of another session are unknown to it. A model with such a formula
-    would divide the error between the formula, which is not applied, and bias and matrix.
-    """
-    return effect.compensation == 'exact'
-
-
-@dataclass(frozen=True, eq=False)
-class ProposedExtension:
-    """A diagnosed calibration whose model formulas of the residual extend."""
-
-    result: TableResult
-    """The calibration without formulas."""
-    diagnosis: Diagnosis
-    """Its unexplained residuals, which the biases may contain."""
-    options: CalibrationOptions
-    """Options of the requested model."""
-    provenance: dict[str, Any] | None = None
-    """Names, hashes and options for the document."""
-
-
-def _with_proposals(
-    recordings: TableRecordings, extension: ProposedExtension, effects: Sequence[Effect]
-) -> Calibration | None:
-    """
-    Return the calibration of the extended model with the proposed formulas `effects`.
-
-    Or None without a formula.
-    """
-    if not effects:
-        return None
-
-    # Exactly the effects of the calibration and the formulas, without a further search.
-    model = extension.result.calibration.model
-    names: dict[str, list[str]] = {section: [] for section in SECTIONS}
-    for effect in (*model.effects, *effects):
-        if effect.role is not Role.LIMIT:
-            names[effect.sensor].append(effect.name)
-    options = replace(
-        extension.options,
-        accelerometer_model='+'.join(names['accelerometer']),
-        gyroscope_model='+'.join(names['gyroscope']),
-        reference_model='+'.join(names['reference']) or 'none',
-        catalogue=model.catalogue.with_effects(*effects),
-        as_asked=True,
-    )
-    solved = recordings.solved(options)
-
-    # A formula determines changes of the output, not its zero: the biases of the affected axes may
-    # still contain the residual, and keep this uncertainty.
-    bias_changes = []
-    for change in biases_off(model, extension.diagnosis.unexplained):
-        bias_changes.append((change, 1.0))
-    widened = ModelExtension(moves=tuple(bias_changes)).applied(solved.solution)
-    return conclude(
-        replace(solved, solution=widened),
-        options,
-        provenance=extension.provenance,
-        under_test={effect.sensor for effect in effects},
-    ).calibration
-
-
-def diagnose_without_table(
-    source: BlockSource,
-    options: CalibrationOptions = CalibrationOptions(),
-    provenance: dict[str, Any] | None = None,
-) -> DiagnosisResult:
-    """
-    Calibrate a recording by hand, and extend the model by identified errors.
-
-    The errors of the model and their causes are identified, and the model is extended (see
-    `findings`).
-
-    Parameters
-    ----------
-    source : BlockSource
-        The recording.
-    options : CalibrationOptions
-        The initial model; default bias and matrix.
-    provenance : optional
-        As in `diagnose_recording`.
-
-    Returns
-    -------
-    DiagnosisResult
-
-    """
-    recording = read_by_hand(source, options.nominal, Preflight(options.gravity))
-    result = calibrate_poses(recording, replace(options, as_asked=False), provenance)
-    if result.found is None:
-        raise too_few_poses(len(result.solution.poses.start))
-    return DiagnosisResult(
-        diagnosis_by_hand(result.found, result.solution),
-        result.calibration,
-        result.tolerances,
-        result.needed,
-        result.observations,
-        replace(
-            options,
-            accelerometer_model=options.accelerometer_model or BARE,
-            gyroscope_model=options.gyroscope_model or BARE,
-        ),
-    )
-
-
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     """
     Return the findings, the unexplained residual of each sensor and the effects without a test.
@@ -423,7 +162,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
                 f' {finding.separating_motion}'
             )
     refused = strongest_refused(diagnosis)
-    if not diagnosis.findings and not _proposed_effects(diagnosis):
+    if not diagnosis.findings and not proposed_effects(diagnosis):
         lines.append(nothing_named(diagnosis))
     elif refused is not None:
         lines.append(
@@ -526,13 +265,23 @@ def _formula_lines(sensor: str, rest: Unexplained, gain: Gain | None) -> list[st
     ]
 
 
-def _proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
+def proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
     """Return the formulas of a diagnosis as effects."""
     effects: list[Effect] = []
     for rest in diagnosis.unexplained.values():
         if rest.proposal is not None:
             effects += rest.proposal.effects
     return effects
+
+
+def is_transferable(effect: Effect) -> bool:
+    """
+    Return whether compensation of another recording can undo an effect.
+
+    Time, joints and attitude of another session are unknown to it. A model with such a formula
+    would divide the error between the formula, which is not applied, and bias and matrix.
+    """
+    return effect.compensation == 'exact'
 
 
 def nothing_named(diagnosis: Diagnosis) -> str:

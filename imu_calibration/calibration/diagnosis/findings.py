@@ -501,7 +501,7 @@ def _with_residuals(hand: HandCalibration) -> HandCalibration:
     )
 
 
-def _traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
+def traces_of_poses(baseline: HandCalibration, hand: HandCalibration) -> Traces:
     """
     Return the `Traces` of two calibrations.
 
@@ -530,7 +530,9 @@ def _traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
 
 def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     """
-    Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings.
+    Return the result of an investigation as a Diagnosis, without traces.
+
+    `hand` is a calibration with all findings.
     """
     problem = found.problem
     named = list(found.named)
@@ -568,5 +570,4 @@ def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagno
         gain,
         count,
         count if named else 0,
-        _traces_of(found.baseline, hand),
     )
