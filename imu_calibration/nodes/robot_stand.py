@@ -179,7 +179,7 @@ def chain_of(
         When a file cannot be used, the description is none, or the link is not on it.
 
     """
-    place = None if table_file in NO_TABLE else files.user_path(table_file)
+    place = _path_of(table_file)
     if not robot.urdf_file:
         if place is None:
             return None
@@ -204,18 +204,20 @@ def live_reference(
     node: Node, robot: RobotSettings, table_file: str, **known: Any
 ) -> 'MotionReference':
     """Return the reference that a node's parameters describe; arguments as for `chain_of`."""
-    # Here, because simulator_node does not need them.
-    from imu_calibration.calibration.gravity_reference import GravityReference
-    from imu_calibration.calibration.table_reference import TableReference
+    # Here, because simulator_node does not need it.
+    from imu_calibration.use_cases.references import reference_of
 
-    table = chain_of(node, robot, table_file, **known)
-    return GravityReference() if table is None else TableReference(table)
+    return reference_of(chain_of(node, robot, table_file, **known))
 
 
 def stand_path(robot: RobotSettings, table_file: str) -> Path | None:
     """Return the file of the arm or the table, None without one."""
-    stand = robot.urdf_file or table_file
-    return None if stand in NO_TABLE else files.user_path(stand)
+    return _path_of(robot.urdf_file or table_file)
+
+
+def _path_of(file: str) -> Path | None:
+    """Return the path that a parameter names, None for none."""
+    return None if file in NO_TABLE else files.user_path(file)
 
 
 def joint_topics(robot: RobotSettings, table_file: str) -> list[str]:

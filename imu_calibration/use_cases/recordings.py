@@ -114,6 +114,23 @@ class RecordingFile:
     quiet: bool = False
     """Whether no progress is reported."""
 
+    def open(self) -> Recording:
+        """
+        Return the recording, to be closed.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, or a topic is missing.
+
+        """
+        return open_recording(
+            existing(self.path),
+            **self.topics.chosen(),
+            want_joints=self.want_joints,
+            want_temperature=self.want_temperature,
+        )
+
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield the blocks and report the progress."""
         gyroscope = self.topics.gyroscope
@@ -121,12 +138,7 @@ class RecordingFile:
             of_force = replace(self, topics=self.topics._replace(gyroscope=None), quiet=True)
             yield _with_gyroscope(list(of_force), self.path, gyroscope)
             return
-        recording = open_recording(
-            self.path,
-            **self.topics.chosen(),
-            want_joints=self.want_joints,
-            want_temperature=self.want_temperature,
-        )
+        recording = self.open()
         advance = counter(
             f'reading {files.name_of_path(self.path)}',
             0 if self.quiet else recording.message_counts.get(recording.imu_topic, 0),

@@ -11,9 +11,9 @@ from imu_calibration.core.samples import BlockSource, SampleBlock
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
 from imu_calibration.use_cases.recordings import (
+    RecordingFile,
     Stand,
     Topics,
-    open_bag,
     source_of,
     sources_without,
     table_of,
@@ -84,9 +84,8 @@ def inputs_of(
         )
     options, topics = calibration_options(choices), topics_of(choices)
     reference = reference_of(stand, recordings, topics, options=options)
-    names = reference.joint_names
-    for path in recordings:
-        if not isinstance(path, SampleBlock):
-            open_bag(path, topics, want_joints=names is not None).close()
-    sources = [source_of(item, topics, names) for item in recordings]
+    sources = [source_of(item, topics, reference.joint_names) for item in recordings]
+    for source in sources:
+        if isinstance(source, RecordingFile):
+            source.open().close()
     return Inputs(options, reference, sources_without(sources, recordings, choices.get('exclude')))
