@@ -30,8 +30,9 @@ from imu_calibration.core.schema import (
 from imu_calibration.document.calibration import Calibration, with_nominal
 from imu_calibration.document.decision import HARMS, SensorDecision
 from imu_calibration.document.proof_entry import ProofEntry
-from imu_calibration.effects.base import AXES, SECTIONS, SENSORS, Effect, Role
+from imu_calibration.effects.base import AXES, INPUT_OF, SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
+from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import Status
 from imu_calibration.kinematics.joint import JointNames
@@ -305,7 +306,7 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
         for group, value in (entry.get('centre') or {}).items():
             offset = np.asarray(value, float)
             slope = np.asarray(slopes.get(group, np.zeros((len(offset), 3))), float)
-            centre[group] = np.column_stack([offset, slope])
+            centre[group] = ColumnCentre(offset, slope, INPUT_OF[effect.sensor])
     terms = {}
     for name, variance in (document.get('covariance_terms') or {}).items():
         terms[str(name)] = np.asarray(variance, float)[order]
@@ -462,8 +463,10 @@ def _section(calibration: Calibration, section: str) -> dict[str, Any]:
             if group.name in calibration.model.centre
         }
         if centre:
-            entries[effect.name]['centre'] = plain({name: c[:, 0] for name, c in centre.items()})
-        slopes = {name: each[:, 1:] for name, each in centre.items() if np.any(each[:, 1:])}
+            entries[effect.name]['centre'] = plain(
+                {name: part.constant for name, part in centre.items()}
+            )
+        slopes = {name: part.slope for name, part in centre.items() if np.any(part.slope)}
         if slopes:
             entries[effect.name]['centre_slope'] = plain(slopes)
         reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]

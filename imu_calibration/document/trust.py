@@ -17,7 +17,8 @@ from imu_calibration.document.calibration import (
 )
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, reason_of
 from imu_calibration.document.outcome import missing
-from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
+from imu_calibration.effects.base import INPUT_OF, SENSORS, UNITS, Effect, Role
+from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulated_rows import AccumulatedRows
@@ -91,104 +92,124 @@ def uncorrected_on_table(
 
     """
     latest = latest or model
-    counts, end = np.array([row.count for row in accumulator.rows], float), end_of(accumulator)
-    centre: dict[str, np.ndarray] = {}
+    end = end_of(accumulator)
+    # A time constant changes the columns, which were gathered at another one.
+    gathered_at = {e.name: gathered.point_of(e) for e in model.effects if e.time_constant}
+    at_columns = replace(model, point=model.point | gathered_at)
+    centre: dict[str, ColumnCentre] = {}
     sizes = []
-    at_columns = replace(
-        model,
-        point=model.point
-        | {e.name: gathered.point_of(e) for e in model.effects if e.time_constant},
-    )
     for effect in not_applied(model):
-        squares, at_end = np.zeros(3), has_settled(latest, effect, end)
+        at_end = has_settled(latest, effect, end)
+        true_input = gathered.columns_of(effect.sensor, Role.LINEAR)
+        samples = _Samples.of(accumulator, effect.sensor, true_input)
+        squares = np.zeros(3)
         for group in effect.groups:
-            rows, own = (
-                gathered.layout(effect.sensor).rows[group.name],
-                model.layout(effect.sensor).rows[group.name],
-            )
-            true_input = gathered.columns_of(effect.sensor, Role.LINEAR)
-            means = np.array([row.sensors[effect.sensor].mean for row in accumulator.rows])
-            within = [
-                factor
-                for (sensor, _), factor in accumulator.within.items()
-                if sensor == effect.sensor
-            ]
+            columns = gathered.layout(effect.sensor).rows[group.name]
+
+            # The constant part: the value at the end, or the part that bias and matrix describe.
             if at_end:
-                column = columns_at(model, effect, [end])[group.name][0]
-                centre[group.name] = _without_slope(column)
+                at_last = columns_at(model, effect, [end])[group.name][0]
+                of_group = _constant(effect, at_last)
             else:
-                centre[group.name] = _moved(
-                    effect,
-                    _projection(effect, rows, true_input, counts, means, within),
-                    values[model.slices[effect.key]] - gathered.point_of(effect),
-                )
-            applied = centre[group.name].T @ coefficients(model, effect.sensor, values)[own]
+                change = values[model.slices[effect.key]] - gathered.point_of(effect)
+                of_group = _moved(effect, _projection(effect, columns, samples), change)
+            centre[group.name] = of_group
+
+            # The output of the effect less that of this part.
+            own = model.layout(effect.sensor).rows[group.name]
+            applied = coefficients(model, effect.sensor, values)[own]
             value = coefficients(at_columns, effect.sensor, values)[own]
-            rest = means[:, rows] @ value - applied[0] - means[:, true_input] @ applied[1:]
-            squares += counts @ rest**2
-            for factor in within:
-                rest = factor[:, rows] @ value - factor[:, true_input] @ applied[1:]
-                squares += (rest**2).sum(axis=0)
-        sizes.append(_size(effect, np.sqrt(squares / counts.sum()), at_end))
+            squares += samples.squares_without(columns, value, of_group, applied)
+        sizes.append(_size(effect, np.sqrt(squares / samples.counts.sum()), at_end))
     return Uncorrected(centre, tuple(sizes))
 
 
-def _without_slope(columns: np.ndarray) -> np.ndarray:
-    """Return the `Centre` of a group of columns, shape (width,), in which the bias has its part."""
-    return np.column_stack([columns, np.zeros((len(columns), 3))])
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """The columns of one sensor in all windows: means, and factors of the rows about them."""
+
+    counts: np.ndarray
+    """Samples of each window, shape (n_windows,)."""
+    means: np.ndarray
+    """Mean rows of the windows, shape (n_windows, n_columns + 3)."""
+    within: list[np.ndarray]
+    """Factors of the rows about these means, each shape (k, n_columns + 3)."""
+    true_input: slice
+    """Columns of the true input."""
+
+    @classmethod
+    def of(cls, accumulator: AccumulatedRows, sensor: str, true_input: slice) -> '_Samples':
+        """Return the columns of a sensor in the windows of an accumulator."""
+        counts = np.array([row.count for row in accumulator.rows], float)
+        means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
+        within = []
+        for (owner, _), factor in accumulator.within.items():
+            if owner == sensor:
+                within.append(factor)
+        return cls(counts, means, within, true_input)
+
+    def squares_without(
+        self, columns: slice, value: np.ndarray, part: ColumnCentre, applied: np.ndarray
+    ) -> np.ndarray:
+        """
+        Return the sums of squares of the output of an effect less that of the constant part.
+
+        Shape (3,). Coefficients of each axis: `value` of the columns, `applied` of the part, both
+        shape (width, 3).
+        """
+        constant = part.constant @ applied
+        slope = part.slope.T @ applied
+        rest = self.means[:, columns] @ value - constant - self.means[:, self.true_input] @ slope
+        squares = self.counts @ rest**2
+        for factor in self.within:
+            rest = factor[:, columns] @ value - factor[:, self.true_input] @ slope
+            squares += (rest**2).sum(axis=0)
+        return squares
 
 
-def _projection(
-    effect: Effect,
-    rows: slice,
-    true_input: slice,
-    counts: np.ndarray,
-    means: np.ndarray,
-    within: Sequence[np.ndarray],
-) -> np.ndarray:
+def _constant(effect: Effect, columns: np.ndarray) -> ColumnCentre:
+    """Return the part of columns, shape (width,), that are constant."""
+    return ColumnCentre(columns, np.zeros((len(columns), 3)), INPUT_OF[effect.sensor])
+
+
+def _projection(effect: Effect, columns: slice, samples: _Samples) -> ColumnCentre:
     """
-    Return the part of the columns of an effect that bias and matrix describe, shape (width, 4).
+    Return the part of the columns of an effect that bias and matrix describe.
 
-    It minimises the squares of ``column - centre[0] - centre[1:] @ true`` over all samples. An
-    effect in time only is no function of the motion: its mean is the value in another session.
-
-    Parameters
-    ----------
-    effect : Effect
-    rows, true_input : slice
-        Columns of the effect, and of the true input of its sensor.
-    counts : array, shape (n_windows,)
-        Samples of each window.
-    means : array, shape (n_windows, n_columns + 3)
-        Mean rows of the windows.
-    within : sequence of array, shape (k, n_columns + 3)
-        Factors of the rows about these means.
-
+    It minimises the squares of ``column - constant - slope @ true`` over all samples. An effect in
+    time only is no function of the motion: its mean is the value in another session.
     """
-    mean = counts @ means / counts.sum()
-    slope = np.zeros((rows.stop - rows.start, 3))
+    counts, true_input = samples.counts, samples.true_input
+    mean = counts @ samples.means / counts.sum()
+    slope = np.zeros((columns.stop - columns.start, 3))
     if not in_time(effect):
-        about_mean = np.sqrt(counts)[:, None] * (means - mean)
-        stacked = np.concatenate([about_mean, *within])
-        inputs, columns = stacked[:, true_input], stacked[:, rows]
+        about_mean = np.sqrt(counts)[:, None] * (samples.means - mean)
+        stacked = np.concatenate([about_mean, *samples.within])
+        inputs = stacked[:, true_input]
         # Directions in which the sensor had no input have no slope.
         power, directions = np.linalg.eigh(inputs.T @ inputs / counts.sum())
         directions = directions[:, power > LEAST_INPUT[effect.sensor] ** 2]
         along = inputs @ directions
-        slope = (directions @ np.linalg.lstsq(along, columns, rcond=None)[0]).T
-    return np.column_stack([mean[rows] - slope @ mean[true_input], slope])
+        slope = (directions @ np.linalg.lstsq(along, stacked[:, columns], rcond=None)[0]).T
+    constant = mean[columns] - slope @ mean[true_input]
+    return ColumnCentre(constant, slope, INPUT_OF[effect.sensor])
 
 
-def _moved(effect: Effect, columns: np.ndarray, change: np.ndarray) -> np.ndarray:
+def _moved(effect: Effect, part: ColumnCentre, change: np.ndarray) -> ColumnCentre:
     """
-    Return columns at parameters that differ by `change` from the point of the columns.
+    Return the part at parameters that differ by `change` from the point of the columns.
 
-    Of a time constant, to first order.
+    Of a time constant, to first order: the second half of its columns are the derivatives.
     """
     if not effect.time_constant:
-        return columns
-    plain, slopes = np.split(columns, 2)
-    return np.concatenate([plain + change[-1] * slopes, slopes])
+        return part
+    constant, constant_by_tau = np.split(part.constant, 2)
+    slope, slope_by_tau = np.split(part.slope, 2)
+    return replace(
+        part,
+        constant=np.concatenate([constant + change[-1] * constant_by_tau, constant_by_tau]),
+        slope=np.concatenate([slope + change[-1] * slope_by_tau, slope_by_tau]),
+    )
 
 
 def uncorrected_in_time(
@@ -205,15 +226,16 @@ def uncorrected_in_time(
     `latest` as for `uncorrected_on_table`.
     """
     latest = latest or model
-    centre, sizes = {}, []
+    centre: dict[str, ColumnCentre] = {}
+    sizes = []
     for effect in not_applied(model):
         at_end, at_times = has_settled(latest, effect, end), columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
         for name, columns in applied.items():
-            centre[name] = _without_slope(columns.mean(axis=0))
+            centre[name] = _constant(effect, columns.mean(axis=0))
         rows = model.layout(effect.sensor).rows
         rest = sum(
-            (at_times[name] - centre[name][:, 0])
+            (at_times[name] - centre[name].constant)
             @ coefficients(model, effect.sensor, values)[rows[name]]
             for name in at_times
         )

@@ -390,6 +390,26 @@ COMPLEX_STEP = 1e-30
 """Complex step of the derivative by a time constant."""
 
 
+@dataclass(frozen=True, eq=False)
+class ColumnCentre:
+    """
+    The part of a group of columns that bias and matrix describe: ``constant + slope @ true``.
+
+    For effects that compensation cannot undo.
+    """
+
+    constant: np.ndarray
+    """Part of the bias, shape (width,)."""
+    slope: np.ndarray
+    """Part of the matrix, per unit of the true input, shape (width, 3)."""
+    true_input: str
+    """Field of a `Reference` with the true input of the sensor."""
+
+    def at(self, ref: Reference) -> np.ndarray:
+        """Return this part of the columns, shape (n, width)."""
+        return self.constant + getattr(ref, self.true_input) @ self.slope.T
+
+
 @dataclass(frozen=True)
 class ColumnGroup:
     """
@@ -457,7 +477,7 @@ class ColumnGroup:
             The true motion.
         point : dict
             'temperature_ref_c', effect name -> values where columns depend on them, 'centre': group
-            -> field of the true input and `Centre` to subtract (``SensorModel.full_point``).
+            -> `ColumnCentre` to subtract (``SensorModel.full_point``).
 
         Raises
         ------
@@ -484,8 +504,7 @@ class ColumnGroup:
                 if self.width > count:
                     result[:, count + k] = np.imag(column) / COMPLEX_STEP
         if self.name in point.get('centre', ()):
-            true_input, centre = point['centre'][self.name]
-            result -= centre[:, 0] + getattr(ref, true_input) @ centre[:, 1:].T
+            result -= point['centre'][self.name].at(ref)
         if self._may_fail and not np.all(np.isfinite(result)):
             raise InputError(
                 f"the columns of '{self.name}' must be finite in the whole recording,"

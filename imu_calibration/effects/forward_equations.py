@@ -9,6 +9,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import INPUT_OF, SENSORS, Effect, Lag, Role
+from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion, shifted
@@ -434,12 +435,8 @@ def sensor_output(
     return columns_at_point(model, sensor, ref) @ coefficients_at_point(model, sensor, values)
 
 
-Centre = Mapping[str, np.ndarray]
-"""
-Column group -> the part of its columns that bias and matrix describe, for effects that compensation
-cannot undo: ``column ~ centre[0] + centre[1:] @ true``, shape (width, 4). `true` is the input of
-the sensor.
-"""
+Centre = Mapping[str, ColumnCentre]
+"""Column group -> the part of its columns that bias and matrix describe."""
 
 
 def not_applied(model: SensorModel) -> list[Effect]:
@@ -470,11 +467,11 @@ def centred(
     """
     Return (values, their derivative by the given ones) for centred columns.
 
-    With ``column = centre[0] + centre[1:] @ true + rest`` the output is that of a changed bias and
+    With ``column = constant + slope @ true + rest`` the output is that of a changed bias and
     matrix, and of the rest::
 
         bias_i + matrix_ij true_j + column value_i
-            = (bias_i + centre[0] value_i) + (matrix_ij + centre[1+j] value_i) true_j + rest value_i
+            = (bias_i + constant value_i) + (matrix_ij + slope_j value_i) true_j + rest value_i
 
     Parameters
     ----------
@@ -492,16 +489,16 @@ def centred(
         for group in effect.groups:
             if group.name not in centre:
                 continue
-            at_centre = centre[group.name]
+            of_group = centre[group.name]
             rows = model.layout(sensor).rows[group.name]
-            change = at_centre.T @ coefficients(model, sensor, values)[rows]
-            slopes = coefficient_jacobian(model, sensor, values)[rows]
-            change_slope = np.einsum('qk,qan->akn', at_centre, slopes)
-            moved[bias] += change[0]
-            slope[bias] += change_slope[:, 0]
-            if np.any(at_centre[:, 1:]):
-                moved[matrix] += change[1:].T.ravel()
-                slope[matrix] += change_slope[:, 1:].reshape(9, -1)
+            of_axes = coefficients(model, sensor, values)[rows]
+            derivative = coefficient_jacobian(model, sensor, values)[rows]
+            moved[bias] += of_group.constant @ of_axes
+            slope[bias] += np.einsum('q,qan->an', of_group.constant, derivative)
+            if np.any(of_group.slope):
+                moved[matrix] += (of_axes.T @ of_group.slope).ravel()
+                of_matrix = np.einsum('qk,qan->akn', of_group.slope, derivative)
+                slope[matrix] += of_matrix.reshape(9, -1)
     return moved, slope
 
 

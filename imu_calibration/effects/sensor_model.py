@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import INPUT_OF, SECTIONS, SENSORS, Effect, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
+from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 
@@ -146,8 +147,8 @@ class SensorModel:
     """
     catalogue: Catalogue = CATALOGUE
     """Where the effects are declared."""
-    centre: dict = field(default_factory=dict)
-    """Column group -> what its columns are measured from (`effects.forward_equations.Centre`)."""
+    centre: dict[str, ColumnCentre] = field(default_factory=dict)
+    """Column group -> the part that is subtracted from its columns."""
 
     def __post_init__(self):
         object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))
@@ -429,12 +430,7 @@ class SensorModel:
         settling = {e.name: self.point_of(e) for e in self.effects if e.time_constant}
         point = {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c}
         if self.centre:
-            point['centre'] = {
-                group.name: (INPUT_OF[effect.sensor], self.centre[group.name])
-                for effect in self.effects
-                for group in effect.groups
-                if group.name in self.centre
-            }
+            point['centre'] = self.centre
         return point
 
 

@@ -19,6 +19,7 @@ from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.trust import END, MEAN, caveats
 from imu_calibration.effects.catalogue import CATALOGUE, term
+from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.forward_equations import centred, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import Reference
@@ -183,8 +184,10 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
     assert calibration.proof['gyroscope'].after < 0.2 * DEG
     again = calibration_from_text(calibration_to_text(calibration))
     np.testing.assert_array_equal(
-        again.model.centre['gyro_warm_up'], calibration.model.centre['gyro_warm_up']
+        again.model.centre['gyro_warm_up'].constant,
+        calibration.model.centre['gyro_warm_up'].constant,
     )
+    assert not calibration.model.centre['gyro_warm_up'].slope.any()
     ref_start, ref_end = (model_output(again, time) for time in (0.0, duration))
     np.testing.assert_allclose(ref_end, bias, atol=1e-3 * DEG)
     np.testing.assert_allclose(ref_start - ref_end, at_start - at_end, atol=0.1 * DEG)
@@ -243,7 +246,8 @@ def test_a_centred_model_has_the_output_of_the_model():
         gyroscope=('bias', 'matrix', 'own'), catalogue=CATALOGUE.with_effects(effect)
     )
     values = rng.normal(size=len(model.param_names))
-    centre = {'own': rng.normal(size=(3, 4))}
+    parts = ColumnCentre(rng.normal(size=3), rng.normal(size=(3, 3)), 'rate_s')
+    centre = {'own': parts}
     motion = [rng.normal(size=(9, 3)) for _ in range(3)]
     ref = Reference(np.arange(9.0), rng.normal(size=(9, 3, 3)), *motion, 9.8)
 
@@ -290,10 +294,10 @@ def test_a_scale_that_settles_is_applied_as_its_mean_over_the_motion():
     np.testing.assert_allclose(
         calibration.value('gyroscope', 'settling_scale'), 0.02, rtol=0, atol=4e-4
     )
-    stored = calibration_from_text(calibration_to_text(calibration)).model.centre
-    np.testing.assert_allclose(
-        stored['settling_scale'], calibration.model.centre['settling_scale'], rtol=1e-9
-    )
+    stored = calibration_from_text(calibration_to_text(calibration)).model.centre['settling_scale']
+    centre = calibration.model.centre['settling_scale']
+    np.testing.assert_allclose(stored.constant, centre.constant, rtol=1e-9)
+    np.testing.assert_allclose(stored.slope, centre.slope, rtol=1e-9)
 
 
 def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
@@ -329,7 +333,7 @@ def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     assert np.abs(calibration.value('gyroscope', 'bias') - truth).max() < 0.01 * DEG
     assert calibration.proof['gyroscope'].after < 0.05 * DEG
     part = calibration.model.slices['gyroscope', 'by_angle']
-    mean_column = calibration.model.centre['by_angle'][:, 0]
+    mean_column = calibration.model.centre['by_angle'].constant
     np.testing.assert_allclose(
         calibration.value('gyroscope', 'bias') - uncentred,
         mean_column * calibration.values[part],

@@ -1,6 +1,6 @@
 """Gain of an extension of the model: errors of the corrected readings of held-out windows."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -19,6 +19,7 @@ from imu_calibration.document.trust import (
 )
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import (
+    Centre,
     References,
     applied_values,
     not_applied,
@@ -236,7 +237,7 @@ def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Si
     values = model.start_from(gathered, problem.values(chosen))
     model = model.at(values)
     latest = latest_settling(model, values, _sd_of(problem, model, chosen))
-    centre: Mapping[str, np.ndarray] = {}
+    centre: Centre = {}
     if not_applied(model):
         accumulator = problem.recording.accumulated(gathered)
         uncorrected = uncorrected_on_table(
