@@ -173,14 +173,15 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
         return ()
     weight = _weights_of_kinds(windows, design)
     design, measured = design * weight[:, None], windows.measured * weight[:, None]
-    solved, _, rank, _ = np.linalg.lstsq(design, measured, rcond=1e-6)
-    if rank < design.shape[1]:
+    left, singular, right = np.linalg.svd(design, full_matrices=False)
+    if singular[-1] <= 1e-6 * singular[0]:
         return ()
     # The windows differ in length and motion, so that their variances are not equal. With the
     # solution K = G w, sd(K)^2 = sum_k G_k^2 (e_k / (1 - h_k))^2, h_k the leverage (HC3 of
     # MacKinnon and White 1985).
-    gain = np.linalg.pinv(design, rcond=1e-6)
-    leverage = np.einsum('ki,ik->k', design, gain)
+    gain = (right.T / singular) @ left.T
+    solved = gain @ measured
+    leverage = (left**2).sum(axis=1)
     residual = (measured - design @ solved) / np.maximum(1.0 - leverage, 1e-3)[:, None]
     dependence = solved[:3].T
     dependence_sd = np.sqrt(gain[:3] ** 2 @ residual**2).T
