@@ -112,7 +112,7 @@ def conclude(
     applied = with_plain_fits(solution, fits)
 
     # Parameters that are not determined, each with the motion or knowledge that determines it.
-    statistics = data.statistics(applied)
+    statistics = data.statistics(applied).to_mapping()
     needs = data.needs(applied, tolerances, quality={**statistics, **changes.to_mapping()})
 
     calibration = document(

@@ -8,11 +8,16 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 import imu_calibration
-from imu_calibration.core.documents import finite
+from imu_calibration.calibration.mount_check import common_turn_deg
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.reference_texts import MOUNT_AXES
+from imu_calibration.document.statistics import (
+    AttitudeScatter,
+    RecordingStatistics,
+    SensorEntry,
+)
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import incomplete_windows, judged
 from imu_calibration.effects.base import SENSORS, Role
@@ -379,44 +384,43 @@ def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
     )
 
 
-def statistics(solution: Solution, gathered: SessionData) -> dict:
-    """Return the statistics section: noise, residuals, chi-square, windows, dropped samples."""
-    result = {}
+def statistics(solution: Solution, gathered: SessionData) -> RecordingStatistics:
+    """Return the statistics of windows: noise, residuals, chi-square, dropped samples."""
+    sensors = {}
     for sensor, noise in solution.noise.items():
-        result[sensor] = {
-            'noise_sd': noise.white_sd,
-            'low_frequency_factor': noise.inflation,
-            'between_window_sd': noise.offset_sd,
-            'wander_sd': float(np.sqrt(noise.bias_variance)),
-            'wander_time_s': noise.bias_time,
-            'residual_rms_moving': finite(solution.residual_rms[sensor][0]),
-            'residual_rms_window_means': solution.residual_rms[sensor][1],
-            'chi2_per_dof': solution.chi2_per_dof[sensor],
-            'slow_over_fast': solution.slow_over_fast.get(sensor, {}),
-        }
+        attitude = None
         if sensor in solution.attitude:
             dependence = solution.attitude[sensor]
-            result[sensor]['attitude'] = {
-                'variance_ratio': dependence.ratio,
-                'p_value': dependence.p_value,
-            }
-        if sensor in solution.session_biases:
-            result[sensor] |= {
-                'between_recordings_sd': noise.session_sd,
-                'bias_of_recordings': solution.session_biases[sensor],
-            }
-        if noise.left_out:
-            result[sensor]['left_out_s'] = [time for _, time in sorted(noise.left_out)]
-    if solution.not_believed:
-        result['not_believed'] = dict(solution.not_believed)
+            attitude = AttitudeScatter(variance_ratio=dependence.ratio, p_value=dependence.p_value)
+        has_biases = sensor in solution.session_biases
+        moving, of_means = solution.residual_rms[sensor]
+        sensors[sensor] = SensorEntry(
+            noise_sd=noise.white_sd,
+            low_frequency_factor=noise.inflation,
+            between_window_sd=noise.offset_sd,
+            wander_sd=float(np.sqrt(noise.bias_variance)),
+            wander_time_s=float('nan') if noise.bias_time is None else noise.bias_time,
+            residual_rms_moving=moving,
+            residual_rms_window_means=of_means,
+            chi2_per_dof=solution.chi2_per_dof[sensor],
+            slow_over_fast=solution.slow_over_fast.get(sensor, {}),
+            attitude=attitude,
+            between_recordings_sd=noise.session_sd if has_biases else None,
+            bias_of_recordings=solution.session_biases.get(sensor),
+            left_out_s=[time for _, time in sorted(noise.left_out)] or None,
+        )
     accumulator = gathered.accumulator
-    result['windows'] = dict(sorted(accumulator.windows.items()))
-    result['samples_used'] = dict(sorted(accumulator.samples.items()))
-    result['dropped'] = dropped(gathered.counts)
-    result['stream'] = {
-        key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']
-    }
-    return result
+    lost = dropped(gathered.counts)
+    return RecordingStatistics(
+        sensors=sensors,
+        not_believed=solution.not_believed or None,
+        windows=dict(sorted(accumulator.windows.items())),
+        samples_used=dict(sorted(accumulator.samples.items())),
+        dropped=lost,
+        stream={key: n for key, n in sorted(gathered.counts.items()) if key not in lost},
+        common_turn_deg=common_turn_deg(solution),
+        unusable_sensors=gathered.unusable or None,
+    )
 
 
 def conditions(gathered: SessionData, gravity: float) -> dict:

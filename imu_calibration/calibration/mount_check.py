@@ -117,12 +117,12 @@ def common_turn(solution: Solution) -> CommonTurn | None:
     return CommonTurn(common, vector, bool(agreed), sd, freedom)
 
 
-def turn_entry(solution: Solution) -> dict[str, list[float]]:
-    """Return the entry of the statistics: the rotation vector of the common turn in degrees."""
+def common_turn_deg(solution: Solution) -> list[float] | None:
+    """Return the rotation vector of the common turn for the statistics, deg; None without one."""
     turn = common_turn(solution)
     if turn is None:
-        return {}
-    return {'common_turn_deg': [round(float(value), 4) for value in turn.vector / DEG]}
+        return None
+    return [round(float(value), 4) for value in turn.vector / DEG]
 
 
 def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]:

@@ -1,6 +1,6 @@
 """Poses and turns of a calibration by hand, with the errors that they have before and after."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -22,6 +22,7 @@ from imu_calibration.calibration.result import (
     Needs,
     WindowErrors,
 )
+from imu_calibration.document.statistics import RecordingStatistics, SensorEntry
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.effects.base import Role
 from imu_calibration.preprocessing.joint_checks import check_force
@@ -136,15 +137,32 @@ class PoseObservations:
         """Return the errors that compensation leaves uncorrected."""
         return uncorrected_by_hand(solution)
 
-    def statistics(self, solution: HandCalibration) -> dict[str, Any]:
+    def statistics(self, solution: HandCalibration) -> RecordingStatistics:
         """Return the statistics of poses and turns, noise and scatter."""
-        recording = self.recording
-        found = _statistics(solution, self.gathered.counts, len(recording.imu))
-        if recording.unusable:
-            found['unusable_sensors'] = dict(recording.unusable)
-        if recording.delay is not None:
-            found['gyroscope_delay'] = recording.delay.to_mapping()
-        return found
+        by_hand = solution.statistics
+        delay = self.recording.delay
+        return RecordingStatistics(
+            sensors={
+                'accelerometer': SensorEntry(
+                    noise_sd=[float(sd) for sd in by_hand['force_noise_sd']],
+                    between_window_sd=float(by_hand['pose_scatter_sd']),
+                    between_window_dof=float(by_hand['pose_dof']),
+                    wander_sd=0.0,
+                ),
+                'gyroscope': SensorEntry(
+                    noise_sd=[float(sd) for sd in by_hand['rate_noise_sd']],
+                    between_window_sd=float(by_hand['drift_scatter_sd']),
+                    between_window_dof=float(by_hand['drift_dof']),
+                    wander_sd=0.0,
+                ),
+            },
+            windows={'static': by_hand.get('poses', 0), 'turns': by_hand.get('turns', 0)},
+            samples_used={'all': len(self.recording.imu)},
+            by_hand=by_hand,
+            dropped={reason: int(n) for reason, n in sorted(self.gathered.counts.items())},
+            unusable_sensors=self.recording.unusable or None,
+            gyroscope_delay=None if delay is None else delay.to_mapping(),
+        )
 
     def needs(
         self, solution: HandCalibration, tolerances: np.ndarray, *, quality: dict[str, Any]
@@ -223,29 +241,3 @@ class PoseObservations:
                 'gravity': f'gravity {known} to {relative * result.gravity:.2g} m/s²',
             },
         )
-
-
-def _statistics(
-    hand: HandCalibration, counts: Mapping[str, int], n_samples: int
-) -> dict[str, dict[str, Any]]:
-    """Return the statistics in the form of the document, with the names of a table's."""
-    by_hand = hand.statistics
-    keys = {
-        'accelerometer': ('force_noise_sd', 'pose_scatter_sd', 'pose_dof'),
-        'gyroscope': ('rate_noise_sd', 'drift_scatter_sd', 'drift_dof'),
-    }
-    of_sensors = {}
-    for sensor, (noise, scatter, dof) in keys.items():
-        of_sensors[sensor] = {
-            'noise_sd': [float(sd) for sd in by_hand[noise]],
-            'between_window_sd': float(by_hand[scatter]),
-            'between_window_dof': float(by_hand[dof]),
-            'wander_sd': 0.0,
-        }
-    return {
-        **of_sensors,
-        'windows': {'static': by_hand.get('poses', 0), 'turns': by_hand.get('turns', 0)},
-        'samples_used': {'all': n_samples},
-        'by_hand': by_hand,
-        'dropped': {reason: int(count) for reason, count in sorted(counts.items())},
-    }

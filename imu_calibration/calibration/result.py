@@ -15,6 +15,7 @@ from imu_calibration.calibration.from_solution import Estimate
 from imu_calibration.calibration.held_out_data import HeldOutData, PlainFit
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import Verdict
+from imu_calibration.document.statistics import RecordingStatistics
 from imu_calibration.document.trust import Uncorrected, usage
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
@@ -145,8 +146,8 @@ class Observations(Protocol[Estimate]):
     def uncorrected(self, solution: Estimate) -> Uncorrected:
         """Return the errors that compensation leaves uncorrected."""
 
-    def statistics(self, solution: Estimate) -> dict[str, Any]:
-        """Return the statistics of the document."""
+    def statistics(self, solution: Estimate) -> RecordingStatistics:
+        """Return the statistics of the recordings and of a solution."""
 
     def needs(
         self, solution: Estimate, tolerances: np.ndarray, *, quality: dict[str, Any]

@@ -32,6 +32,7 @@ from imu_calibration.calibration.result import (
 )
 from imu_calibration.calibration.window_search import search_windows
 from imu_calibration.core.units import ARCMIN
+from imu_calibration.document.statistics import RecordingStatistics
 from imu_calibration.document.trust import Uncorrected, latest_settling, uncorrected_on_table
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import (
@@ -391,12 +392,9 @@ class WindowObservations:
             latest=latest_settling(solution.model, values, solution.sd),
         )
 
-    def statistics(self, solution: Solution) -> dict[str, Any]:
+    def statistics(self, solution: Solution) -> RecordingStatistics:
         """Return the statistics of windows, noise and residuals, and the common turn."""
-        found = statistics(solution, self.gathered) | mount_check.turn_entry(solution)
-        if self.gathered.unusable:
-            found['unusable_sensors'] = dict(self.gathered.unusable)
-        return found
+        return statistics(solution, self.gathered)
 
     def needs(
         self, solution: Solution, tolerances: np.ndarray, *, quality: dict[str, Any]

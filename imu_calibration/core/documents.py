@@ -10,6 +10,7 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from errno import EINVAL
 from functools import cache
 from os import PathLike
@@ -54,6 +55,32 @@ Deepest nesting of lists and mappings; the stack of a recursive parser overflows
 def finite(value: float) -> float | None:
     """Return a float, or None for an infinite value or NaN, which documents do not contain."""
     return float(value) if math.isfinite(value) else None
+
+
+def stated(entry: Any) -> dict[str, Any]:
+    """
+    Return the fields of a dataclass as the entry of a document, also in its fields and mappings.
+
+    Without fields that are None, False or ''; an unknown number (NaN) becomes null.
+    """
+    found = {}
+    for each in fields(entry):
+        value = getattr(entry, each.name)
+        if value is None or value is False or (isinstance(value, str) and not value):
+            continue
+        found[each.name] = _entry(value)
+    return found
+
+
+def _entry(value: Any) -> Any:
+    """Return the value of a field as a document has it."""
+    if is_dataclass(value):
+        return stated(value)
+    if isinstance(value, Mapping):
+        return {key: _entry(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return list(value)
+    return finite(value) if isinstance(value, float) else value
 
 
 def plain(value: Any) -> Any:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
+from imu_calibration.core.documents import stated
+
 Entry = TypeVar('Entry', bound='RegimeErrors')
 
 
@@ -26,12 +28,7 @@ class RegimeErrors:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry of a document: the fields that are not at their default."""
-        found: dict[str, Any] = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if value is not None and value is not False and value != '':
-                found[each.name] = list(value) if isinstance(value, tuple) else value
-        return found
+        return stated(self)
 
     @classmethod
     def from_mapping(cls: type[Entry], entry: Mapping[str, Any]) -> Entry:
@@ -71,16 +68,15 @@ class ProofEntry(RegimeErrors):
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry of a document."""
         found = super().to_mapping()
-        del found['regimes']
-        if self.regimes:
-            found['regimes'] = {}
-            for name, errors in self.regimes.items():
-                part = errors.to_mapping()
-                if errors.unit == self.unit:
-                    part.pop('unit', None)
-                found['regimes'][str(name)] = part
-        if self.earlier is not None:
-            found['earlier'] = {'after': self.earlier.after, 'ci95': list(self.earlier.ci95)}
+        regimes = found.pop('regimes')
+        for part in regimes.values():
+            # A regime in the unit of the entry does not repeat it.
+            if part.get('unit') == self.unit:
+                del part['unit']
+        if regimes:
+            found['regimes'] = {str(name): part for name, part in regimes.items()}
+        if 'earlier' in found:
+            found['earlier'] = found.pop('earlier')
         return found
 
     @classmethod

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.mount_check import mount_findings, turn_entry
+from imu_calibration.calibration.mount_check import common_turn_deg, mount_findings
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.rotations import nearest_rotation, rotation, rotation_vector
@@ -66,7 +66,7 @@ def test_a_small_turn_is_a_note_with_its_size():
     (finding,) = mount_findings(solution(*triads), table())
     assert finding.severity == NOTE and finding.check == 'mount'
     assert float(re.search(r'([\d.]+) deg', finding.text)[1]) == pytest.approx(0.5, abs=0.1)
-    assert turn_entry(solution(*triads))['common_turn_deg'] == pytest.approx([0, -0.5, 0], abs=0.1)
+    assert common_turn_deg(solution(*triads)) == pytest.approx([0, -0.5, 0], abs=0.1)
 
 
 def test_usual_units_are_seldom_turned():

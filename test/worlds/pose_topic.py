@@ -18,6 +18,7 @@ from imu_calibration.calibration.from_solution import ModelChanges, ModelExtensi
 from imu_calibration.calibration.held_out_data import HeldOutData, JudgedData, errors_of_rows
 from imu_calibration.calibration.result import Needs
 from imu_calibration.calibration.solved import Solved
+from imu_calibration.document.statistics import RecordingStatistics, SensorEntry
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import output_of_effects
@@ -108,7 +109,8 @@ class PoseBlocks:
     def statistics(self, solution):
         noise_sd = [float(value) for value in solution.noise['gyroscope'].white_sd]
         windows = {'blocks': len(self.blocks)}
-        return {'gyroscope': {'noise_sd': noise_sd}, 'windows': windows, 'dropped': {}}
+        sensors = {'gyroscope': SensorEntry(noise_sd=noise_sd)}
+        return RecordingStatistics(sensors=sensors, windows=windows, dropped={})
 
     def needs(self, solution, tolerances, *, quality):
         return Needs({}, ())
