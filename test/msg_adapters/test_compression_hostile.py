@@ -464,10 +464,10 @@ def test_index_entries_of_one_message_read_it_once(tmp_path):
 def test_rows_that_share_overflow_pages_take_little_memory(tmp_path):
     """8.5 MB with 1000 rows on one chain of overflow pages took 7.1 GB."""
     path = tmp_path / 'x.db3'
-    path.write_bytes(rows_that_share_pages(400, 240))
+    path.write_bytes(rows_that_share_pages(400, 239))
     with closing(sqlite3.connect(path)) as connection:
         (n_rows,) = connection.execute(
-            'SELECT count(*) FROM messages WHERE length(data) = ?', (20_000 + 240 * 4092,)
+            'SELECT count(*) FROM messages WHERE length(data) = ?', (20_000 + 239 * 4092,)
         ).fetchone()
     assert n_rows == 401
     assert survived('inspect', path).megabytes < 150
