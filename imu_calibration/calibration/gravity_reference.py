@@ -37,6 +37,7 @@ class GravityReference:
 
     joint_names: ClassVar[None] = None
     not_usable: ClassVar[str] = 'not usable for calibration without a table'
+    is_calibration_wanted: ClassVar[bool] = False
     live = staticmethod(LiveByHand)
 
     def table_for(self, purpose: str, code: str = '') -> Table:

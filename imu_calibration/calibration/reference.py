@@ -52,6 +52,10 @@ class MotionReference(Protocol):
     def not_usable(self) -> str:
         """First words on a recording from which no calibration results."""
 
+    @property
+    def is_calibration_wanted(self) -> bool:
+        """Whether a recording is inspected for its calibration; without a table perhaps not."""
+
     def table_for(self, purpose: str, code: str = '') -> Table:
         """
         Return the table.

@@ -48,6 +48,7 @@ class TableReference:
     """The chain of joints."""
 
     not_usable: ClassVar[str] = 'not usable for calibration'
+    is_calibration_wanted: ClassVar[bool] = True
 
     @property
     def joint_names(self) -> JointNames:

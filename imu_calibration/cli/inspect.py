@@ -65,6 +65,8 @@ def run(options: Options) -> VerbResult:
         )
     if set(codes) == {1}:  # no topic is usable: also one line on standard error, as every refusal
         refuse(looks[0].findings)
+        if isinstance(looks[0].calibrated, ImuCalibrationError):
+            raise looks[0].calibrated
     # A recording with a path was inspected, not samples in memory.
     assert looks[0].recording is not None
     return VerbResult(

@@ -527,8 +527,7 @@ def surpassed_limit(calibration: Calibration, sensor: str) -> InstrumentLimit | 
     if scale_range(factor) is IMPOSSIBLE:
         low, high = POSSIBLE_SCALE
         return InstrumentLimit(
-            f'a scale factor must be {low:g} to {high:g}, it is {significant(factor)}; state the'
-            ' unit of the readings',
+            f'a scale factor must be {low:g} to {high:g}, it is {significant(factor)}',
             CONVERT,
             f'{sensor}_unit',
         )
@@ -536,7 +535,7 @@ def surpassed_limit(calibration: Calibration, sensor: str) -> InstrumentLimit | 
         low, high = USUAL_SCALE
         return InstrumentLimit(
             f'a scale factor outside {low:g} to {high:g} must be determined and help on held-out'
-            f' data, {significant(factor)} is not; state the unit of the readings',
+            f' data, {significant(factor)} is not',
             CONVERT,
             f'{sensor}_unit',
         )

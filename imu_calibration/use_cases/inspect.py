@@ -71,7 +71,10 @@ class RecordingSummary:
         Where a complete calibration results from the recording the code is 0, as that of
         `calibrate`, whatever the warnings; on a table it is always that of `calibrate`.
         """
-        return 1 if self.refused else exit_code_of(self.reasons)
+        is_error = isinstance(self.calibrated, ImuCalibrationError)
+        if self.refused or (is_error and self.reference.is_calibration_wanted):
+            return 1
+        return exit_code_of(self.reasons)
 
     @property
     def result(self) -> CalibrationResult | None:

@@ -190,7 +190,8 @@ def test_a_warning_changes_the_code_of_inspect_only_without_a_complete_calibrati
     on_table = TableReference(SimpleNamespace())
     for reference, calibrated, code in (
         (by_hand, None, 3),
-        (on_table, refusal, 3),
+        (on_table, refusal, 1),
+        (by_hand, refusal, 3),
         (on_table, whole, 0),
         (by_hand, whole, 0),
         (on_table, lacking, 3),
