@@ -324,16 +324,10 @@ class _DelayCost:
     def prediction_error(self, delay: float) -> float:
         """Return the sum of squares of each part with A and b of the other parts."""
         normal, applied, observed = self._equations(delay)
-        error = float(observed.sum())
-        for part, (own_normal, own_applied) in enumerate(zip(normal, applied, strict=True)):
-            others = np.delete(normal, part, axis=0).sum(axis=0)
-            scale = np.sqrt(np.maximum(np.diagonal(others), np.finfo(float).tiny))
-            inverse = np.linalg.pinv(
-                others / np.outer(scale, scale), MIN_EIGENVALUE, hermitian=True
-            )
-            fit = inverse @ (np.delete(applied, part, axis=0).sum(axis=0) / scale) / scale
-            error += float(fit @ own_normal @ fit - 2.0 * fit @ own_applied)
-        return error
+        fit = _least_squares(_all_and_without_each(normal)[1:], _all_and_without_each(applied)[1:])
+        # |y - X x|^2 = y'y - 2 b'x + x'N x
+        crossed = np.einsum('ki,ki->', fit, applied)
+        return float(observed.sum() - 2.0 * crossed + np.einsum('ki,kij,kj->', fit, normal, fit))
 
     def _equations(self, delay: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return (N, b, y'y) of the normal equations of each part, (k, 12, 12), (k, 12), (k,)."""
@@ -358,17 +352,47 @@ def _all_and_without_each(of_parts):
     return np.concatenate([total[None], total - of_parts])
 
 
+@dataclass(frozen=True, eq=False)
+class _Directions:
+    """Eigenvectors of normal equations ``N x = b`` in unknowns of equal size."""
+
+    scale: np.ndarray
+    """Square roots of the diagonal of N, shape (..., n)."""
+    vectors: np.ndarray
+    """Eigenvectors in the columns, shape (..., n, n)."""
+    along: np.ndarray
+    """Component of ``b / scale`` along each, shape (..., n)."""
+    determined: np.ndarray
+    """Whether the windows determine it."""
+    values: np.ndarray
+    """Its eigenvalue; 1 where it is not determined."""
+
+    @classmethod
+    def of(cls, normal: np.ndarray, applied: np.ndarray) -> '_Directions':
+        """Return those of equations of shapes (..., n, n), (..., n)."""
+        diagonal = np.diagonal(normal, axis1=-2, axis2=-1)
+        scale = np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(normal / (scale[..., :, None] * scale[..., None, :]))
+        along = np.einsum('...ij,...i->...j', vectors, applied / scale)
+        determined = values > MIN_EIGENVALUE
+        return cls(scale, vectors, along, determined, np.where(determined, values, 1.0))
+
+
+def _least_squares(normal, applied):
+    """Return the solution of ``N x = b``, zero along what the windows do not determine."""
+    found = _Directions.of(normal, applied)
+    length = np.where(found.determined, found.along / found.values, 0.0)
+    return np.einsum('...ij,...j->...i', found.vectors, length) / found.scale
+
+
 def _least_squares_residual(normal, applied, observed):
     """
     Return ``y.T y - b.T N^-1 b`` of normal equations ``N x = b``, shapes (..., n, n), (..., n).
 
     Directions that the windows do not determine are left out.
     """
-    scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(normal / (scale[..., :, None] * scale[..., None, :]))
-    along = np.einsum('...ij,...i->...j', vectors, applied / scale)
-    determined = values > MIN_EIGENVALUE
-    explained = np.where(determined, along**2 / np.where(determined, values, 1.0), 0.0)
+    found = _Directions.of(normal, applied)
+    explained = np.where(found.determined, found.along**2 / found.values, 0.0)
     return observed - explained.sum(axis=-1)
 
 
