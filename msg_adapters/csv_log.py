@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
@@ -1043,7 +1043,7 @@ class _Table:
         wanted = sorted({self.column(name) for name in names})
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': None}
-        lines = self._selected(self._rows(), where)
+        lines = self._selected(self._rows, where)
         lines = self.lines = self._complete(lines, wanted[-1] + 1)
         number_lines = [self._as_numbers(line) for line in lines]
         with warnings.catch_warnings():
@@ -1072,15 +1072,16 @@ class _Table:
                 f'{self.path} must have at least two rows of numbers, got fewer; check the file'
             )
 
+    @cached_property
     def _rows(self):
-        """Return the lines of the rows."""
+        """The lines of the rows; the file is read once for the names of sensors and the columns."""
         with _opened(self.path) as file:
             return plain_lines(file.read().splitlines())[self.first :]
 
     def values_of(self, name, where):
         """Return the different cells of a column in the rows that fulfil `where`, sorted."""
         column, found = self.column(name), set()
-        for line in self._selected(self._rows(), where):
+        for line in self._selected(self._rows, where):
             cells = self._cells(line) if '"' in line else line.split(self.delimiter)
             if len(cells) > column:
                 found.add(cells[column].strip())
@@ -1136,7 +1137,7 @@ class _Table:
                     continue
                 cell = cells[column].strip()
                 seen[cell] += 1
-                if any(map(partial(_same, cell), (value, *value.split(',')))):
+                if any(_same(cell, each) for each in (value, *value.split(','))):
                     kept.append(line)
             if not kept:
                 most = ', '.join(cell for cell, _ in seen.most_common(5))
