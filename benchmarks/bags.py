@@ -24,7 +24,7 @@ PAUSE_NS = 2_000_000_000
 """
 Hole between the repetitions, so that the jump of the joints back to the start lies in no window.
 """
-ITERATED_SECONDS = 1.0
+ITERATED_SECONDS = 0.25
 """Processor time over which a bare iteration is averaged."""
 RUNNER = """
 import os, subprocess, sys
@@ -74,15 +74,15 @@ def long_session(minutes, imu_rate=1000.0, joint_rate=200.0):
     )
 
 
-def hand_session():
+def hand_session(still=22.0):
     """
-    Return (ImuSamples, None) of ten minutes by hand at 200 Hz.
+    Return (ImuSamples, None) by hand at 200 Hz: ten minutes with poses of 22 s.
 
-    25 poses of 22 s, random turns of 2 s between them.
+    25 poses of `still` s, random turns of 2 s between them.
     """
     from worlds.hand_sessions import simulate as simulate_by_hand
 
-    return simulate_by_hand(0, 25, period=0.005, still=22.0, duration=2.0)[0], None
+    return simulate_by_hand(0, 25, period=0.005, still=still, duration=2.0)[0], None
 
 
 def iterate(bag):

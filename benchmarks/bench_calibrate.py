@@ -135,7 +135,7 @@ def main():
     )
     parser.add_argument('--storages', nargs='+', choices=LIMITS, default=tuple(LIMITS))
     parser.add_argument('--repetitions', type=int, default=REPETITIONS)
-    add_smallest(parser, minutes=1.0, rate=25.0, storages=['mcap'], repetitions=1)
+    add_smallest(parser, minutes=0.5, rate=25.0, storages=['mcap'], repetitions=1)
     options = parser.parse_args()
     rows = bench_calibrate(
         options.minutes, options.repetitions, rate=options.rate, storages=options.storages

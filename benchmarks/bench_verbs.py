@@ -46,7 +46,7 @@ class Session(NamedTuple):
     """A bag that several verbs read."""
 
     make: Callable
-    """Returns (ImuSamples, JointSamples or None)."""
+    """Returns (ImuSamples, JointSamples or None) of this share of the length."""
     messages: int
     """Number of messages."""
 
@@ -67,10 +67,10 @@ class Case(NamedTuple):
 
 SESSIONS = {
     '5 min at 100 Hz': Session(
-        lambda: long_session(5.0, imu_rate=100.0, joint_rate=100.0), 300 * 200
+        lambda share: long_session(5.0 * share, imu_rate=100.0, joint_rate=100.0), 300 * 200
     ),
-    '10 min by hand at 200 Hz': Session(hand_session, 600 * 200),
-    'an hour at 1 kHz': Session(lambda: long_session(60.0), 3600 * 1200),
+    '10 min by hand at 200 Hz': Session(lambda share: hand_session(22.0 * share), 600 * 200),
+    'an hour at 1 kHz': Session(lambda share: long_session(60.0 * share), 3600 * 1200),
 }
 CASES = (
     Case('calibrate', '5 min at 100 Hz', ('--table', 'TABLE', '--output', 'OUTPUT'), 1.5, 200),
@@ -89,7 +89,7 @@ CASES = (
 )
 
 
-def bench_verbs(repetitions=REPETITIONS, only=''):
+def bench_verbs(repetitions=REPETITIONS, only='', share=1.0):
     """
     Yield (case, multiples of a bare iteration, seconds, MB, limit as multiple).
 
@@ -102,7 +102,7 @@ def bench_verbs(repetitions=REPETITIONS, only=''):
             ]
             if not cases:
                 continue
-            bag = write_bench_bag(Path(folder, f'bag{number}'), session=session.make())
+            bag = write_bench_bag(Path(folder, f'bag{number}'), session=session.make(share))
             limit = 1 / (SECONDS_PER_MESSAGE * session.messages)
             for case in cases:
                 runs = [
@@ -146,10 +146,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--repetitions', type=int, default=REPETITIONS)
     parser.add_argument('--only', default='', help='run the cases with this text in the name')
-    add_smallest(parser, repetitions=1, only='by hand')
+    parser.add_argument('--share', type=float, default=1.0, help='share of the sessions, default 1')
+    add_smallest(parser, repetitions=1, only='by hand', share=0.1)
     options = parser.parse_args()
     missed = False
-    for case, multiples, seconds, memory, limit in bench_verbs(options.repetitions, options.only):
+    for case, multiples, seconds, memory, limit in bench_verbs(
+        options.repetitions, options.only, options.share
+    ):
         multiple = median(multiples)
         missed |= multiple > limit or max(memory) > case.memory_mb
         print(

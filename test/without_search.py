@@ -2,11 +2,13 @@
 Scripts whose searches for effects on a table test only some candidates.
 
 Scripts are run as users run them, without an argument for the candidates of their searches.
-`python -m without_search EFFECT+... MODULE [ARGUMENT ...]` runs a module.
+`python -m without_search 'EFFECT+... MODULE [ARGUMENT ...]' ...` runs modules one after the other,
+in one process that has imported the package once.
 """
 
 import contextlib
 import runpy
+import shlex
 import sys
 from collections.abc import Iterator
 from unittest.mock import patch
@@ -31,7 +33,12 @@ def candidates_in_scripts(candidates: str) -> Iterator[None]:
 
 
 if __name__ == '__main__':
-    _, names, module, *_ = sys.argv
-    del sys.argv[:2]
-    with candidates_in_scripts(names):
-        runpy.run_module(module, run_name='__main__', alter_sys=True)
+    for line in sys.argv[1:]:
+        names, *sys.argv = shlex.split(line)
+        print(f'== {line}', flush=True)
+        with candidates_in_scripts(names):
+            try:
+                runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
+            except SystemExit as end:
+                if end.code:
+                    raise
