@@ -12,7 +12,6 @@ import pytest
 
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text
-from msg_adapters.write import write_session
 
 from worlds.live_sessions import assert_same, errors_in_sd, make_session, offline
 
@@ -93,6 +92,7 @@ def answer_of(station, folder):
 
 @pytest.mark.long
 def test_losses_disorder_nan_foreign_frames_clock_jumps_and_silence(station, session, tmp_path):
+    session = beginning(session)
     imu, joints, values, model = session
     rng = np.random.default_rng(5)
     node = station.calibration_node(tmp_path)
@@ -107,10 +107,10 @@ def test_losses_disorder_nan_foreign_frames_clock_jumps_and_silence(station, ses
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
 
     assert station.call('/calibration_node/reset').success
-    check_bursts_and_foreign_frames(station, publisher, beginning(session), tmp_path)
+    check_bursts_and_foreign_frames(station, publisher, session, tmp_path)
 
     assert station.call('/calibration_node/reset').success
-    check_clock_jump_and_silence(station, publisher, beginning(session), tmp_path)
+    check_clock_jump_and_silence(station, publisher, session, tmp_path)
     assert station.processes.end(node, signal.SIGTERM) == 0
 
 
@@ -264,25 +264,8 @@ def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp
 
 
 @pytest.mark.long
-def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(station, tmp_path):
-    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=29.0)
-    write_session(tmp_path / 'fast', imu, joints)
-    node = station.calibration_node(tmp_path)
-    station.until(lambda: station.status, 'the node')
-    player = station.play(tmp_path / 'fast', 1.0, subscribers=1)
-    station.until(lambda: player.poll() is not None, 'the end of the recording')
-    station.until(
-        lambda: received(station) == [len(imu), len(joints)],
-        'every message to arrive',
-        patience=20.0,
-    )
-    assert station.figure('windows') > 0
-    assert station.processes.end(node) == 0
-
-
-@pytest.mark.long
-def test_six_minutes_of_data_leave_no_memory_behind(tmp_path):
-    found = soak(360.0, 20.0, tmp_path, 100.0, 50.0)
+def test_four_minutes_of_data_leave_no_memory_behind(tmp_path):
+    found = soak(240.0, 20.0, tmp_path, 100.0, 50.0)
     for name, (middle, last, _, n_imu) in found.items():
         assert last - middle <= GROWTH_MB, f'{name} grew from {middle:.1f} to {last:.1f} MB'
-        assert n_imu > 10_000
+        assert n_imu >= 24_000

@@ -92,7 +92,8 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
 
         station.until(count, 'the first messages')
         start, told = time.monotonic(), 0.0
-        while time.monotonic() - start < seconds / factor:
+        # Until the node has received all of them: a busy machine needs longer.
+        while (n_imu := count()) < seconds * imu_rate:
             station.spin_for(min(1.0, seconds / factor / 60))
             now = time.monotonic() - start
             for name, process in running.items():
@@ -101,12 +102,11 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
             if tell and now - told > 60.0:
                 told = now
                 tell(
-                    f'{now * factor / 3600:.2f} h: '
+                    f'{n_imu / imu_rate / 3600:.2f} h: '
                     + ', '.join(
                         f'{name} {samples[-1][1]:.1f} MB' for name, samples in memory.items()
                     )
                 )
-        n_imu = count()
     return {
         name: (*thirds(samples), max(mb for _, mb in samples), n_imu)
         for name, samples in memory.items()
