@@ -33,8 +33,6 @@ NEEDED = (
     'packaging',
     'psutil',
     'lark',
-    'importlib-metadata',
-    'netifaces',
     'catkin_pkg',
 )
 """What ros2cli imports beside rclpy."""
@@ -115,13 +113,14 @@ def with_ros2(folder):
     if any(folder.iterdir()):
         return _with_packages_of(folder)
     needed = [name for name in NEEDED if importlib.util.find_spec(name.replace('-', '_')) is None]
-    for more in (
-        ['--no-compile', '--no-deps', '--no-index', *map(str, wheels)],
-        *[['--no-compile', *needed]] * bool(needed),
-    ):
-        done = subprocess.run([*install, *more], capture_output=True, text=True, timeout=300)
-        if done.returncode:
-            pytest.skip(f'ros2cli cannot be installed here: {done.stderr.strip().splitlines()[-1]}')
+    done = subprocess.run(
+        [*install, '--no-compile', '--no-deps', *map(str, wheels), *needed],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    if done.returncode:
+        pytest.skip(f'ros2cli cannot be installed here: {done.stderr.strip().splitlines()[-1]}')
     (folder / 'composition_interfaces' / 'srv').mkdir(parents=True)
     (folder / 'composition_interfaces' / '__init__.py').touch()
     (folder / 'composition_interfaces' / 'srv' / '__init__.py').write_text(COMPONENTS)
