@@ -9,6 +9,8 @@ import pytest
 from imu_calibration.cli.main import main
 from imu_calibration.document.calibration_text import calibration_from_text
 
+from worlds.candidates import FEW
+
 pytestmark = pytest.mark.slow
 
 
@@ -44,6 +46,8 @@ def outcome(tmp_path_factory):
             str(folder / 'bag' / 'table.yaml'),
             '--output',
             str(folder / 'out'),
+            '--candidates',
+            f'{FEW}+accel_size_effect',
         ]
     )
     assert code in (0, 3)

@@ -26,6 +26,8 @@ from imu_calibration.cli import parser, show
 from imu_calibration.cli.main import ProgressBars, main
 from imu_calibration.cli.terminal import Terminal
 
+from worlds.small_bags import write_small_bag
+
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
 SESSION, TABLE, TRUTH = (
     f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml')
@@ -37,7 +39,7 @@ PRINTING = {
     'export': ['--list'],
     'plan': ['--by-hand', '--no-report', '--output', 'plan'],
     'check': [SESSION, '--table', TABLE, '--calibration', TRUTH],
-    'noise': [SESSION, '--output', 'noise'],
+    'noise': [SESSION, '--no-report', '--output', 'noise'],
 }
 
 
@@ -242,11 +244,12 @@ def test_no_line_of_an_error_is_wider_than_the_terminal(arguments):
 
 
 @pytest.mark.live
-def test_colour_is_for_terminals_and_not_with_no_color():
-    assert b'\x1b[32m' in on_terminal(['inspect', SESSION])
-    assert b'\x1b[3' not in on_terminal(['inspect', SESSION], NO_COLOR='1')
+def test_colour_is_for_terminals_and_not_with_no_color(tmp_path):
+    bag = str(write_small_bag(tmp_path / 'bag'))
+    assert b'\x1b[32m' in on_terminal(['inspect', bag])
+    assert b'\x1b[3' not in on_terminal(['inspect', bag], NO_COLOR='1')
     plain = subprocess.run(
-        [sys.executable, '-m', 'imu_calibration', 'inspect', SESSION],
+        [sys.executable, '-m', 'imu_calibration', 'inspect', bag],
         cwd=ROOT,
         capture_output=True,
         check=True,

@@ -381,10 +381,14 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
     with Loop(tmp_path / 'out.txt') as loop:
         loop.begin(
             tmp_path,
-            {'tolerances_file': write_tolerances(tmp_path / 'tolerances.yaml', 2.0)},
-            {'diagnosis_period': 60.0},
+            {
+                'tolerances_file': write_tolerances(tmp_path / 'tolerances.yaml', 4.0),
+                **FEW_PARAMETERS,
+            },
+            # The only diagnosis is that which the planner requests.
+            FEW_PARAMETERS | {'model_as_asked': True, 'diagnosis_period': 600.0},
         )
-        loop.spin_for(2.0)
+        loop.spin_for(1.0)
         # Nothing moves before start.
         assert loop.value('state') == 'idle' and loop.value('motion') == '0'
         loop.ask('next')

@@ -19,7 +19,6 @@ from ros.live_station import STAY_LOCAL, free_domain
 from ros.workspace import ROOT, sourced
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
-TABLE = ROOT / 'bags/sample_session/table.yaml'
 TRUTH = ROOT / 'bags/sample_session/truth.yaml'
 FAULTY = """
 import sys, rclpy
@@ -98,10 +97,8 @@ def test_every_verb_of_the_plain_command_is_offered(place):
 @pytest.mark.parametrize(
     'line',
     [
-        f'inspect {ROOT}/bags/sample_session --table {TABLE}',
         f'export {TRUTH} --to json --output WHERE.json --force',
         f'compare {TRUTH} nowhere.yaml',
-        'calibrate --output WHERE',
         'calibrat session',
     ],
 )

@@ -237,17 +237,8 @@ def test_shares_are_of_the_locked_windows():
     assert low <= share_removed(before, after) <= high
 
 
-@pytest.mark.parametrize(
-    ('kind', 'size'),
-    [('cable_in_an_arc', 1.0), pytest.param('sticks_when_warm', 2.0, marks=pytest.mark.long)],
-)
-def test_the_place_is_found(kind, size):
-    """
-    A gyroscope step of half this size is within the wander of its bias.
-
-    The temperature is passed once: it is named with the moment.
-    """
-    row, known = row_of(6, kind, 'white', Beyond(kind, 6, size))
+def test_the_place_is_found():
+    row, known = row_of(6, 'cable_in_an_arc', 'white', Beyond('cable_in_an_arc', 6))
     assert row['flagged'] and row['f1'] > 0.7 and row['axis'] and not row['found'], row
     assert len(known) == 24 and all(sd > 0 for _, sd in known.values())
 
