@@ -37,7 +37,9 @@ def test_the_interval_of_a_change_has_the_spread_of_both_errors():
 
 def test_check_gives_3_when_the_error_has_changed_even_if_it_still_helps():
     """The error in the file is a fifth of that of the recording, but the raw error is larger."""
-    session = make_session(3, profile='quick', noise='realistic', grade='industrial')
+    session = make_session(
+        3, profile='quick', noise='realistic', grade='industrial', imu_rate=50.0, joint_rate=50.0
+    )
     table = Table.from_mapping(session.table)
     block = session.block
     calibration = calibrate_recordings(block, table, model_as_asked=True).calibration

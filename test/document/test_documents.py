@@ -140,7 +140,7 @@ def any_calibration(draw):
     )
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(any_calibration())
 def test_any_calibration_survives_yaml_whole(calibration):
     text = calibration_to_text(calibration)
@@ -156,12 +156,7 @@ def test_any_calibration_survives_yaml_whole(calibration):
         calibration.model.joint_names,
         calibration.model.temperature_ref_c,
     )
-
-
-@settings(max_examples=30, deadline=None, derandomize=True)
-@given(any_calibration())
-def test_written_read_and_written_again_is_the_same_text(calibration):
-    once = calibration_to_text(calibration_from_text(calibration_to_text(calibration)))
+    once = calibration_to_text(read)
     assert calibration_to_text(calibration_from_text(once)) == once
 
 

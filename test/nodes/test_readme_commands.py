@@ -327,6 +327,7 @@ def test_parameters_are_requested_until_the_node_answers():
         dumped(None, Ended('ended', 1), '/n')
 
 
+@pytest.mark.long
 def test_launch_arguments_are_parameters_of_the_node_which_is_started_again(terminals, home):
     """With the real launch: an argument that is not given keeps the default of the node."""
     workspace = home[0] / 'ws'

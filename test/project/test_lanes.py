@@ -90,8 +90,14 @@ def test_only_live_tests_are_repeated(tmp_path, text, code, unstable):
     (tmp_path / 'pytest.ini').write_text('[pytest]\nmarkers =\n    live: x\n    long: x\n')
     (tmp_path / 'test_it.py').write_text(text)
     done = subprocess.run(
-        [sys.executable, TEST / 'run_lanes.py', 'core', 'live', '--', '-n', str(int(unstable))],
+        [
+            sys.executable,
+            TEST / 'run_lanes.py',
+            *'core live -- -p xdist -n'.split(),
+            str(+unstable),
+        ],
         cwd=tmp_path,
+        env=os.environ | {'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1'},
         capture_output=True,
         text=True,
         timeout=300,
