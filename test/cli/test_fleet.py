@@ -40,7 +40,7 @@ def session(seed, values):
         values,
         TABLE,
         profile=make_profile('quick', seed, TABLE),
-        options=SimulationOptions(100.0, 100.0),
+        options=SimulationOptions(50.0, 50.0),
         seed=seed,
     )
     return imu, joints
@@ -172,8 +172,8 @@ def test_a_fleet_excludes_the_times_of_all_units_and_of_one(recordings, tmp_path
     for unit in ('unit_a', 'unit_b'):
         calibration = read_calibration(tmp_path / 'fleet' / unit / 'calibration.yaml')
         dropped[unit] = calibration.statistics['dropped']['imu excluded']
-    # 100 Hz, two recordings of unit_b
-    assert dropped == {'unit_a': 200, 'unit_b': 1000}
+    # 50 Hz, two recordings of unit_b
+    assert dropped == {'unit_a': 100, 'unit_b': 500}
     capsys.readouterr()
     assert main([*arguments, '--exclude', 'unit_d=4:7']) == 1
     assert "'unit_d=4:7'" in capsys.readouterr().err
