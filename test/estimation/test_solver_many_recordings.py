@@ -170,9 +170,10 @@ def test_what_a_smaller_recording_shows_is_taken_in():
 
     Two minutes of motion with the same IMU and a driver that is 12 ms late do.
     """
-    pair = make_pair('driver_lag', 31)
+    rates = {'imu_rate': 50.0, 'joint_rate': 50.0}
+    pair = make_pair('driver_lag', 31, **rates)
     resting = make_session(
-        63, noise='realistic', grade='industrial', profile='static_only', unit=31
+        63, noise='realistic', grade='industrial', profile='static_only', unit=31, **rates
     )
     table = Table.from_mapping(pair.table)
     found = imu_calibration.calibrate([pair.first.block, resting.block], table, candidates=FEW)
