@@ -161,14 +161,15 @@ def values_of(station, name):
 
 
 @pytest.mark.long
-@pytest.mark.long
 def test_a_hidden_effect_is_named_live(tmp_path):
     """
     Quadratic terms that the model lacks.
 
     Diagnostics say so, as the verb does of the same bag, and the calibration is the verb's.
     """
-    session = physics.make_session(3, {'accel_quadratic': None}, profile='quick')
+    session = physics.make_session(
+        3, {'accel_quadratic': None}, profile='quick', imu_rate=50.0, joint_rate=50.0
+    )
     physics.write_bag(session, tmp_path / 'bag')
     (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
     table = Table.from_mapping(session.table)
