@@ -132,7 +132,9 @@ def test_watch(capsys):
 
 def test_an_error_is_described(capsys):
     assert main(['compare', TRUTH, 'nowhere.yaml', '--json']) == 1
-    VALIDATOR.validate(json.loads(capsys.readouterr().out))
+    document = json.loads(capsys.readouterr().out)
+    VALIDATOR.validate(document)
+    assert (document['exit_code'], document['error']['code']) == (1, 'file_unreadable')
 
 
 @pytest.mark.parametrize(
