@@ -16,7 +16,11 @@ from hypothesis import HealthCheck, settings
 
 # The same examples every time, and no failure because the machine is busy.
 settings.register_profile(
-    'suite', derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    'suite',
+    max_examples=30,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile('suite')
 

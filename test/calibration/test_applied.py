@@ -119,7 +119,8 @@ def test_the_proof_from_window_statistics_differs_by_the_square_of_the_errors():
     from imu_calibration.calibration.proof import prove
     from imu_calibration.effects.forward_equations import applied_values
 
-    session = imu.simulate('quick', seed=4, effects=['accel_quadratic', 'gyro_g_sensitivity'])
+    effects = ['accel_quadratic', 'gyro_g_sensitivity']
+    session = imu.simulate('quick', seed=4, effects=effects)
     result = imu.calibrate(
         session.samples,
         session.table,
@@ -144,7 +145,7 @@ def drifting(size=0.5 * DEG, time_constant=35.0):
 
     It is (samples, table, bias at the end, bias at the start, duration in s).
     """
-    session = imu.simulate('random_short', seed=7, **RATES)
+    session = imu.simulate('quick', seed=7, **RATES)
     time = 1e-9 * (session.samples.imu.stamp_ns - session.samples.imu.stamp_ns[0])
     course = (
         -size * np.expm1(-time / time_constant)

@@ -40,7 +40,7 @@ from imu_calibration.selection.search import SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
 from worlds.candidates import FEW, with_candidates
-from worlds.misfit_coverage import calibrated
+from worlds.misfit_coverage import COARSE, calibrated, clean
 from worlds.misfit_worlds import make_pair
 from worlds.moments import Wander
 from worlds.physics import TABLES, make_session
@@ -49,14 +49,13 @@ from worlds.physics_beyond import Beyond
 TABLE = Table.from_mapping(TABLES['three_axis'])
 NAMES = tuple(TABLE.joint_names)
 OFFSET = 'reference.time_offset.offset'
-COARSE = {'imu_rate': 50.0, 'joint_rate': 50.0}
 SHAFT = {'table': 'shaft', 'profile': 'sweeps'}
 
 
 @pytest.fixture(scope='module')
 def late():
     """A session on a shaft whose driver stamps 12 ms late, and the table."""
-    pair = make_pair('driver_lag', 31, **SHAFT)
+    pair = make_pair('driver_lag', 31, **SHAFT, **COARSE)
     return pair.first, Table.from_mapping(pair.table)
 
 
@@ -119,7 +118,7 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
 
     The halves disagree, the model stays, its parameters are less certain.
     """
-    windows, rng = calibrated(make_pair(None, 11, **COARSE).first).windows, np.random.default_rng(5)
+    windows, rng = clean(11).windows, np.random.default_rng(5)
     model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'), joint_names=NAMES)
 
     def measured(share):
@@ -168,7 +167,7 @@ def test_windows_for_the_search_are_spread_and_bounded():
 
     Of a short one all.
     """
-    windows = calibrated(make_pair(None, 11, **COARSE).first).windows
+    windows = clean(11).windows
     every = DecimatedWindows()
     for window in windows:
         every.add(window)
@@ -356,7 +355,12 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     # Another guard, which sees to it here too.
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_, **settings: True)
     session = make_session(
-        141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141), **COARSE
+        141,
+        None,
+        'realistic',
+        profile='quick',
+        cause=Beyond('force_cubed_in_gyro', 141),
+        **COARSE,
     )
     found = imu.calibrate(
         session.block, Table.from_mapping(session.table), candidates=FEW
@@ -373,7 +377,7 @@ def test_a_bias_is_not_known_better_than_windows_agree_on_it():
     Poses of each sense agree so well that their mean passed for sure, ten sd from the truth.
     """
     cause = Beyond('backlash', 2)
-    session = make_session(2, None, 'realistic', cause=cause, **COARSE)
+    session = make_session(2, None, 'realistic', profile='random_short', cause=cause, **COARSE)
     calibration = imu.calibrate(
         session.block, Table.from_mapping(session.table), candidates=FEW
     ).calibration

@@ -15,7 +15,6 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.window_statistics import Regime
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
-from worlds.candidates import FEW
 from worlds.misfit_worlds import make_pair
 from worlds.physics import write_bag
 
@@ -27,7 +26,9 @@ def pair():
 
 @pytest.fixture(scope='module')
 def calibrated(pair):
-    return calibrate_recordings(pair.first.block, Table.from_mapping(pair.table), candidates=FEW)
+    return calibrate_recordings(
+        pair.first.block, Table.from_mapping(pair.table), model_as_asked=True
+    )
 
 
 def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):

@@ -15,7 +15,6 @@ from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
-from worlds.candidates import FEW
 from worlds.misfit_worlds import SHAFT, make_pair
 
 VERTICAL = {**SHAFT, 'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
@@ -28,7 +27,7 @@ def vertical():
         'motor_ripple', 3, table=VERTICAL, profile='sweeps', imu_rate=50.0, joint_rate=50.0
     )
     return pair, calibrate_recordings(
-        pair.first.block, Table.from_mapping(pair.table), candidates=FEW
+        pair.first.block, Table.from_mapping(pair.table), model_as_asked=True
     ).calibration
 
 
@@ -79,7 +78,7 @@ def test_one_attitude_is_never_called_harmful():
 def test_a_horizontal_shaft_has_many_attitudes():
     pair = make_pair(None, 3, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0)
     calibration = calibrate_recordings(
-        pair.first.block, Table.from_mapping(pair.table), candidates=FEW
+        pair.first.block, Table.from_mapping(pair.table), model_as_asked=True
     ).calibration
     assert not calibration.proof['accelerometer'].one_attitude
     assert set(calibration.status[calibration.model.part('accelerometer', Role.LINEAR)]) != {HELD}

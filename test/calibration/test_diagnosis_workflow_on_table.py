@@ -18,17 +18,20 @@ from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.selection import questions
 from imu_calibration.selection.evidence import locked_windows
 from imu_calibration.selection.gain import APPLIED, OF_MODEL, heldout_gain
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.residual_analysis import inquire
 
+from worlds.candidates import FEW, with_candidates
 from worlds.diagnosing import diagnose
 from worlds.hide_and_seek_worlds import components_of
 from worlds.hiding import Sizes, record
 
 FOLLOWING = 'accel_thermal_bias+accel_thermal_scale+accel_bias_drift+gyro_thermal_bias'
 """Candidates whose columns change with the temperature or the time."""
+CANDIDATES = FEW + '+accel_size_effect+lever_arm+encoder_harmonic+gyro_saturation'
 SEED, QUICK = 3, {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
@@ -54,7 +57,9 @@ def seek(effect, sizes):
         through_bag=effect == 'accel_quadratic',
         **QUICK,
     )
-    return recording, diagnose(recording.windows, recording.table, recording.model)
+    return recording, diagnose(
+        recording.windows, recording.table, recording.model, candidates=CANDIDATES
+    )
 
 
 def test_nothing_is_found_where_nothing_is_hidden(sizes):
@@ -115,7 +120,8 @@ def test_earlier_choice_is_replaced_by_the_simpler_effect_that_does_as_well(size
         through_bag=False,
         **QUICK,
     )
-    search = investigate(recording.windows, recording.table, recording.model).problem.search
+    model = with_candidates(recording.model, CANDIDATES)
+    search = investigate(recording.windows, recording.table, model).problem.search
     nine_arms = next(q for q in search.questions if q.name == 'accel_size_effect')
     assert [q.name for q in search.reconsidered([nine_arms])] == ['lever_arm']
 
@@ -137,7 +143,9 @@ def test_document_holds_what_the_contract_asks_for(sizes):
     }
     assert set(finding['gain']) >= {'heldout_rms_before', 'heldout_rms_after', 'reduction', 'ci95'}
     assert document['baseline']['accelerometer']['effects'] == ['bias', 'matrix']
-    assert {entry['effect'] for entry in document['not_testable']} == {'earth_rate'} | {
+    used = [window for window in recording.windows if window.kind != 'unused']
+    _, not_testable = questions.testable_effects(recording.model, recording.table, used)
+    assert {entry['effect'] for entry in not_testable} == {'earth_rate'} | {
         f'{short}_{what}'
         for short in ('accel', 'gyro')
         for what in ('thermal_hysteresis', 'vibration_rectification')
@@ -171,13 +179,8 @@ def test_a_bias_that_follows_the_thermometer_is_named_beside_a_wander_and_a_wand
 
 def test_what_locked_windows_show_moves_the_gain_and_nothing_else(sizes):
     """Ten standard deviations onto one locked window of each kind."""
-    recording = record(
-        SEED,
-        {'accel_quadratic': sizes.hidden('accel_quadratic', SEED, 5.0)},
-        'white',
-        through_bag=False,
-        **QUICK,
-    )
+    recording, _ = seek('accel_quadratic', sizes)
+    model = with_candidates(recording.model)
     used = [window for window in recording.windows if window.kind != 'unused']
     locked, kinds = (
         locked_windows(np.array([window.kind for window in used])),
@@ -195,7 +198,7 @@ def test_what_locked_windows_show_moves_the_gain_and_nothing_else(sizes):
         )
         for w in used
     ]
-    found, other = (investigate(some, recording.table, recording.model) for some in (used, windows))
+    found, other = (investigate(some, recording.table, model) for some in (used, windows))
     assert [q.label for q in found.named] == [q.label for q in other.named] == ['accel_quadratic']
     one, two = (
         [search.score([], question).gain for question in search.questions]
@@ -234,9 +237,8 @@ def test_gain_is_measured_on_windows_that_took_no_part(sizes):
 
 
 def test_effects_without_their_data_are_not_testable():
-    recording = record(
-        SEED, None, 'white', through_bag=False, profile='static_only', temperature=None
-    )
+    options = QUICK | {'profile': 'static_only', 'temperature': None}
+    recording = record(SEED, None, 'white', through_bag=False, **options)
     document = diagnosis_mapping(diagnose(recording.windows, recording.table, recording.model))
     lacking = {entry['effect']: entry for entry in document['not_testable']}
     assert {'accel_thermal_bias', 'gyro_thermal_scale'} <= set(lacking)
@@ -273,7 +275,8 @@ def test_the_gain_is_that_of_corrected_readings(sizes):
     The model's residual differs by the scale factors.
     """
     recording, diagnosis = seek('accel_quadratic', sizes)
-    found, rms = inquire(recording.windows, recording.table, recording.model), []
+    candidates = with_candidates(recording.model, CANDIDATES)
+    found, rms = inquire(recording.windows, recording.table, candidates), []
     for chosen in ([], found.named):
         known = dict(zip(found.problem.space.names, found.problem.values(chosen)))
         model = (

@@ -26,6 +26,7 @@ def test_a_response_to_one_square_of_the_force_is_found_beside_the_bias(componen
         52,
         {'gyro_force_squared': hidden.reshape(3, 6)},
         'white',
+        profile='quick',
         imu_rate=50.0,
         joint_rate=50.0,
     )

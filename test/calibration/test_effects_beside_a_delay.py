@@ -22,7 +22,7 @@ def test_a_delay_and_a_zero_do_not_cost_the_effects_that_are_in_the_model():
     By these no arm of a sensor is significant; with the delay in the model it is.
     """
     hidden = {'time_offset': np.array([DELAY]), 'encoder_zero': np.array([ZERO])}
-    session = make_session(6, hidden, arms=True, imu_rate=50.0, joint_rate=50.0)
+    session = make_session(6, hidden, arms=True, profile='quick', imu_rate=50.0, joint_rate=50.0)
     found = imu.calibrate(
         session.block, Table.from_mapping(session.table), candidates=FEW
     ).calibration

@@ -65,7 +65,7 @@ def expected(quick):
     return offline(quick)
 
 
-def blocks(*streams, seed=0, mean_seconds=0.2):
+def blocks(*streams, seed=0, mean_seconds=0.5):
     """Cut a session into uneven blocks as they would come from topics."""
     rng = np.random.default_rng(seed)
     first, last = streams[0].stamp_ns[0] - 1, max(samples.stamp_ns[-1] for samples in streams) + 1
@@ -96,10 +96,16 @@ def assert_same(a, b, share=SD):
     np.testing.assert_allclose(a.sd, b.sd, rtol=1e-6)
 
 
-def test_the_live_answer_is_the_offline_answer(quick, expected):
+@pytest.fixture(scope='module')
+def whole(quick):
+    """Return a live calibration after the session; solutions do not change it."""
     live = LiveCalibration(TABLE)
     run(live, *quick)
-    result = live.solve(pending=True)
+    return live
+
+
+def test_the_live_answer_is_the_offline_answer(whole, expected):
+    result = whole.solve(pending=True)
     assert_same(result.calibration, expected.calibration)
     for section in ('windows', 'samples_used', 'dropped', 'stream'):
         assert result.calibration.statistics[section] == expected.calibration.statistics[section]
@@ -110,8 +116,8 @@ def test_solving_on_the_way_changes_nothing(quick, expected):
     live, count = LiveCalibration(TABLE), 0
     for number, block in enumerate(blocks(*quick, seed=3)):
         live.push(block)
-        if number % 150 == 149:
-            live.solve(pending=number % 300 == 299)
+        if number % 60 == 59:
+            live.solve(pending=number % 120 == 119)
             count += 1
     assert count >= 3
     assert_same(live.solve(pending=True).calibration, expected.calibration)
@@ -124,7 +130,7 @@ def test_windows_that_are_open_count_only_when_asked_for(quick):
     With them there are more samples, without them the windows that were completed.
     """
     live = LiveCalibration(TABLE)
-    completed = [window for part in list(blocks(*quick))[:700] for window in live.push(part)]
+    completed = [window for part in list(blocks(*quick))[:280] for window in live.push(part)]
     used = sum(len(window) for window in completed if window.kind != 'unused')
     without, with_open = (
         sum(live.solve(pending=flag).calibration.statistics['samples_used'].values())
@@ -204,16 +210,14 @@ def at_temperature(samples, temperature_c):
     )
 
 
-def test_a_proven_session_is_proven_after_resume(quick):
+def test_a_proven_session_is_proven_after_resume(whole):
     """
     Held-out blocks are saved.
 
     Without them the resumed session was unproven until as many windows had come again.
     """
-    first = LiveCalibration(TABLE)
-    run(first, *quick)
-    before = first.solve(pending=True).calibration
-    after = LiveCalibration(TABLE, saved=first.saved(pending=True)).solve().calibration
+    before = whole.solve(pending=True).calibration
+    after = LiveCalibration(TABLE, saved=whole.saved(pending=True)).solve().calibration
     assert set(before.decisions.values()) == {HELPS} and after.decisions == before.decisions
     for sensor in before.proof:
         assert after.proof[sensor].windows == before.proof[sensor].windows
@@ -262,16 +266,14 @@ def test_a_session_resumed_30_kelvin_warmer_knows_both_temperatures(quick):
     assert found.sd[found.model.slices['accelerometer', 'accel_thermal_bias']].max() < 1e-4
 
 
-def test_a_state_comes_back_to_the_last_bit(quick):
-    live = LiveCalibration(TABLE)
-    run(live, *quick)
-    gathered = live.gathered()
-    data = collector.to_bytes(gathered, live.model)
+def test_a_state_comes_back_to_the_last_bit(whole):
+    gathered = whole.gathered()
+    data = collector.to_bytes(gathered, whole.model)
     again = collector.from_bytes(data)[0]
-    assert collector.to_bytes(again, live.model) == data
+    assert collector.to_bytes(again, whole.model) == data
     found, expected = (
         conclude(
-            solved_windows(WindowObservations(TABLE, each, live.model), CalibrationOptions())
+            solved_windows(WindowObservations(TABLE, each, whole.model), CalibrationOptions())
         ).calibration
         for each in (again, gathered)
     )
@@ -286,7 +288,7 @@ def test_before_the_first_temperature_there_is_nothing_to_save():
         live.saved()
 
 
-def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
+def test_a_state_of_another_model_or_a_broken_one_is_refused():
     live = LiveCalibration(TABLE)
     data = collector.to_bytes(live.gathered(), live.model)
     with refused(DocumentError, 'other_model', 'accel_size_effect'):
@@ -358,11 +360,9 @@ def test_a_column_of_more_values_than_any_session_has_is_refused(column):
         collector._unpacked(column, collector._SavedNumbers(b'', 10**6))
 
 
-def test_windows_of_one_kind_are_saved_in_common_columns(quick):
+def test_windows_of_one_kind_are_saved_in_common_columns(whole):
     """Each small array of each window was written alone, which took ten times as long."""
-    live = LiveCalibration(TABLE)
-    run(live, *quick)
-    rows = [row for row in live.gathered().accumulator.rows if row.kind == 'static']
+    rows = [row for row in whole.gathered().accumulator.rows if row.kind == 'static']
     counts = []
     for count in (len(rows) // 2, len(rows)):
         collector._packed([rows[:count]], arrays := [])

@@ -139,7 +139,9 @@ def test_a_delay_is_taken_at_its_size_like_offline():
 
     Those of all windows are taken anew where the search found the delay.
     """
-    pair = make_pair('driver_lag', 31, table='shaft', profile='sweeps')
+    pair = make_pair(
+        'driver_lag', 31, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0
+    )
     table = Table.from_mapping(pair.table)
     live = LiveCalibration(table, OPTIONS)
     for block in blocks(pair.first.imu, pair.first.joints):

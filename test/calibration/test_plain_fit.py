@@ -107,8 +107,8 @@ def world(kind, seed, gyroscope_model='bias+matrix'):
         patch.setattr(misfit_worlds, 'CAUSES', CAUSES)
         pair = misfit_worlds.make_pair(kind, seed, imu_rate=50.0, joint_rate=50.0)
     if kind == 'losses':
-        first, second = with_losses(pair.first, seed), with_losses(pair.second, seed + 1)
-        pair = replace(pair, first=first, second=second)
+        sessions = with_losses(pair.first, seed), with_losses(pair.second, seed + 1)
+        pair = replace(pair, made=sessions.__getitem__)
     table = Table.from_mapping(pair.table)
     options = CalibrationOptions(
         accelerometer_model='bias+matrix',

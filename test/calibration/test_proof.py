@@ -18,7 +18,6 @@ from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldO
 from imu_calibration.references.turntable.window_statistics import Regime, moving_pieces
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
-from worlds.candidates import FEW
 from worlds.misfit_worlds import make_pair
 
 SENSORS = ('accelerometer', 'gyroscope')
@@ -26,7 +25,7 @@ SENSORS = ('accelerometer', 'gyroscope')
 
 def calibrated(pair, **choices):
     return calibrate_recordings(
-        pair.first.block, Table.from_mapping(pair.table), **choices, candidates=FEW
+        pair.first.block, Table.from_mapping(pair.table), model_as_asked=True, **choices
     )
 
 
@@ -40,7 +39,6 @@ def late():
     return calibrated(
         make_pair('driver_lag', 1, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0),
         reference_model='table_tilt',
-        model_as_asked=True,
     )
 
 

@@ -8,16 +8,17 @@ from worlds.candidates import FEW
 from worlds.moments import LouderInMotion, LouderWithSpeed
 from worlds.physics import make_session
 
+QUICK = {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
+
 
 def test_noise_that_is_larger_in_motion_is_no_error_of_the_model():
-    session = make_session(
-        8, None, 'white', cause=LouderInMotion(4e-3), imu_rate=50.0, joint_rate=50.0
-    )
+    session = make_session(8, None, 'white', cause=LouderInMotion(4e-3), **QUICK)
     result = imu.calibrate(
         session.block,
         Table.from_mapping(session.table),
         accelerometer_model='bias+matrix',
         gyroscope_model='bias+matrix',
+        candidates=FEW,
     )
     assert max(misfit_ratios(result.calibration.statistics, 'gyroscope').values()) > NOTED_MISFIT
     found = motion_misfits(result.calibration)
@@ -27,9 +28,8 @@ def test_noise_that_is_larger_in_motion_is_no_error_of_the_model():
 
 def test_noise_that_grows_with_the_speed_is_no_unexplained_residual():
     # It was a place ("while the speed is 56 deg/s or more"), and effects were not applied.
-    session = make_session(
-        9242, None, 'white', cause=LouderWithSpeed((0.02, 2.6e-3)), imu_rate=50.0, joint_rate=50.0
-    )
+    cause = LouderWithSpeed((0.02, 2.6e-3))
+    session = make_session(9242, None, 'white', cause=cause, **QUICK)
     result = imu.calibrate(session.block, Table.from_mapping(session.table), candidates=FEW)
     assert 'unexplained' not in result.calibration.statistics
     assert max(misfit_ratios(result.calibration.statistics, 'gyroscope').values()) > 1.5

@@ -32,9 +32,11 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.compensation_cases import random_calibration
+from worlds.misfit_coverage import COARSE
 from worlds.misfit_worlds import SHAFT, make_pair, sweeps
 from worlds.physics import make_session
 
+REAL = COARSE | {'noise': 'realistic'}
 VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
 
 
@@ -45,7 +47,7 @@ def needed_motions(result, table):
 
 
 def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
-    pair = make_pair(None, 1, table='shaft', profile='sweeps')
+    pair = make_pair(None, 1, table='shaft', profile='sweeps', **COARSE)
     table = Table.from_mapping(pair.table)
     result = calibrate_recordings(
         pair.first.block, table, accelerometer_model='bias+matrix', model_as_asked=True
@@ -65,7 +67,7 @@ def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
     About the vertical one gravity stays where it is.
     """
     table = Table.from_mapping(VERTICAL)
-    session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
+    session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), **REAL)
     result = calibrate_recordings(
         SampleBlock(session.imu, session.joints),
         table,
@@ -95,7 +97,7 @@ def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
 
 def test_an_uncertain_gravity_needs_its_value_and_no_spins():
     """0.03 m/s^2 in 9.8 m/s^2 is 0.3 % of scale; more data do not reduce it."""
-    session = make_session(3, profile='quick', noise='realistic', grade='industrial')
+    session = make_session(3, profile='quick', **REAL)
     table = Table.from_mapping(session.table | {'gravity_sd': 0.03})
     result = calibrate_recordings(
         SampleBlock(session.imu, session.joints), table, model_as_asked=True
@@ -135,7 +137,7 @@ def test_bias_processes_of_a_misfit_are_its_error():
 
 def test_a_missing_effect_on_a_table_needs_its_cause_and_no_motions():
     """Arms of 3 cm that the model does not have: the residual is that of no moving bias."""
-    session = make_session(6, profile='short', noise='realistic', grade='industrial', arms=True)
+    session = make_session(6, profile='quick', arms=True, **REAL)
     result = calibrate_recordings(
         SampleBlock(session.imu, session.joints),
         Table.from_mapping(session.table),
@@ -156,7 +158,7 @@ def test_a_missing_effect_on_a_table_needs_its_cause_and_no_motions():
 )
 def test_a_missing_effect_that_shows_at_rest_only_needs_its_cause(effects, keys):
     """A g-sensitivity scatters the means at rest; a later or warmer recording scatters as much."""
-    session = make_session(9031, effects, profile='short', noise='realistic', grade='tactical')
+    session = make_session(9031, effects, profile='quick', grade='tactical', **REAL)
     found = calibrate_recordings(
         SampleBlock(session.imu, session.joints),
         Table.from_mapping(session.table),
@@ -176,7 +178,7 @@ def test_a_missing_effect_that_shows_at_rest_only_needs_its_cause(effects, keys)
 
 def test_an_effect_that_is_held_for_a_misfit_needs_its_cause_and_no_motions():
     """Arms are not in the model: a quadratic response takes their part, and is not believed."""
-    session = make_session(8, profile='short', noise='realistic', grade='industrial', arms=True)
+    session = make_session(8, profile='quick', arms=True, **REAL)
     found = calibrate_recordings(
         SampleBlock(session.imu, session.joints),
         Table.from_mapping(session.table),
@@ -198,7 +200,7 @@ def test_an_effect_that_is_held_for_a_misfit_needs_its_cause_and_no_motions():
 
 
 def test_a_weak_rate_of_the_earth_needs_the_place_and_no_motion():
-    session = make_session(8113, {'earth_rate': None}, profile='quick', noise='realistic')
+    session = make_session(8113, {'earth_rate': None}, profile='quick', **REAL)
     known = Table.from_mapping(session.table)
     nowhere = replace(
         known, gravity=known.gravity_value, latitude=None, height=None, azimuth_deg=None
@@ -210,7 +212,7 @@ def test_a_weak_rate_of_the_earth_needs_the_place_and_no_motion():
 
 def test_needs_and_verdict_have_one_rule_for_an_incomplete_model():
     """Its bias process is an error of the model, unless errors of the stamps explain it."""
-    session = make_session(6, profile='short', noise='realistic', grade='industrial')
+    session = make_session(6, profile='quick', **REAL)
     table = Table.from_mapping(session.table)
     result = calibrate_recordings(
         SampleBlock(session.imu, session.joints), table, model_as_asked=True
@@ -302,7 +304,7 @@ def test_a_ros_1_bag_is_told_how_to_be_converted(tmp_path):
 
 
 def test_the_report_shows_the_proof_by_motion():
-    pair = make_pair(None, 1)
+    pair = make_pair(None, 1, **COARSE)
     found = calibrate_recordings(
         pair.first.block, Table.from_mapping(pair.table), model_as_asked=True
     )

@@ -35,6 +35,7 @@ from imu_calibration.effects.forward_equations import (
 from imu_calibration.effects.sensor_model import SensorModel
 from tools.tolerance_file import rendered
 
+from worlds.candidates import FEW
 from worlds.random_motion import random_reference
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,18 +62,19 @@ def spoken_of(path):
     names = {name for _, name in CATALOGUE.effects()}
     cuts = [(name, k) for name in names for k, letter in enumerate(name) if letter == '_']
     parts = {name[k:] for name, k in cuts} | {name[: k + 1] for name, k in cuts} | {'time_constant'}
-    found, tree = [], ast.parse(path.read_text())
-    asked = {
-        id(node.left)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Compare)
-        and isinstance(node.ops[0], (ast.In, ast.NotIn))
-        and getattr(node.comparators[0], 'attr', '') not in ('uses', 'needs')
-    }
-    for node in ast.walk(tree):
-        text = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ''
-        if not re.fullmatch(r'[\w.+:@]+', text):
-            continue
+    found, texts, asked = [], [], set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Constant):
+            if isinstance(node.value, str) and re.fullmatch(r'[\w.+:@]+', node.value):
+                texts.append(node)
+        elif (
+            isinstance(node, ast.Compare)
+            and isinstance(node.ops[0], (ast.In, ast.NotIn))
+            and getattr(node.comparators[0], 'attr', '') not in ('uses', 'needs')
+        ):
+            asked.add(id(node.left))
+    for node in texts:
+        text = node.value
         words = re.split('[+.:@]', text)
         known = set(words) & names if words[0] not in ALSO_WORDS else set(words[1:]) & names
         if (
@@ -290,7 +292,11 @@ def test_compensation_takes_it_out_offline_and_live():
 def test_diagnosis_finds_and_names_it(name):
     made = session(name)
     found = imu.diagnose(
-        made.samples, made.table, catalogue=MINE, accelerometer_model=ASKED['accelerometer']
+        made.samples,
+        made.table,
+        catalogue=MINE,
+        candidates=FEW,
+        accelerometer_model=ASKED['accelerometer'],
     )
     assert [finding.effect for finding in found.findings] == [name]
     truth, model = made.truth.value(SENSOR[name], name), found.calibration.model

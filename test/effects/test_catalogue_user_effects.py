@@ -387,7 +387,7 @@ def test_the_example_file_is_a_catalogue_whose_effects_are_found():
         truth,
         table,
         profile=make_profile('quick', 3, table),
-        options=SimulationOptions(noise=GRADES['industrial'].noise),
+        options=SimulationOptions(50.0, 50.0, GRADES['industrial'].noise),
         seed=3,
     )
     found = calibrate_recordings(

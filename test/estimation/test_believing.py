@@ -16,7 +16,7 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 
-from worlds.misfit_coverage import calibrated
+from worlds.misfit_coverage import calibrated, clean
 from worlds.misfit_worlds import SHAFT, make_pair
 from worlds.physics import TABLES
 
@@ -88,8 +88,7 @@ def test_a_scale_that_only_misfit_gives_is_held_and_named(upright):
 
 def test_a_wrong_full_scale_setting_is_no_misfit():
     """A gyroscope that reads twice the rate keeps its factor: it fits."""
-    session = make_pair(None, 11).first
-    table, found = Table.from_mapping(TABLES['three_axis']), calibrated(session)
+    table, found = Table.from_mapping(TABLES['three_axis']), clean(11)
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     doubled = solved(
         [replace(window, rate_s=2 * window.rate_s) for window in found.windows], model, table
@@ -118,10 +117,7 @@ def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
 
     The standard deviations are as they were.
     """
-    windows, table = (
-        calibrated(make_pair(None, 11).first).windows,
-        Table.from_mapping(TABLES['three_axis']),
-    )
+    windows, table = clean(11).windows, Table.from_mapping(TABLES['three_axis'])
     model = SensorModel(
         accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(table.joint_names)
     )

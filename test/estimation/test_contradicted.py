@@ -19,8 +19,7 @@ from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 
-from worlds.misfit_coverage import calibrated
-from worlds.misfit_worlds import make_pair
+from worlds.misfit_coverage import clean
 from worlds.physics import TABLES
 
 TABLE = Table.from_mapping(TABLES['three_axis'])
@@ -32,7 +31,7 @@ LEAN, BUMP = np.array([0.04, -0.03, 0.01]), 8.0
 @pytest.fixture(scope='module')
 def session():
     """A clean session of realistic noise, calibrated."""
-    return calibrated(make_pair(None, 501).first)
+    return clean(501)
 
 
 def accumulated(windows):

@@ -25,7 +25,7 @@ from imu_calibration.references.turntable.accumulator import Accumulator, restri
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 
-from worlds.misfit_coverage import base_sd, calibrated, errors_in_sd
+from worlds.misfit_coverage import COARSE, base_sd, calibrated, clean, errors_in_sd
 from worlds.misfit_worlds import make_pair
 from worlds.physics import TABLES
 
@@ -37,7 +37,7 @@ YAW = 'gyroscope.matrix.zx'
 @pytest.fixture(scope='module')
 def windows():
     """Windows of a clean session."""
-    return calibrated(make_pair(None, 11).first).windows
+    return clean(11).windows
 
 
 def measured(windows, change_of, seed):
@@ -109,7 +109,7 @@ def test_errors_that_go_with_the_motion_are_in_the_standard_deviations(cause):
 
     With what the blocks show they are as large as they should be.
     """
-    errors = [errors_in_sd(calibrated(make_pair(cause, seed).first)) for seed in (21, 22)]
+    errors = [errors_in_sd(calibrated(make_pair(cause, seed, **COARSE).first)) for seed in (21, 22)]
     alone, with_it = (
         np.concatenate(
             [
@@ -214,7 +214,7 @@ def test_biases_carry_what_goes_with_the_attitude_as_offsets_or_as_a_bias_too_fa
     The mean of what it adds is as large as its scatter, which the noise takes for a process of 6 s
     here.
     """
-    found = calibrated(make_pair('flexible_mount', 9313).first)
+    found = calibrated(make_pair('flexible_mount', 9313, **COARSE).first)
     noise, part = (
         found.solution.noise['accelerometer'],
         found.solution.model.slices['accelerometer', 'bias'],

@@ -118,12 +118,12 @@ def test_biases_that_differ_get_a_value_each(motion):
 
 def test_biases_that_agree_stay_one(motion):
     """
-    Without steps, four pairs of recordings are treated as one.
+    Without steps, two pairs of recordings are treated as one.
 
     The bias is known better than from a single recording.
     """
     sds = bias_sds(motion)
-    for seed in range(4):
+    for seed in range(2):
         system = recordings(
             motion,
             random_values(MODEL, 'industrial', seed),

@@ -120,7 +120,6 @@ FIRST = np.array([-1, 9, -45, 0, 45, -9, 1]) / (60 * STEP)  # sixth-order differ
 SECOND = np.array([2, -27, 270, -490, 270, -27, 2]) / (180 * STEP**2)
 
 
-@settings(max_examples=40, deadline=None)
 @given(table=tables(), seed=st.integers(0, 1000))
 def test_rate_is_the_derivative_of_the_attitude(table, seed):
     table = replace(table, azimuth_deg=None)
@@ -138,7 +137,6 @@ def test_rate_is_the_derivative_of_the_attitude(table, seed):
     )
 
 
-@settings(max_examples=40, deadline=None)
 @given(table=tables(), seed=st.integers(0, 1000))
 def test_angular_acceleration_is_the_derivative_of_the_rate(table, seed):
     """Against inertial space, in the turning frame: the Earth's rate is included."""
@@ -146,7 +144,6 @@ def test_angular_acceleration_is_the_derivative_of_the_rate(table, seed):
     np.testing.assert_allclose(FIRST @ ref.rate_s, ref.alpha_s[3], atol=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
 @given(table=tables(), seed=st.integers(0, 1000))
 def test_force_is_gravity_and_the_acceleration_of_the_reference_point(table, seed):
     table = replace(table, azimuth_deg=None)
@@ -263,7 +260,6 @@ def test_azimuth_is_that_of_the_base_x_axis():
     assert heading == pytest.approx(30.0)
 
 
-@settings(max_examples=30)
 @given(table=tables(), angles=st.tuples(number, number))
 def test_tilt_turns_up_and_north_together(table, angles):
     table = replace(table, latitude=30.0, azimuth_deg=20.0)

@@ -19,7 +19,6 @@ from msg_adapters import csv_log
 from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv
 
-from worlds.candidates import FEW
 from worlds.hand_sessions import simulate
 
 PLAIN = 'time,ax,ay,az,gx,gy,gz'
@@ -265,16 +264,18 @@ def test_verbs_read_logs_and_convert_writes_the_same_bag(tmp_path, imu, capsys):
     path = write(tmp_path / 'log.csv', PLAIN, seconds(imu), imu.force_s, imu.rate_s)
     assert main(['convert', str(path), '--output', str(tmp_path / 'bag')]) == 0
     assert 'ax,ay,az' in capsys.readouterr().out
-    from_log = imu_calibration.calibrate(path, gravity=STANDARD_GRAVITY, candidates=FEW).calibration
+    from_log = imu_calibration.calibrate(
+        path, gravity=STANDARD_GRAVITY, model_as_asked=True
+    ).calibration
     from_bag = imu_calibration.calibrate(
-        tmp_path / 'bag', gravity=STANDARD_GRAVITY, candidates=FEW
+        tmp_path / 'bag', gravity=STANDARD_GRAVITY, model_as_asked=True
     ).calibration
     from_arrays = imu_calibration.calibrate(
         time=seconds(imu),
         force=imu.force_s,
         rate=imu.rate_s,
         gravity=STANDARD_GRAVITY,
-        candidates=FEW,
+        model_as_asked=True,
     ).calibration
     for other in (from_bag, from_arrays):
         np.testing.assert_allclose(other.values, from_log.values, rtol=1e-6, atol=1e-9)
@@ -297,7 +298,7 @@ def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_us
         'read_csv',
         lambda path, *given, **named: reads.append(path) or read_csv(path, *given, **named),
     )
-    imu_calibration.calibrate(path, gravity=STANDARD_GRAVITY, candidates=FEW)
+    imu_calibration.calibrate(path, gravity=STANDARD_GRAVITY, model_as_asked=True)
     assert len(reads) == 1
     bag = csv_log._converted(
         path, path.stat().st_mtime_ns, path.stat().st_size, csv_log.LogOptions()

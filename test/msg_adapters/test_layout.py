@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from refusal import refused
 from rosbags.typesys import Stores, get_typestore
@@ -35,7 +35,6 @@ TYPES = STORE.types
 GENERAL = {
     message_type: deserializer(message_type, {}) for message_type in (IMU_TYPE, JOINT_STATE_TYPE)
 }
-quick = settings(max_examples=40, deadline=None, derandomize=True)
 
 frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=20)
 doubles = st.floats(allow_nan=True, width=64)
@@ -76,7 +75,6 @@ def serialize(message, little=True):
 imu_messages = st.builds(imu_message, stamps, frames, st.lists(doubles, min_size=37, max_size=37))
 
 
-@quick
 @given(imu_messages, orders)
 def test_imu_fields_are_those_of_rosbags(message, little):
     data = serialize(message, little)
@@ -100,7 +98,6 @@ def test_imu_fields_are_those_of_rosbags(message, little):
     )
 
 
-@quick
 @given(st.text() | st.binary(max_size=400))
 def test_a_name_is_one_short_line_whatever_a_recording_contains(name):
     clean = clean_name(name)
@@ -114,7 +111,6 @@ def test_a_name_is_one_short_line_whatever_a_recording_contains(name):
     assert clean_name('imu\n1,\x1b[2J\u202e') == 'imu?1,?[2J?'
 
 
-@quick
 @given(imu_messages, orders, frames, st.lists(doubles, min_size=3, max_size=3))
 def test_a_patched_imu_is_what_rosbags_would_write(message, little, frame, force):
     patched = patch_imu(serialize(message, little), frame_id=frame, force_s=force)
@@ -123,7 +119,6 @@ def test_a_patched_imu_is_what_rosbags_would_write(message, little, frame, force
     assert patched == serialize(message, little)
 
 
-@quick
 @given(st.lists(st.tuples(imu_messages, orders), min_size=1, max_size=30))
 def test_any_mixture_of_layouts_gives_the_general_path_s_samples(messages):
     packed = Packed.join([serialize(*pair) for pair in messages])
@@ -154,7 +149,6 @@ def joint_messages(draw, table):
     )
 
 
-@quick
 @given(
     st.lists(st.tuples(joint_messages(['outer', 'middle', 'i']), orders), min_size=1, max_size=12)
 )
@@ -182,7 +176,6 @@ def test_messages_without_names_do_not_choose_the_joints():
     assert decoder.dropped == {NO_NAMES: 2}
 
 
-@quick
 @given(st.binary(max_size=400), imu_messages, st.integers(0, 400))
 def test_broken_bytes_are_counted_and_never_raise(noise, message, cut):
     whole = serialize(message)
@@ -302,7 +295,6 @@ def test_a_trajectory_is_written_whatever_the_order_of_its_arrays_in_memory():
     )
 
 
-@quick
 @given(st.lists(frames, max_size=4, unique=True), st.integers(0, 5), st.integers(0, 2), frames)
 def test_a_trajectory_is_written_as_rosbags_reads_it_and_comes_back(
     names, n_points, n_derivatives, frame

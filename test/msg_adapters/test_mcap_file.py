@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from test_bag import make_session
 
@@ -136,7 +136,6 @@ def test_an_index_that_is_wrong_is_not_believed(tmp_path, parts):
     )
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     st.lists(st.tuples(st.integers(1, 3), st.integers(0, 40), st.integers(1, 40)), max_size=20),
     st.integers(0, 30),

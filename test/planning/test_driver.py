@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from refusal import refused
 
@@ -395,7 +395,6 @@ def random_limits(seed):
     )
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(0, 10**6), st.floats(0.5, 4.0))
 def test_no_limit_of_any_table_is_ever_exceeded_by_what_is_sent(seed, hurry):
     limits = random_limits(seed)

@@ -25,7 +25,6 @@ from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.diagnose import diagnose
 
-from worlds.candidates import FEW
 from worlds.misfit_worlds import make_pair
 
 
@@ -365,12 +364,12 @@ def test_a_gyroscope_that_repeats_one_reading_on_a_shaft_is_left_out(shaft):
     start = moving[len(moving) // 2]
     rate[start : start + 1000] = rate[start]
     found = calibrate_recordings(
-        replace(shaft[0], imu=replace(shaft[0].imu, rate_s=rate)), shaft[1], candidates=FEW
+        replace(shaft[0], imu=replace(shaft[0].imu, rate_s=rate)), shaft[1], model_as_asked=True
     )
     (frozen,) = [each for each in found.result.gathered.findings if each.samples]
     assert frozen.check == 'frozen' and frozen.samples == pytest.approx(1000, abs=50)
     assert found.exit_code == 3 and found.calibration.decisions['gyroscope'] == 'helps'
-    whole = calibrate_recordings(*shaft, candidates=FEW).calibration
+    whole = calibrate_recordings(*shaft, model_as_asked=True).calibration
     away = found.calibration.values - whole.values
     assert (np.abs(away) <= 2 * found.calibration.sd).all()
 
@@ -379,7 +378,7 @@ def test_a_wrong_gain_is_no_frozen_joint(gimbals):
     assert calibrate_recordings(
         replace(gimbals[0], imu=replace(gimbals[0].imu, rate_s=1.1 * gimbals[0].imu.rate_s)),
         gimbals[1],
-        candidates=FEW,
+        model_as_asked=True,
     ).calibration
 
 

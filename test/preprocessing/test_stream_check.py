@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
@@ -126,7 +126,6 @@ STEPS = st.sampled_from(
 )
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
 @given(
     st.lists(STEPS, min_size=1, max_size=60),
     st.lists(st.integers(0, 60), max_size=12),

@@ -55,7 +55,7 @@ def result():
         values,
         TABLE,
         profile=make_profile('quick', 9, TABLE),
-        options=SimulationOptions(noise=GRADES['industrial'].noise),
+        options=SimulationOptions(50.0, 50.0, GRADES['industrial'].noise),
         seed=9,
     )
     block = SampleBlock(imu, joints)

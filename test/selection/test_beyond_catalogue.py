@@ -238,7 +238,8 @@ def test_shares_are_of_the_locked_windows():
 
 
 def test_the_place_is_found():
-    row, known = row_of(6, 'cable_in_an_arc', 'white', Beyond('cable_in_an_arc', 6))
+    cause = Beyond('cable_in_an_arc', 6)
+    row, known = row_of(6, 'cable_in_an_arc', 'white', cause, candidates=FEW)
     assert row['flagged'] and row['f1'] > 0.7 and row['axis'] and not row['found'], row
     assert len(known) == 24 and all(sd > 0 for _, sd in known.values())
 

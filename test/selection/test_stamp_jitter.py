@@ -72,7 +72,7 @@ def test_no_jitter_changes_nothing():
 
 def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
     """Independent errors of 50 us at 1 rad/s are 0.5 mm/s^2, six times the noise of this grade."""
-    recording = record(5, None, 'realistic@navigation', through_bag=False)
+    recording = record(5, None, 'realistic@navigation', through_bag=False, profile='quick')
     diagnosis = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
     assert diagnosis_mapping(diagnosis)['stamp_jitter_s'] == pytest.approx(50e-6, rel=0.1)
@@ -80,7 +80,7 @@ def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
 
 
 def test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model():
-    session = make_session(6, None, 'realistic', grade='navigation')
+    session = make_session(6, None, 'realistic', grade='navigation', profile='quick')
     result = imu.calibrate(session.block, Table.from_mapping(session.table), candidates=FEW)
     entry = result.calibration.statistics['stamp_jitter']
     assert (

@@ -36,7 +36,8 @@ FEW = (
 
 def alone(sensor, seed=9420, value=np.nan, **options):
     """Return (session, block) of a session with the readings of one sensor."""
-    session = make_session(seed, profile='quick', noise='realistic', arms=True, **options)
+    options = {'imu_rate': 50.0, 'joint_rate': 50.0, 'arms': True} | options
+    session = make_session(seed, profile='quick', noise='realistic', **options)
     (other,) = set(READINGS) - {sensor}
     column = READINGS[other]
     gone = np.full_like(getattr(session.imu, column), value)

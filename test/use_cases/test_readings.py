@@ -22,7 +22,6 @@ from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
-from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 
 G, DEG = 9.80665, np.pi / 180
@@ -70,7 +69,7 @@ def in_g(truth):
     raw = in_units(truth[0], 'g', 'deg/s')
     units = {'accelerometer_unit': 'g', 'gyroscope_unit': 'deg/s'}
     return calibrate_recordings(
-        SampleBlock(raw), gravity=GRAVITY, candidates=FEW, **units
+        SampleBlock(raw), gravity=GRAVITY, model_as_asked=True, **units
     ).calibration
 
 
@@ -100,7 +99,7 @@ def test_units_travel_from_the_recording_to_the_corrected_readings(truth, force_
     raw = in_units(imu, force_unit, rate_unit)
     units = {'accelerometer_unit': force_unit, 'gyroscope_unit': rate_unit}
     found = calibrate_recordings(
-        SampleBlock(raw), gravity=GRAVITY, candidates=FEW, **units
+        SampleBlock(raw), gravity=GRAVITY, model_as_asked=True, **units
     ).calibration
     assert max_z(found, values) < 5.0
     assert found.readings.accelerometer.scale == pytest.approx(1 / SIZES[force_unit], rel=1e-12)
@@ -182,7 +181,7 @@ def test_rates_at_another_scale_than_the_calibrated_one_are_a_caution_or_refused
 def test_compensate_refuses_rates_in_another_unit(tmp_path, truth, rate_unit):
     """The whole recording is needed for it: no turn lies at its beginning."""
     imu, _, _ = truth
-    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY, candidates=FEW).calibration
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY, model_as_asked=True).calibration
     raw = in_units(imu, 'm/s^2', rate_unit)
     with pytest.raises(InputError) as caught:
         compensate_recording(SampleBlock(raw), found)
@@ -237,7 +236,7 @@ def test_counts_of_a_text_log_are_stated_for_calibrate_and_compensate(tmp_path, 
     log = tmp_path / 'log.csv'
     np.savetxt(log, rows, '%.4f', ',', header='time (s),ax,ay,az,gx,gy,gz', comments='')
     units = {'accelerometer_unit': 'counts:4096/g', 'gyroscope_unit': 'counts:65.5/(deg/s)'}
-    found = calibrate_recordings(log, gravity=GRAVITY, candidates=FEW, **units).calibration
+    found = calibrate_recordings(log, gravity=GRAVITY, model_as_asked=True, **units).calibration
     assert max_z(found, values) < 5.0
     corrected = compensate_recording(log, found).imu
     np.testing.assert_allclose(lengths_at_rest(corrected, ranges), GRAVITY, rtol=1e-3)

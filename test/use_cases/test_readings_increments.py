@@ -17,7 +17,6 @@ from imu_calibration.use_cases.inspect import imu_topics_of
 from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.csv_log import LogOptions
 
-from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 
 G, DEG = 9.80665, np.pi / 180
@@ -48,7 +47,7 @@ def test_increments_are_detected_stated_stored_and_applied(session):
     assert float(caught.value.value) == pytest.approx(per_second, rel=1e-3)
 
     found = calibrate_recordings(
-        raw, gravity=GRAVITY, increments=per_second, candidates=FEW
+        raw, gravity=GRAVITY, increments=per_second, model_as_asked=True
     ).calibration
     bias_f, _, _, matrix_w = unpack(values)
     np.testing.assert_allclose(parameters(found, 'accelerometer', 'bias'), bias_f, atol=5e-3)
@@ -120,7 +119,7 @@ def test_a_log_of_increments_names_the_option(tmp_path, session, header):
     assert (caught.value.code, caught.value.key) == ('increments', 'increments')
     assert len(imu_topics_of(log, Topics(log=LogOptions(raw=('force', 'rate'))))) == 1
     found = calibrate_recordings(
-        log, gravity=GRAVITY, increments=per_second, candidates=FEW
+        log, gravity=GRAVITY, increments=per_second, model_as_asked=True
     ).calibration
     np.testing.assert_allclose(
         parameters(found, 'accelerometer', 'bias'), unpack(values)[0], atol=5e-3

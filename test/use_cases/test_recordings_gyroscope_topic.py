@@ -22,7 +22,6 @@ from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu
 
-from worlds.candidates import FEW
 from worlds.small_hand import ACCELEROMETER, GRAVITY, GYROSCOPE, hand_motion
 
 
@@ -52,7 +51,7 @@ def bag(tmp_path_factory):
 @pytest.fixture(scope='module')
 def calibration(bag):
     return calibrate_recordings(
-        bag, imu_topic='/accel', gyroscope_topic='/gyro', gravity=GRAVITY, candidates=FEW
+        bag, imu_topic='/accel', gyroscope_topic='/gyro', gravity=GRAVITY, model_as_asked=True
     ).calibration
 
 

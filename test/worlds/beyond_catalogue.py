@@ -35,13 +35,15 @@ def hidden_row(seed, kind, noise, *, known, size=1.0):
     return row | {'known_bias': float(np.sqrt(np.mean(np.square(moved))))}
 
 
-def row_of(seed, kind, noise, cause=None):
-    """Return (row, bias and matrix of both sensors as estimated)."""
-    recording = record(
-        seed, None, noise, through_bag=False, **({} if cause is None else {'cause': cause})
-    )
+def row_of(seed, kind, noise, cause=None, *, candidates=None, **options):
+    """
+    Return (row, bias and matrix of both sensors as estimated).
+
+    `candidates` as for `use_cases.diagnose.diagnose`, `options` as for `physics.make_session`.
+    """
+    recording = record(seed, None, noise, through_bag=False, cause=cause, **options)
     start = time.process_time()
-    found = diagnose(recording.windows, recording.table, recording.model)
+    found = diagnose(recording.windows, recording.table, recording.model, candidates=candidates)
     row = {
         'part': 'beyond',
         'kind': kind,

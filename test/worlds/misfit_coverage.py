@@ -11,6 +11,7 @@ and how much wider than by noise alone the standard deviations are.
 
 import argparse
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from worlds.misfit_worlds import CAUSES, make_pair
 
 OPTIONS = CalibrationOptions('bias+matrix', 'bias+matrix', 'time_offset')
 """The timing is asked, as a search would: a lag is not what these worlds are about."""
+COARSE = {'imu_rate': 50.0, 'joint_rate': 50.0}
+"""Rates of sessions in tests."""
 GROUPS = tuple(
     f'{sensor}.{name}' for sensor in ('accelerometer', 'gyroscope') for name in ('bias', 'matrix')
 )
@@ -61,6 +64,12 @@ def calibrated(session, options=OPTIONS):
             break
         model = again
     return Calibrated(windows, solution, session.truth)
+
+
+@lru_cache(maxsize=None)
+def clean(seed):
+    """Return a session in which all is as the model has it, calibrated; made once."""
+    return calibrated(make_pair(None, seed, **COARSE).first)
 
 
 def base_sd(solution):

@@ -7,7 +7,9 @@ where it acts: the motor moves the table, the encoder is read, the fixture gives
 runs, the driver stamps.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
@@ -296,18 +298,26 @@ CAUSES = {
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two sessions of one unit in one world."""
+    """Two sessions of one unit in one world, each made when it is first read."""
 
     cause: str | None
     """Name in `CAUSES`; None: a clean world."""
-    first: Session
-    """To calibrate on."""
-    second: Session
-    """To compensate: another motion, other noise, another start."""
+    made: Callable[[int], Session]
+    """Makes the first session (0) or the second (1)."""
+
+    @cached_property
+    def first(self) -> Session:
+        """Return the session to calibrate on."""
+        return self.made(0)
+
+    @cached_property
+    def second(self) -> Session:
+        """Return the session to compensate: another motion, other noise, another start."""
+        return self.made(1)
 
     @property
     def table(self):
-        """Table description, as in the table's YAML."""
+        """Return the table description, as in the table's YAML."""
         return self.first.table
 
 
@@ -340,23 +350,23 @@ def make_pair(
         As for `worlds.physics.make_session`.
 
     """
-    sessions = []
-    for number in range(2):
-        acting = None if cause is None else CAUSES[cause](size, generator(seed, 'cause ' + cause))
+    kind = None if cause is None else CAUSES[cause]
+
+    def made(number):
+        acting = None if kind is None else kind(size, generator(seed, f'cause {cause}'))
         motion = sweeps(1.0 + 0.25 * number) if profile == 'sweeps' else profile
-        sessions.append(
-            make_session(
-                2 * seed + number,
-                noise=noise,
-                grade=grade,
-                table=SHAFT if table == 'shaft' else table,
-                profile=motion,
-                unit=seed,
-                cause=acting,
-                **options,
-            )
+        return make_session(
+            2 * seed + number,
+            noise=noise,
+            grade=grade,
+            table=SHAFT if table == 'shaft' else table,
+            profile=motion,
+            unit=seed,
+            cause=acting,
+            **options,
         )
-    return Pair(cause, *sessions)
+
+    return Pair(cause, made)
 
 
 def sweeps(pace=1.0, seconds=100.0):
