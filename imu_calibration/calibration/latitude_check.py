@@ -114,10 +114,10 @@ def latitude_findings(
     free = next((effect for effect in model.effects if effect.known_size), None)
     if free is not None:
         return _of_free_rate(solution, table, model.slices[free.key])
-    if table.azimuth_deg is not None and windows is not None:
-        named = model.find('gyroscope', Role.CROSS) is not None
-        return _of_windows(windows, table, NAMED_SDS if named else CONTRADICTING_SDS)
-    return ()
+    if windows is None or table.azimuth_deg is None:
+        return ()
+    named = model.find('gyroscope', Role.CROSS) is not None
+    return _of_windows(windows, table, NAMED_SDS if named else CONTRADICTING_SDS)
 
 
 def _of_free_rate(solution: Solution, table: Table, part: slice) -> tuple[CheckFinding, ...]:

@@ -142,12 +142,13 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
     if turn is None:
         return ()
     # The axis of the last joint is the same in both links that it connects.
-    last_axis = table.mat_sl @ np.array(table.joints[-1].axis)
+    last_joint = table.joints[-1]
+    last_axis = table.mat_sl @ np.array(last_joint.axis)
     severe = turn.agreed and turn.angle >= LEAST_COMMON_TURN
     if not severe and not turn.noted(last_axis):
         return ()
     zero = ''
-    if table.joints[-1].turns and abs(last_axis @ turn.vector) > ALONG * turn.angle:
+    if last_joint.turns and abs(last_axis @ turn.vector) > ALONG * turn.angle:
         zero = f' (or the zero of {table.joint_names[-1]}, which has the same effect)'
     angles = np.round(mount_rpy_deg(turn.matrix, table), 2)
     fits = ', '.join(f'{value + 0.0:.2f}' for value in angles)

@@ -254,7 +254,8 @@ def _earth_known(table):
 
     Without latitude or azimuth its three components in the level frame are unknowns.
     """
-    if table.latitude is None or table.azimuth_deg is None:
+    earth_rate = table.earth_rate_n
+    if earth_rate is None:
         return None
     return (
         'the reference holds the rotation of the Earth already, from latitude and azimuth',

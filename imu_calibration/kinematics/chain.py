@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from imu_calibration.kinematics.rotations import Reference, align, cross, earth_rate_n, rotation
+from imu_calibration.kinematics.rotations import Reference, align, cross, rotation
 from imu_calibration.kinematics.table import (
     Table,
     axis_angles,
@@ -413,8 +413,9 @@ def _base_columns(table):
     columns = np.zeros((3, 6, 1))
     mat_bn = table.mat_nb.T
     columns[:, :3, 0] = mat_bn
-    if table.latitude is not None and table.azimuth_deg is not None:
-        columns[:, 3, 0] = mat_bn @ earth_rate_n(table.latitude, table.azimuth_n_deg)
+    earth_rate = table.earth_rate_n
+    if earth_rate is not None:
+        columns[:, 3, 0] = mat_bn @ earth_rate
     columns[:, 5, 0] = table.gravity_value * mat_bn[:, 2]
     return columns
 

@@ -27,6 +27,7 @@ from imu_calibration.kinematics.joint import (
 from imu_calibration.kinematics.rotations import (
     NORMAL_GRAVITY_ACCURACY,
     align,
+    earth_rate_n,
     normal_gravity,
     rotation_from_rpy,
 )
@@ -335,6 +336,14 @@ class Table:
         return (
             None if self.azimuth_deg is None else self.azimuth_deg + base_heading_deg(self.mat_nb)
         )
+
+    @property
+    def earth_rate_n(self) -> np.ndarray | None:
+        """Earth's rate in n, rad/s, shape (3,); None without latitude or azimuth."""
+        azimuth = self.azimuth_n_deg
+        if self.latitude is None or azimuth is None:
+            return None
+        return earth_rate_n(self.latitude, azimuth)
 
 
 def site_from_mapping(site: Mapping[str, Any]) -> dict[str, Any]:

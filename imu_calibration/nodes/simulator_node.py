@@ -27,7 +27,6 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.kinematics.motion_limits import limits_of
-from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, run_node
@@ -281,8 +280,8 @@ class SimulatorNode(Node):
             if settings.profile in NO_PROFILE
             else make_profile(settings.profile, settings.seed, table)
         )
-        if profile is not None and profile.table is not None:
-            table = Table.from_mapping(profile.table)
+        if profile is not None:
+            table = profile.table_moved(table)
         return table, TableController(
             profile,
             tuple(table.joint_names),

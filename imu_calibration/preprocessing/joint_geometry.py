@@ -169,14 +169,15 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
 
 def _corrections(readings: MovingReadings, table: Table) -> Iterator[Correction]:
     """Yield the best change of the zeros, then another axis of each joint."""
-    if table.joint_names.zeros:
+    zero_names = table.joint_names.zeros
+    if zero_names:
         zeros = _fitted(
             lambda zeros: readings.rate_residual(table, _shifted(readings.motion, table, zeros)),
-            len(table.joint_names.zeros),
+            len(zero_names),
         )
         words = ', '.join(
             f'{name} reads {np.degrees(-zero):.2f} deg too much'
-            for name, zero in zip(table.joint_names.zeros, zeros)
+            for name, zero in zip(zero_names, zeros)
         )
         yield readings.correction(words, table, _shifted(readings.motion, table, zeros))
     for k, name in enumerate(table.joint_names):

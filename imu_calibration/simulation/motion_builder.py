@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.motion_limits import MotionLimits, free_limits
+from imu_calibration.kinematics.table import Table
 
 # Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the
 # septic and a rate blended by the quintic both have continuous position, rate, acceleration and
@@ -137,6 +138,10 @@ class Profile:
     Description of the table that the profile is made for (as in the table's YAML), when it brings
     its own.
     """
+
+    def table_moved(self, given: Table) -> Table:
+        """Return the table that moves: that of the profile if it has one, otherwise `given`."""
+        return given if self.table is None else Table.from_mapping(self.table)
 
     @property
     def edges(self) -> np.ndarray:

@@ -175,6 +175,7 @@ def make_profile(
             code='profile_unknown',
         )
     entry = _REGISTRY[name]
+    table = entry.table or table
     joint_names = _joint_names(entry, table)
     fits = entry.n_joints in (None, len(joint_names))
     if not (fits or entry.adapts):
@@ -183,11 +184,8 @@ def make_profile(
             f" {len(joint_names)}; choose 'any_table'",
             code='joint_count',
         )
-    limits = (
-        limits_of(table)
-        if isinstance(table, Table) and entry.table is None
-        else free_limits(len(joint_names))
-    )
+    # A description in a mapping states no limits.
+    limits = limits_of(table) if isinstance(table, Table) else free_limits(len(joint_names))
     build = (
         within_limits
         if entry.adapts and not limits.endless.all()
@@ -230,8 +228,6 @@ def _require_within(profile, limits):
 
 
 def _joint_names(entry, table):
-    if entry.table is not None:
-        return tuple(joint['name'] for joint in entry.table['joints'])
     if table is None:
         return THREE_AXIS if entry.n_joints in (None, 3) else THREE_AXIS[:1] + THREE_AXIS[2:]
     if isinstance(table, dict):

@@ -150,9 +150,8 @@ def turning_world(table: Table, model: SensorModel) -> Table:
     Without an azimuth in the description north is along base x; calibration estimates it. An
     Earth's rate that the model states is that of the world already.
     """
-    if table.latitude is None or table.azimuth_deg is not None:
-        return table
-    if any(effect.known_size for effect in model.effects):
+    is_stated = any(effect.known_size for effect in model.effects)
+    if is_stated or table.latitude is None or table.azimuth_deg is not None:
         return table
     return replace(table, azimuth_deg=0.0)
 

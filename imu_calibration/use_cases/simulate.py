@@ -147,7 +147,7 @@ def simulate(
     report('simulating')
     given = table_of(table or config_file('table_simulated.yaml'))
     motion = make_profile(profile, seed, given, duration=duration)
-    mover = given if motion.table is None else Table.from_mapping(motion.table)
+    mover = motion.table_moved(given)
     given_imu = None if calibration is None else files.given_calibration(calibration)
     model, values = true_imu(
         mover,

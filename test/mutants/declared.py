@@ -939,8 +939,8 @@ SIGNS = _of(
     (
         'another latitude reads as a g-sensitivity',
         'latitude_findings',
-        '_1.azimuth_deg is not None and _2 is not None',
-        'False',
+        '_1 is None or _2.azimuth_deg is None',
+        'True',
         'test_latitude_check.py',
     ),
     (
