@@ -20,27 +20,50 @@ Factors = dict[str, list[np.ndarray]]
 """Sensor -> triangular factor of the whitened rows of each axis (`WeightedSystem.factors`)."""
 
 
+def weak_alone(data: np.ndarray, prior_sd: np.ndarray) -> np.ndarray:
+    """
+    Return a mask of the parameters that are undetermined even if all other ones were known.
+
+    `data`: weighted design without priors, shape (m, n).
+    """
+    return HELD_SHARE * prior_sd * np.linalg.norm(data, axis=0) < 1
+
+
 def undetermined_parameters(
-    system: WeightedSystem, values: np.ndarray, factors: Factors, *, free: np.ndarray
+    rows: np.ndarray,
+    prior_sd: np.ndarray,
+    *,
+    free: np.ndarray,
+    held: np.ndarray,
+    tie: float = 1.0,
 ) -> np.ndarray:
     """
     Return a mask of the parameters whose standard deviation exceeds a share of the prior's.
 
-    First the parameters that are weak even if all other parameters were known; then one at a time,
-    given the ones fixed before: of parameters of which only the sum is observable, one stays free.
+    One at a time, the one with the largest share, given the ones fixed before: of parameters of
+    which only the sum is observable, one stays free.
+
+    Parameters
+    ----------
+    rows : array, shape (m, n)
+        Weighted design with rows of a prior, which may be as wide as to leave only the data.
+    prior_sd : array, shape (n,)
+    free, held : array of bool, shape (n,)
+        Parameters under test, and those of them that are fixed in any case.
+    tie : float
+        Part of the largest share from which a parameter is as weak: the first of these is fixed,
+        below 1 independent of rounding.
+
     """
-    data, prior = system.jacobian(values, factors), system.prior
-    jacobian = np.concatenate([data, prior.root])
-    held = free & (HELD_SHARE * prior.sd * np.linalg.norm(data, axis=0) < 1)
-    while True:
-        estimated = free & ~held
-        share = np.zeros(len(values))
-        variances = np.diag(inverse_gram(jacobian[:, estimated]))
-        share[estimated] = np.sqrt(variances) / prior.sd[estimated]
+    held = held.copy()
+    while np.any(estimated := free & ~held):
+        share = np.zeros(len(prior_sd))
+        variances = np.diag(inverse_gram(rows[:, estimated]))
+        share[estimated] = np.sqrt(variances) / prior_sd[estimated]
         if not np.any(share > HELD_SHARE):
-            return held
-        # The first of equal values, independent of rounding.
-        held[np.argmax(share > 0.99 * share.max())] = True
+            break
+        held[np.argmax(share >= tie * share.max())] = True
+    return held
 
 
 def implausible_parameters(

@@ -16,9 +16,9 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.group_variances import GroupVariances, estimate_group_variances
+from imu_calibration.estimation.held_parameters import undetermined_parameters
 from imu_calibration.estimation.scaled_solve import (
     covariance_with_held,
-    inverse_gram,
     triangular_of_band,
 )
 from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
@@ -32,8 +32,6 @@ enough for rounding.
 """
 LEAST_START_VARIANCE = 0.01
 """Least variance of a component in the second iteration, as a share of its fallback."""
-HELD_RATIO = 0.5
-"""A parameter whose sd exceeds this share of its prior's is fixed at its nominal value."""
 FIRST_STEPS = 2
 """Steps with errors of linearisation."""
 SMALL_STEP_LENGTH = 1e-3
@@ -134,7 +132,8 @@ def estimate_rows(
     # With the priors: which parameters do the data determine?
     first = _iterate(reference, state, asked & ~held, priors, variance=fallback, fallback=fallback)
     factor = _factor(reference.linearise(first.state), first.scatter)
-    held = _choose_held(factor, priors, asked, held=held)
+    flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * priors))
+    held = undetermined_parameters(np.vstack([factor, flat_prior]), priors, free=asked, held=held)
     free = asked & ~held
 
     # From the data alone, with the other parameters at their nominal values.
@@ -152,31 +151,6 @@ def estimate_rows(
     terms = {SAMPLE_NOISE: own - of_scatter, BIAS_PROCESS: of_scatter, HELD_PRIORS: of_held}
     n_steps = first.n_steps + last.n_steps
     return RowEstimate(last.state, terms, held, free, last.scatter, factor, n_steps)
-
-
-def _choose_held(
-    factor: np.ndarray, priors: np.ndarray, asked: np.ndarray, *, held: np.ndarray
-) -> np.ndarray:
-    """
-    Return which of the parameters `asked` (mask) have next to no information from the data.
-
-    Shape (n,).
-
-    One at a time, given the parameters fixed so far, the one with the largest sd in units of its
-    prior, while that exceeds one half. `held` (mask): fixed before.
-    """
-    held = held.copy()
-    while np.any(free := asked & ~held):
-        # Sds in units of the priors, nearly unlimited without information from the data.
-        scaled = factor[:, free] * priors[free]
-        flat_prior = np.eye(free.sum()) / FLAT_PRIOR_FACTOR
-        ratio = np.zeros(len(priors))
-        ratio[free] = np.sqrt(np.diag(inverse_gram(np.vstack([scaled, flat_prior]))))
-        worst = int(np.argmax(ratio))
-        if ratio[worst] <= HELD_RATIO:
-            break
-        held[worst] = True
-    return held
 
 
 @dataclass(frozen=True, eq=False)

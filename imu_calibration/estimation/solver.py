@@ -13,6 +13,7 @@ from imu_calibration.estimation.held_parameters import (
     Factors,
     implausible_parameters,
     undetermined_parameters,
+    weak_alone,
 )
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
@@ -46,6 +47,8 @@ SMALL_STEP_OF_NOISE = 0.01
 """The same while the noise is not known yet."""
 MAX_HALVINGS = 12
 """A step that raises the cost is halved less than this many times."""
+EQUALLY_WEAK = 0.99
+"""Part of the largest share of a prior's sd from which parameters are equally undetermined."""
 START_PENALTY = 1e-6
 """Weight of the nominal sensor in the first values, for motions that do not determine them."""
 Noises = dict[str, NoiseModel]
@@ -109,7 +112,14 @@ def solve(
     # Parameters that the data do not determine are fixed at their prior.
     factors = _factors(system, noises)
     values = _minimised(system, values, factors, free)
-    held = undetermined_parameters(system, values, factors, free=free)
+    data = system.jacobian(values, factors)
+    held = undetermined_parameters(
+        np.concatenate([data, prior.root]),
+        prior.sd,
+        free=free,
+        held=free & weak_alone(data, prior.sd),
+        tie=EQUALLY_WEAK,
+    )
     held |= not_separable(accumulator, model)
     _refuse_held(held, free, model, allow_holding)
 
