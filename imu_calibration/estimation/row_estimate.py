@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.estimation.gauss_newton import gauss_newton
 from imu_calibration.estimation.group_variances import GroupVariances, estimate_group_variances
 from imu_calibration.estimation.held_parameters import undetermined_parameters
 from imu_calibration.estimation.scaled_solve import (
@@ -130,7 +131,8 @@ def estimate_rows(
         held = withheld & asked
 
     # With the priors: which parameters do the data determine?
-    first = _iterate(reference, state, asked & ~held, priors, variance=fallback, fallback=fallback)
+    with_priors = _RowSquares(reference, asked & ~held, priors, fallback)
+    first = _iterate(with_priors, state, fallback)
     factor = _factor(reference.linearise(first.state), first.scatter)
     flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * priors))
     held = undetermined_parameters(np.vstack([factor, flat_prior]), priors, free=asked, held=held)
@@ -139,9 +141,8 @@ def estimate_rows(
     # From the data alone, with the other parameters at their nominal values.
     state = replace(first.state, values=np.where(held, reference.nominal, first.state.values))
     variance = np.maximum(first.scatter.variance, LEAST_START_VARIANCE * fallback)
-    last = _iterate(
-        reference, state, free, FLAT_PRIOR_FACTOR * priors, variance=variance, fallback=fallback
-    )
+    of_data = _RowSquares(reference, free, FLAT_PRIOR_FACTOR * priors, fallback)
+    last = _iterate(of_data, state, variance)
 
     # The covariance as a sum of named terms: C = C_noise + C_scatter + C_held.
     rows = reference.linearise(last.state)
@@ -155,60 +156,91 @@ def estimate_rows(
 
 @dataclass(frozen=True, eq=False)
 class _Iterated:
-    """State and scatter after the Gauss-Newton steps."""
+    """State and scatter after some Gauss-Newton steps."""
 
     state: Any
     """Parameters and nuisances."""
     scatter: GroupVariances
     """Scatter of the components beyond the noise."""
-    n_steps: int
+    n_steps: int = 0
     """Number of steps."""
 
 
-def _iterate(
-    reference: RowReference,
-    state: Any,
-    free: np.ndarray,
-    priors: np.ndarray,
-    *,
-    variance: np.ndarray,
-    fallback: np.ndarray,
-) -> _Iterated:
-    """Repeat steps and scatter estimates until both converge."""
-    start = np.array(variance, float)
-    scatter = GroupVariances(start, np.full(len(fallback), np.inf), start.copy())
-    for number in range(1, MAX_NEWTON_STEPS + 1):
+@dataclass(frozen=True, eq=False)
+class _RowStep:
+    """A step, and the scatter with which the rows were weighted."""
+
+    change: np.ndarray
+    """Of the nuisances, then of all parameters."""
+    length: float
+    """Length in joint standard deviations."""
+    scatter: GroupVariances
+    """Scatter of the components beyond the noise."""
+    is_settled: bool
+    """Whether the scatter is that of the step before."""
+
+
+@dataclass(frozen=True, eq=False)
+class _RowSquares:
+    """Sum of squares of the rows of a reference and of the priors (`LeastSquares`)."""
+
+    reference: RowReference
+    free: np.ndarray
+    """True for the parameters that are estimated, shape (n,)."""
+    priors: np.ndarray
+    """Standard deviations of the parameters before any data, shape (n,)."""
+    fallback: np.ndarray
+    """Variances of the components where the data are too few, shape (n_components,)."""
+
+    def step(self, at: _Iterated) -> _RowStep:
+        """Return the step from a state, with the scatter estimated at it."""
+        free, fallback = self.free, self.fallback
         # Rows of the reference, of nuisances and free parameters, and rows of the priors.
-        rows = reference.linearise(state)
+        rows = self.reference.linearise(at.state)
         n_nuisances = rows.nuisance.shape[1]
         n_free = int(free.sum())
         columns = np.hstack([rows.nuisance, rows.main[:, free]])
         design = np.vstack([columns, np.eye(n_nuisances + n_free)[n_nuisances:]])
-        residual = np.concatenate([rows.residual, (reference.nominal - state.values)[free]])
-        noise = np.concatenate([rows.noise, priors[free] ** 2])
+        distance = (self.reference.nominal - at.state.values)[free]
+        residual = np.concatenate([rows.residual, distance])
+        noise = np.concatenate([rows.noise, self.priors[free] ** 2])
         group = np.concatenate([rows.component, np.full(n_free, -1)])
 
         # The residuals of the first steps contain errors of linearisation, which are no scatter.
+        scatter = at.scatter
         before = scatter.variance
-        if number > FIRST_STEPS:
+        if at.n_steps >= FIRST_STEPS:
             scatter = estimate_group_variances(
-                design, residual, noise, group=group, start=scatter.variance, fallback=fallback
+                design, residual, noise, group=group, start=before, fallback=fallback
             )
 
-        # Weighted least squares: R x = q, from the triangular factor of [design | residual].
+        # Weighted least squares: R x = q, from the triangular factor of [design | residual]; |q|
+        # is the length of the step.
         sd = np.sqrt(scatter.total(noise, group))
         factor = triangular_of_band(np.column_stack([design, residual]) / sd[:, None])[:-1]
         right = factor[:, -1]
-        step = np.zeros(n_nuisances + len(free))
+        change = np.zeros(n_nuisances + len(free))
         moving = np.append(np.ones(n_nuisances, bool), free)
-        step[moving] = scipy.linalg.solve_triangular(factor[:, :-1], right)
-        state = reference.moved(state, step)
-
-        # Both have converged; |q| is the length of the step in joint sds.
+        change[moving] = scipy.linalg.solve_triangular(factor[:, :-1], right)
         settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
-        if number > FIRST_STEPS + 1 and settled and np.linalg.norm(right) < SMALL_STEP_LENGTH:
-            break
-    return _Iterated(state, scatter, number)
+        return _RowStep(change, float(np.linalg.norm(right)), scatter, settled)
+
+    def moved(self, at: _Iterated, step: _RowStep) -> _Iterated:
+        """Return the state after a step."""
+        state = self.reference.moved(at.state, step.change)
+        return _Iterated(state, step.scatter, at.n_steps + 1)
+
+    def is_last(self, at: _Iterated, step: _RowStep) -> bool:
+        """Return whether parameters and scatter have converged."""
+        is_small = step.is_settled and step.length < SMALL_STEP_LENGTH
+        return at.n_steps > FIRST_STEPS + 1 and is_small
+
+
+def _iterate(squares: _RowSquares, state: Any, variance: np.ndarray) -> _Iterated:
+    """Return the state and the scatter of least cost; `variance`: scatter in the first steps."""
+    start = np.array(variance, float)
+    scatter = GroupVariances(start, np.full(len(start), np.inf), start.copy())
+    return gauss_newton(squares, _Iterated(state, scatter), n_steps=MAX_NEWTON_STEPS)
 
 
 def _factor(rows: RowSet, scatter: GroupVariances) -> np.ndarray:

@@ -9,6 +9,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulated_rows import AccumulatedRows, not_separable
 from imu_calibration.estimation.attitude_dependence import attitude_dependence
+from imu_calibration.estimation.gauss_newton import gauss_newton, halved
 from imu_calibration.estimation.held_parameters import (
     Factors,
     implausible_parameters,
@@ -45,8 +46,8 @@ SMALL_STEP = 1e-7
 """A solve ends with a step below this many standard deviations."""
 SMALL_STEP_OF_NOISE = 0.01
 """The same while the noise is not known yet."""
-MAX_HALVINGS = 12
-"""A step that raises the cost is halved less than this many times."""
+MAX_HALVINGS = 11
+"""Largest number of times that a step is halved which raises the cost."""
 EQUALLY_WEAK = 0.99
 """Part of the largest share of a prior's sd from which parameters are equally undetermined."""
 START_PENALTY = 1e-6
@@ -255,6 +256,71 @@ def _factors(system: WeightedSystem, noises: Noises) -> Factors:
     return {sensor: system.factors(sensor, noises[sensor]) for sensor in system.sensors}
 
 
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Values of the parameters with their residuals."""
+
+    values: np.ndarray
+    """Shape (n_params,)."""
+    residual: np.ndarray
+    """Whitened residuals, those of the prior last, shape (m,)."""
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step of the free parameters."""
+
+    change: np.ndarray
+    """Shape (n_free,)."""
+    length: float
+    """Largest change in sds of each parameter if all other ones were known."""
+
+
+@dataclass(frozen=True, eq=False)
+class _WindowSquares:
+    """Sum of squares of triangular factors of all windows and of the prior (`LeastSquares`)."""
+
+    system: WeightedSystem
+    factors: Factors
+    """Triangular factors of the whitened rows."""
+    free: np.ndarray
+    """True for the parameters that are estimated, shape (n_params,)."""
+    enough: float
+    """Length of the last step."""
+
+    def at(self, values: np.ndarray) -> _Point:
+        """Return values with their residuals."""
+        return _Point(values, self.system.residuals(values, self.factors))
+
+    def step(self, point: _Point) -> _Step:
+        """Return the step from a point."""
+        prior = self.system.prior
+        data = self.system.jacobian(point.values, self.factors)[:, self.free]
+        rows = np.concatenate([data, prior.root[:, self.free]])
+        change = scaled_lstsq(rows, -point.residual)
+        information = (data**2).sum(axis=0) + 1 / prior.sd[self.free] ** 2
+        return _Step(change, float(np.max(np.abs(change) * np.sqrt(information), initial=0.0)))
+
+    def moved(self, point: _Point, step: _Step) -> _Point:
+        """Return the point after the longest of the halved steps that does not raise the cost."""
+
+        def after(share: float) -> _Point:
+            values = point.values.copy()
+            values[self.free] += step.change * share
+            return self.at(values)
+
+        return halved(point, after, lambda each: each.cost, n_halvings=MAX_HALVINGS)
+
+    def is_last(self, point: _Point, step: _Step) -> bool:
+        """Return whether a step is small; a large misfit limits the accuracy."""
+        return step.length < self.enough * max(1.0, 1e-7 * np.sqrt(point.cost))
+
+
 def _minimised(
     system: WeightedSystem,
     values: np.ndarray,
@@ -262,43 +328,9 @@ def _minimised(
     free: np.ndarray,
     enough: float = SMALL_STEP,
 ) -> np.ndarray:
-    """
-    Return the values of least cost: Gauss-Newton with step halving on the triangular factors.
-
-    It continues until steps are below `enough` standard deviations.
-    """
-    prior = system.prior
-    for _ in range(MAX_SOLVE_STEPS):
-        residual = system.residuals(values, factors)
-        data = system.jacobian(values, factors)[:, free]
-        step = scaled_lstsq(np.concatenate([data, prior.root[:, free]]), -residual)
-        values, cost = _halved(system, values, step, free, factors, residual @ residual)
-
-        # In sds of each parameter if all others were known; a large misfit limits the accuracy.
-        information = (data**2).sum(axis=0) + 1 / prior.sd[free] ** 2
-        largest = np.max(np.abs(step) * np.sqrt(information), initial=0.0)
-        if largest < enough * max(1.0, 1e-7 * np.sqrt(cost)):
-            break
-    return values
-
-
-def _halved(
-    system: WeightedSystem,
-    values: np.ndarray,
-    step: np.ndarray,
-    free: np.ndarray,
-    factors: Factors,
-    cost: float,
-) -> tuple[np.ndarray, float]:
-    """Return (values, cost) after the longest of the halved steps that does not raise the cost."""
-    for halvings in range(MAX_HALVINGS):
-        moved = values.copy()
-        moved[free] += step * 0.5**halvings
-        residual = system.residuals(moved, factors)
-        moved_cost = residual @ residual
-        if moved_cost <= cost * (1 + 1e-12) + 1e-12:
-            return moved, moved_cost
-    return values, cost
+    """Return the values of least cost; steps below `enough` standard deviations are the last."""
+    squares = _WindowSquares(system, factors, free, enough)
+    return gauss_newton(squares, squares.at(values), n_steps=MAX_SOLVE_STEPS).values
 
 
 @dataclass(frozen=True, eq=False)

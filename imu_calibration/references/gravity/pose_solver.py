@@ -6,13 +6,14 @@ First guess, and the covariance due to gravity, the Earth's rate and the model e
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import Role
+from imu_calibration.estimation.gauss_newton import gauss_newton
 from imu_calibration.estimation.model_error import (
     MIN_SCATTER_BLOCKS,
     ModelError,
@@ -109,9 +110,15 @@ def first_state(model: HandModel, poses: Poses) -> State:
     """
     values = model.nominal.copy()
     if 'accelerometer' not in model.absent:
-        estimates = [_by_norms(model, poses, start) for start in _starting_points(model, poses)]
-        costs = [estimate.cost for estimate in estimates]
-        values = estimates[int(np.argmin(costs))].values
+        index = model.base_index('accelerometer')
+        index = index[~model.withheld[index]]
+        squares = _NormsAndPriors(model, poses.force, poses.conditions, index)
+        least = np.inf
+        for start in _starting_points(model, poses):
+            end = gauss_newton(squares, start, n_steps=MAX_NEWTON_STEPS)
+            if squares.is_possible(end) and squares.cost(end) < least:
+                values = end
+                least = squares.cost(end)
     bias, matrix, *_ = model.linear(values)
     true = np.linalg.solve(matrix, (poses.force - bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)
@@ -136,41 +143,63 @@ def _starting_points(model: HandModel, poses: Poses) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
-class _NormEstimate:
-    """End of a search that begins in one place."""
+class NormSquares:
+    """
+    Sum of squares of ``|corrected force| - gravity`` over means at rest (`LeastSquares`).
 
-    values: np.ndarray
-    """Parameters, those of the accelerometer estimated, shape (n,)."""
-    cost: float
-    """Sum of the squared residuals and of the distances from the priors, in sds."""
+    The state has the values of all parameters, shape (n,).
+    """
+
+    model: HandModel
+    force: np.ndarray
+    """Means at rest, m/s^2, shape (k, 3)."""
+    conditions: dict[str, Any]
+    """Their time and temperature, as `Poses.conditions`."""
+    index: np.ndarray
+    """Parameters that are estimated, shape (n_free,)."""
+
+    def rows(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors, shape (k,), and their columns, shape (k, n_free)."""
+        errors, columns = self.model.norm_rows(values, self.force, **self.conditions)
+        return errors, columns[:, self.index]
+
+    def cost(self, values: np.ndarray) -> float:
+        """Return the sum of squares."""
+        errors, _ = self.rows(values)
+        return float(errors @ errors)
+
+    def moved(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return the values after a step."""
+        moved = values.copy()
+        moved[self.index] += step
+        return moved
 
 
-def _by_norms(model: HandModel, poses: Poses, start: np.ndarray) -> _NormEstimate:
-    """Return the `_NormEstimate` from Gauss-Newton steps that begin at the parameters `start`."""
-    norm_sd = NORM_SD_SHARE * model.gravity
-    free = model.base_index('accelerometer')
-    free = free[~model.withheld[free]]
-    prior_sd = model.priors[free]
+class _NormsAndPriors(NormSquares):
+    """The same in standard deviations, with the distances from the priors."""
 
-    def linearised(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residuals in sds, those of the priors last, and their columns."""
-        residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
-        distance = (model.nominal - values)[free] / prior_sd
-        rows = np.vstack([columns[:, free] / norm_sd, np.diag(1 / prior_sd)])
-        return np.concatenate([residual / norm_sd, distance]), rows
+    def rows(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors, those of the priors last, and their columns."""
+        errors, columns = super().rows(values)
+        norm_sd = NORM_SD_SHARE * self.model.gravity
+        prior_sd = self.model.priors[self.index]
+        distance = (self.model.nominal - values)[self.index] / prior_sd
+        rows = np.vstack([columns / norm_sd, np.diag(1 / prior_sd)])
+        return np.concatenate([errors / norm_sd, distance]), rows
 
-    values = start.copy()
-    for _ in range(MAX_NEWTON_STEPS):
-        target, rows = linearised(values)
-        step = np.linalg.lstsq(rows, target, rcond=None)[0]
-        values[free] += step
-        # Beyond a scale of zero lies the mirrored solution, or none.
-        if not np.isfinite(values).all() or np.diag(model.linear(values)[1]).min() <= 0.0:
-            return _NormEstimate(model.nominal.copy(), np.inf)
-        if np.max(np.abs(step)) < 1e-10:
-            break
-    target, _ = linearised(values)
-    return _NormEstimate(values, float(target @ target))
+    def step(self, values: np.ndarray) -> np.ndarray:
+        """Return the step of the estimated parameters."""
+        errors, columns = self.rows(values)
+        return np.linalg.lstsq(columns, errors, rcond=None)[0]
+
+    def is_last(self, values: np.ndarray, step: np.ndarray) -> bool:
+        """Return whether a step is small, or led beyond the possible values."""
+        return not self.is_possible(values) or bool(np.max(np.abs(step)) < 1e-10)
+
+    def is_possible(self, values: np.ndarray) -> bool:
+        """Return whether no scale is negative: there lies the mirrored solution, or none."""
+        is_finite = np.isfinite(values).all()
+        return bool(is_finite and np.diag(self.model.linear(values)[1]).min() > 0.0)
 
 
 def _of_gravity(model: HandModel, values: np.ndarray, relative_sd: float) -> np.ndarray:

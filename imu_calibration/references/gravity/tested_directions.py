@@ -13,10 +13,11 @@ import numpy as np
 
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES
+from imu_calibration.estimation.gauss_newton import gauss_newton, halved
 from imu_calibration.estimation.group_variances import student_factor
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
-from imu_calibration.references.gravity.pose_solver import first_state
+from imu_calibration.references.gravity.pose_solver import NormSquares, first_state
 from imu_calibration.references.gravity.poses import ATTITUDES_APART
 
 OFF_AXIS = 0.15
@@ -41,8 +42,8 @@ to 5 deg, 45 % do, up to 3.1 sd wrong.
 """
 PLACEMENT_STEPS = 8
 """Gauss-Newton steps of a fit of the placements."""
-LEAST_STEP_SHARE = 0.1
-"""Smallest share of a step that is tried where a larger share does not lower the errors."""
+PLACEMENT_HALVINGS = 3
+"""Largest number of times that a step is halved which does not lower the errors."""
 TURNS_CONTRADICT = 3.84
 """Increase of ``n log(mean square)`` of turns by which they contradict the cross terms."""
 
@@ -135,6 +136,27 @@ class PlacementFit:
         return added
 
 
+class _PlacementSquares(NormSquares):
+    """The norms of placements without priors."""
+
+    def step(self, values: np.ndarray) -> np.ndarray:
+        """Return the step of the estimated parameters."""
+        errors, columns = self.rows(values)
+        return np.linalg.lstsq(columns, errors, rcond=1e-9)[0]
+
+    def moved(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return the values after the longest share of a step that does not raise the errors."""
+
+        def after(share: float) -> np.ndarray:
+            return NormSquares.moved(self, values, share * step)
+
+        return halved(values, after, self.cost, n_halvings=PLACEMENT_HALVINGS)
+
+    def is_last(self, values: np.ndarray, step: np.ndarray) -> bool:
+        """Return whether a step is lost in rounding: the next ones would be the same."""
+        return bool(np.all(values[self.index] + step == values[self.index]))
+
+
 def fit_placements(
     model: HandModel, values: np.ndarray, poses: Poses, *, up: np.ndarray, used: np.ndarray
 ) -> PlacementFit:
@@ -168,29 +190,20 @@ def fit_placements(
     index = index[~model.withheld[index]]
     values = values.copy()
     values[model.withheld] = model.nominal[model.withheld]
-    errors, columns = model.norm_rows(values, force, **conditions)
-    for _ in range(PLACEMENT_STEPS):
-        step = np.linalg.lstsq(columns[:, index], errors, rcond=1e-9)[0]
-        share = 1.0
-        while share > LEAST_STEP_SHARE:
-            trial = values.copy()
-            trial[index] += share * step
-            trial_errors, trial_columns = model.norm_rows(trial, force, **conditions)
-            if trial_errors @ trial_errors < errors @ errors:
-                values, errors, columns = trial, trial_errors, trial_columns
-                break
-            share /= 2
+    squares = _PlacementSquares(model, force, conditions, index)
+    values = gauss_newton(squares, values, n_steps=PLACEMENT_STEPS)
 
     # Variance of a placement from the errors, with the widening of Student's t.
-    squares = float(errors @ errors)
-    rank = int(np.linalg.matrix_rank(columns[:, index]))
+    errors, columns = squares.rows(values)
+    cost = float(errors @ errors)
+    rank = int(np.linalg.matrix_rank(columns))
     spare = len(errors) - rank
     covariance = None
     if spare >= FEWEST_SPARE and rank == len(index):
-        information = columns[:, index].T @ columns[:, index]
-        variance = float(student_factor(np.array([spare]))[0]) * squares / spare
+        information = columns.T @ columns
+        variance = float(student_factor(np.array([spare]))[0]) * cost / spare
         covariance = variance * np.linalg.inv(information)
-    return PlacementFit(index, values, squares, spare, covariance)
+    return PlacementFit(index, values, cost, spare, covariance)
 
 
 def placements_demand(

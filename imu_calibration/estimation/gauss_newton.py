@@ -1,0 +1,69 @@
+"""Gauss-Newton iteration, for the least squares of any reference."""
+
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+StateT = TypeVar('StateT')
+StepT = TypeVar('StepT')
+
+RISE = 1e-12
+"""Rise of a cost that is rounding, relative and absolute."""
+
+
+class LeastSquares(Protocol[StateT, StepT]):
+    """A sum of squares as a function of a state: parameters, maybe with nuisances."""
+
+    def step(self, state: StateT) -> StepT:
+        """Return the step to the minimum of the sum that is linearised at a state."""
+
+    def moved(self, state: StateT, step: StepT) -> StateT:
+        """Return the state after a step."""
+
+    def is_last(self, state: StateT, step: StepT) -> bool:
+        """Return whether a step, which led to a state, is small enough to be the last one."""
+
+
+def gauss_newton(problem: LeastSquares[StateT, StepT], state: StateT, *, n_steps: int) -> StateT:
+    """
+    Return the state of least cost, after at most `n_steps` steps from a state.
+
+    Each step solves the problem that is linearised at the state before it.
+    """
+    for _ in range(n_steps):
+        step = problem.step(state)
+        state = problem.moved(state, step)
+        if problem.is_last(state, step):
+            break
+    return state
+
+
+def halved(
+    state: StateT,
+    moved: Callable[[float], StateT],
+    cost: Callable[[StateT], float],
+    *,
+    n_halvings: int,
+) -> StateT:
+    """
+    Return the state after the longest share of a step that does not raise the cost.
+
+    The shares are 1, 1/2, 1/4 and so on; the state itself is returned if each raises the cost.
+
+    Parameters
+    ----------
+    state
+        Before the step.
+    moved : callable
+        Returns the state after a share of the step.
+    cost : callable
+        Returns the sum of squares of a state.
+    n_halvings : int
+        Largest number of halvings.
+
+    """
+    limit = cost(state) * (1 + RISE) + RISE
+    for number in range(n_halvings + 1):
+        shorter = moved(0.5**number)
+        if cost(shorter) <= limit:
+            return shorter
+    return state
