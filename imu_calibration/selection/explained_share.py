@@ -10,6 +10,7 @@ import numpy as np
 
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.noise_beside_effects import plausible_processes
+from imu_calibration.selection.order_of_tests import without_weakest
 from imu_calibration.selection.parameter_space import scatter_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
@@ -201,14 +202,13 @@ def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
 
     `share(chosen, question)` is the share that each removes.
     """
-    chosen = list(chosen)
-    while chosen:
-        shares = [share(chosen, question) / needed_share(question) for question in chosen]
-        weakest = int(np.argmin(shares))
-        if shares[weakest] >= 1.0:
-            break
-        chosen = chosen[:weakest] + chosen[weakest + 1 :]
-    return chosen
+
+    def weakest(kept: list[Question]) -> int | None:
+        shares = [share(kept, question) / needed_share(question) for question in kept]
+        place = int(np.argmin(shares))
+        return place if shares[place] < 1.0 else None
+
+    return without_weakest(chosen, weakest)
 
 
 def needed_share(question: Question) -> float:

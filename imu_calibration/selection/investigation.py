@@ -22,6 +22,7 @@ from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import LagExplanations, lag_explanations
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.onset import Onset, find_onset
+from imu_calibration.selection.order_of_tests import select_findings, without_weakest
 from imu_calibration.selection.questions import (
     Question,
     point_with,
@@ -367,12 +368,8 @@ def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
     explained = ExplainedWindows(problem.evidence, problem.search)
-
-    # Enough share of the unexplained, no simpler alternative, better prediction, equal halves.
-    with_share = simpler(problem, explained, pruned(chosen, explained.share))
-    helpful = _that_help(problem, explained, with_share)
-    named, unstable = _agreed(problem, explained, helpful)
-    return _Outcome(problem, explained, chosen, named, unstable)
+    found = select_findings(WindowTests(problem, explained), chosen)
+    return _Outcome(problem, explained, chosen, found.named, found.unstable)
 
 
 def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
@@ -391,7 +388,7 @@ def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
             problem,
             explained,
             same_questions(problem, outcome.chosen),
-            _that_help(problem, explained, named),
+            WindowTests(problem, explained).predicting(named),
             same_questions(problem, outcome.unstable),
         )
     return outcome
@@ -419,54 +416,55 @@ def too_few_windows(count: int) -> NotObservableError:
     )
 
 
-def _agreed(
-    problem: LinearisedProblem, explained: ExplainedWindows, named: Sequence[Question]
-) -> tuple[Sequence[Question], list[Question]]:
-    """
-    Return (findings that hold, findings on which the two halves disagree).
+@dataclass(frozen=True, eq=False)
+class WindowTests:
+    """The tests of a choice on the windows of a table (`EffectTests`)."""
 
-    The first are findings on which both halves agree and that hold without the other ones.
-    """
-    unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
-    kept = [question for question in named if question not in unstable]
-    if unstable:
-        kept = _that_help(problem, explained, kept)
-    return problem.search.drop_insignificant(kept), unstable
+    problem: LinearisedProblem
+    explained: ExplainedWindows
 
+    def explaining(self, chosen: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects that explain most of the excess, without a simpler alternative."""
+        return simpler(self.problem, self.explained, pruned(chosen, self.explained.share))
 
-def _that_help(
-    problem: LinearisedProblem, explained: ExplainedWindows, named: Sequence[Question]
-) -> list[Question]:
-    """
-    Return the admissible findings that improve cross-validated prediction.
+    def predicting(self, named: Sequence[Question]) -> list[Question]:
+        """
+        Return the admissible findings that improve cross-validated prediction.
 
-    By backward elimination of the least helpful.
+        Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a
+        misfit that repeats with the motion is evidence for any effect that correlates with it. So
+        the unweighted residual must decrease too. The locked windows are not used: their later gain
+        would be biased.
+        """
+        problem = self.problem
+        admissible = [
+            question
+            for question in named
+            if problem.search.allowed(named, question) and problem.windows_agree(named, question)
+        ]
 
-    Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a
-    misfit that repeats with the motion is evidence for any effect that correlates with it. So the
-    unweighted residual must decrease too. The locked windows are not used: their later gain would
-    be biased.
-    """
-    kept = [
-        question
-        for question in named
-        if problem.search.allowed(named, question) and problem.windows_agree(named, question)
-    ]
-    while kept:
-        # The finding with the least reduction among those with too little; NaN is not sure.
-        least_helpful = None
-        least_reduction = np.inf
-        for place, question in enumerate(kept):
-            reduction = _sure_reduction(problem, kept, question)
-            if not reduction > _needed_reduction(problem, explained, kept, question):
-                rank = -np.inf if np.isnan(reduction) else reduction
-                if least_helpful is None or rank < least_reduction:
-                    least_helpful = place
-                    least_reduction = rank
-        if least_helpful is None:
-            break
-        del kept[least_helpful]
-    return kept
+        def least_helpful(kept: list[Question]) -> int | None:
+            place = None
+            least = np.inf
+            for k, question in enumerate(kept):
+                reduction = _sure_reduction(problem, kept, question)
+                if not reduction > _needed_reduction(problem, self.explained, kept, question):
+                    # NaN is not sure.
+                    rank = -np.inf if np.isnan(reduction) else reduction
+                    if place is None or rank < least:
+                        place = k
+                        least = rank
+            return place
+
+        return without_weakest(admissible, least_helpful)
+
+    def agrees_in_halves(self, named: Sequence[Question], question: Question) -> bool:
+        """Return whether both halves of the recording show an effect alike."""
+        return self.problem.agrees_in_halves(named, question)
+
+    def significant(self, named: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects that are significant without those that were removed."""
+        return self.problem.search.drop_insignificant(named)
 
 
 def _needed_reduction(

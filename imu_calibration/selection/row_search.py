@@ -9,9 +9,12 @@ from imu_calibration.core.progress import reported
 from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
-from imu_calibration.selection.questions import (
-    Question,
+from imu_calibration.selection.order_of_tests import (
+    Findings,
+    select_findings,
+    without_weakest,
 )
+from imu_calibration.selection.questions import Question
 from imu_calibration.selection.row_evidence import RowBlock, RowEvidence, RowSpace
 from imu_calibration.selection.search import Search
 
@@ -56,13 +59,13 @@ class RowProblem:
         blocks = [block.select(~np.isin(block.group, groups)) for block in self.blocks]
         return [block for block in blocks if block.known.size > 3]
 
-    def named(self) -> list[Question]:
+    def explaining(self, chosen: Sequence[Question]) -> list[Question]:
         """
-        Return the findings: chosen effects of which each explains most of the excess variance.
+        Return the effects of which each explains most of the excess variance.
 
         Sizes beyond the range of known instruments are tested only for the remaining excess.
         """
-        named = list(pruned(self.search.run(), self.explained.share))
+        named = list(pruned(chosen, self.explained.share))
         if self.explained.rest(named):
             wide = self.search.asking_any_size()
             known, self.search = self.search, wide
@@ -148,15 +151,11 @@ class ChoiceWithout:
 
 
 @dataclass(frozen=True, eq=False)
-class RowChoice:
+class RowChoice(Findings):
     """Effects that rows support."""
 
-    named: list[Question]
-    """Questions that became findings, in the order found."""
     held_out: list[ChoiceWithout]
-    """The search without each part of the groups."""
-    unstable: list[Question]
-    """Rejected, because the estimates of the two halves differ significantly."""
+    """The search without each part of the groups; none without an effect to test."""
 
 
 def choose_effects(problem: RowProblem) -> RowChoice:
@@ -168,14 +167,40 @@ def choose_effects(problem: RowProblem) -> RowChoice:
     problem : RowProblem
 
     """
-    named = problem.named()
-    held_out = _held_out(problem) if named else []
-    named = _that_predict(problem, held_out, named)
-    unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
-    if unstable:
-        stable = [question for question in named if question not in unstable]
-        named = _that_predict(problem, held_out, stable)
-    return RowChoice(named, held_out, unstable)
+    tests = RowTests(problem)
+    found = select_findings(tests, problem.search.run())
+    return RowChoice(found.named, found.unstable, tests.held_out)
+
+
+class RowTests:
+    """The tests of a choice on few rows (`EffectTests`)."""
+
+    def __init__(self, problem: RowProblem):
+        self.explaining = problem.explaining
+        self.agrees_in_halves = problem.agrees_in_halves
+        self.problem = problem
+        self.held_out: list[ChoiceWithout] = []
+
+    def predicting(self, named: Sequence[Question]) -> list[Question]:
+        """Return the findings that improve the prediction of rows held out from their choice."""
+        if named and not self.held_out:
+            self.held_out = _held_out(self.problem)
+
+        def last_poor(kept: list[Question]) -> int | None:
+            poor = None
+            for place, question in enumerate(kept):
+                gain = self.problem.gain(
+                    self.held_out, kept[:place], kept[: place + 1], sensor=question.sensor
+                )
+                if not gain.ci95[0] > 0:
+                    poor = place
+            return poor
+
+        return without_weakest(named, last_poor)
+
+    def significant(self, named: Sequence[Question]) -> Sequence[Question]:
+        """Return all: each predicts rows that were held out from the choice."""
+        return named
 
 
 def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
@@ -186,25 +211,8 @@ def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
     for number in reported('repeating the search', range(times), times):
         out = groups[number::times]
         smaller = problem.without(out)
-        found.append(ChoiceWithout(out, smaller.named(), smaller))
+        found.append(ChoiceWithout(out, smaller.explaining(smaller.search.run()), smaller))
     return found
-
-
-def _that_predict(
-    problem: RowProblem, held_out: Sequence[ChoiceWithout], named: Sequence[Question]
-) -> list[Question]:
-    """Return the findings that improve the prediction of rows held out from their choice."""
-    kept = list(named)
-    while kept:
-        poor = []
-        for place, question in enumerate(kept):
-            gain = problem.gain(held_out, kept[:place], kept[: place + 1], sensor=question.sensor)
-            if not gain.ci95[0] > 0:
-                poor.append(question)
-        if not poor:
-            break
-        kept.remove(poor[-1])
-    return kept
 
 
 def gain_of_groups(block: RowBlock, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:

@@ -242,7 +242,7 @@ def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late, exam
 
 @pytest.mark.long
 def test_what_likelihood_asks_for_and_nobody_is_sure_of_is_not_named_but_widens(late, monkeypatch):
-    monkeypatch.setattr(investigation, '_that_help', lambda *_: [])
+    monkeypatch.setattr(investigation.WindowTests, 'predicting', lambda *_: [])
     found = investigated(late)
     assert not found.named and 'time_offset' in [question.name for question in found.rejected]
     names = found.problem.baseline.param_names

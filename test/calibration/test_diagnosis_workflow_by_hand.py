@@ -161,7 +161,7 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
     model = SensorModel(joint_names=table.joint_names)
     imu = simulate_session(model, random_values(model), table, profile=profile)[0]
     # What is asked about is known before the search.
-    monkeypatch.setattr(RowProblem, 'named', lambda self: [])
+    monkeypatch.setattr(RowProblem, 'explaining', lambda self, chosen: [])
     found = investigate_by_hand(gather_by_hand(imu), HandOptions(GRAVITY))
     assert {'gyro_rate_product', 'gyro_quadratic'} <= {
         entry['effect'] for entry in found.not_testable

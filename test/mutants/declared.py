@@ -339,9 +339,9 @@ SEARCH = _of(
     ),
     (
         'what is nothing without what was taken out is named',
-        '_agreed',
-        '_1.search.drop_insignificant(...)',
-        '...',
+        'select_findings',
+        '_1.significant(_2)',
+        '_2',
         'test_search.py::test_what_is_nothing_without_what_was_taken_out_is_not_named',
     ),
     (
@@ -409,7 +409,7 @@ SEARCH = _of(
     ),
     (
         'how far windows agree is not asked',
-        '_that_help',
+        'WindowTests.predicting',
         '_1.search.allowed(_2, _3) and _1.windows_agree(_2, _3)',
         '_1.search.allowed(_2, _3)',
         'test_search.py::test_what_the_windows_disagree_on_is_not_named',
@@ -447,7 +447,7 @@ SEARCH = _of(
     ),
     (
         'halves that disagree are not asked',
-        '_agreed',
+        'select_findings',
         'not _1.agrees_in_halves(_2, _3)',
         'False',
         'test_search.py::test_what_the_halves_disagree_on_is_denied',
@@ -461,7 +461,7 @@ SEARCH = _of(
     ),
     (
         'a finding need not lower the residual in its own unit',
-        '_that_help',
+        'WindowTests.predicting',
         'not _1 > _needed_reduction(..., ..., ..., ...)',
         'False',
         (

@@ -35,6 +35,7 @@ from imu_calibration.selection.noise_beside_effects import (
     plausible_processes,
 )
 from imu_calibration.selection.onset import _passed_once
+from imu_calibration.selection.order_of_tests import select_findings
 from imu_calibration.selection.parameter_space import (
     ParameterSpace,
     parameter_space,
@@ -836,40 +837,43 @@ def test_halves_agree_within_chance(apart, agree):
     assert problem.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
 
 
-def with_problem(
+def judging_tests(
     monkeypatch,
     paid=None,
     agree=lambda question: True,
     windows_agree=lambda named, question: True,
     drop_insignificant=list,
 ):
-    """Return an attempt of which the residual in the sensor's unit and the halves say this."""
+    """Return tests of which the residual in the sensor's unit and the halves say this."""
     monkeypatch.setattr(
         investigation, '_sure_reduction', lambda problem, kept, each: (paid or {}).get(each, 0.5)
     )
     monkeypatch.setattr(investigation, '_needed_reduction', lambda *given: 0.0)
-    return SimpleNamespace(
+    monkeypatch.setattr(investigation.WindowTests, 'explaining', lambda tests, chosen: chosen)
+    problem = SimpleNamespace(
         search=SimpleNamespace(
             allowed=lambda named, question: True, drop_insignificant=drop_insignificant
         ),
         windows_agree=windows_agree,
         agrees_in_halves=lambda named, question: agree(question),
     )
+    return investigation.WindowTests(problem, None)
 
 
 def test_a_finding_lowers_the_residual_in_the_sensors_own_unit(monkeypatch):
-    problem = with_problem(monkeypatch, {CUBIC: -0.01})
-    assert investigation._that_help(problem, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
+    tests = judging_tests(monkeypatch, {CUBIC: -0.01})
+    assert tests.predicting([QUADRATIC, CUBIC]) == [QUADRATIC]
 
 
 def test_what_the_windows_disagree_on_is_not_named(monkeypatch):
-    problem = with_problem(monkeypatch, windows_agree=lambda named, question: question is not CUBIC)
-    assert investigation._that_help(problem, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
+    tests = judging_tests(monkeypatch, windows_agree=lambda named, question: question is not CUBIC)
+    assert tests.predicting([QUADRATIC, CUBIC]) == [QUADRATIC]
 
 
 def test_what_the_halves_disagree_on_is_denied(monkeypatch):
-    problem = with_problem(monkeypatch, agree=lambda question: question is not CUBIC)
-    assert investigation._agreed(problem, None, [QUADRATIC, CUBIC]) == ([QUADRATIC], [CUBIC])
+    tests = judging_tests(monkeypatch, agree=lambda question: question is not CUBIC)
+    found = select_findings(tests, [QUADRATIC, CUBIC])
+    assert (found.named, found.unstable) == ([QUADRATIC], [CUBIC])
 
 
 def test_what_is_nothing_without_what_was_taken_out_is_not_named(monkeypatch):
@@ -889,14 +893,8 @@ def test_what_is_nothing_without_what_was_taken_out_is_not_named(monkeypatch):
         (lambda question: True, [QUADRATIC, CUBIC]),
         (lambda question: question is not CUBIC, []),
     ):
-        assert (
-            investigation._agreed(
-                with_problem(monkeypatch, agree=agree, drop_insignificant=drop_insignificant),
-                None,
-                [QUADRATIC, CUBIC],
-            )[0]
-            == named
-        )
+        tests = judging_tests(monkeypatch, agree=agree, drop_insignificant=drop_insignificant)
+        assert select_findings(tests, [QUADRATIC, CUBIC]).named == named
 
 
 @pytest.mark.parametrize(
