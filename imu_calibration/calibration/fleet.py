@@ -6,6 +6,7 @@ Plain functions, for any scheduler.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,8 +36,8 @@ class Unit:
     """Its recordings; must be picklable for another process."""
     bags: tuple = ()
     """Names of the recordings."""
-    provenance: Callable[[], dict] | None = None
-    """Callable that returns bag hashes and options for the document, or None."""
+    provenance: Callable[[], dict[str, Any]] = dict
+    """Returns bag hashes and options for the document."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ class FleetStep:
             return UnitResult(unit.name, error=text, reasons=(text,))
 
     def _calibrated(self, unit: Unit) -> UnitResult:
-        provenance = unit.provenance() if unit.provenance is not None else None
+        provenance = unit.provenance()
         recordings = TableRecordings.of(
             unit.sources, self.table, names=unit.bags or None, keep_windows=True
         )
