@@ -30,6 +30,7 @@ from imu_calibration.document.trust import (
 )
 from imu_calibration.effects.base import UNITS
 from imu_calibration.effects.forward_equations import applied_values
+from imu_calibration.estimation.gauss_newton import after_one_step
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.rotations import unit_rows
@@ -360,9 +361,7 @@ class _Lengths:
         poses = self.hand.poses
         # the rows are minus the derivative of the errors
         errors, rows = self.hand.hand_model.norm_rows(values, poses.force, **poses.conditions)
-        moved = values.copy()
-        moved[fitted] += scaled_lstsq(rows[kept][:, fitted], errors[kept])
-        return moved
+        return after_one_step(values, rows[kept], errors[kept], free=fitted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,5 +392,4 @@ class _Turns:
         rows = GravityRows(model, hand.poses, used).linearise(state)
         of_turns = rows.component == COMPONENTS.index('turn')
         matrix = fitted & ~bias
-        moved[matrix] += scaled_lstsq(rows.main[of_turns][:, matrix], rows.residual[of_turns])
-        return moved
+        return after_one_step(moved, rows.main[of_turns], rows.residual[of_turns], free=matrix)

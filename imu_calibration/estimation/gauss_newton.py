@@ -3,6 +3,10 @@
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
+import numpy as np
+
+from imu_calibration.estimation.scaled_solve import scaled_lstsq
+
 StateT = TypeVar('StateT')
 StepT = TypeVar('StepT')
 
@@ -67,3 +71,24 @@ def halved(
         if cost(shorter) <= limit:
             return shorter
     return state
+
+
+def after_one_step(
+    values: np.ndarray, design: np.ndarray, misfit: np.ndarray, *, free: np.ndarray
+) -> np.ndarray:
+    """
+    Return the values after one step, which is exact where the rows are linear.
+
+    Parameters
+    ----------
+    values : array, shape (n,)
+        Where the rows are linearised.
+    design, misfit : array, shape (m, n) and (m,)
+        ``misfit = design @ change + error`` in standard deviations, measured minus predicted.
+    free : array of bool, shape (n,)
+        Parameters that move.
+
+    """
+    moved = values.copy()
+    moved[free] += scaled_lstsq(design[:, free], misfit)
+    return moved

@@ -12,8 +12,9 @@ from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.gauss_newton import after_one_step
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
-from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular
+from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.kinematics.joint_motion import JointMotion
@@ -283,9 +284,7 @@ class HeldOut:
         found = []
         for fold in range(TABLE_FOLDS):
             rows = np.concatenate([known, *(part for k, part in enumerate(parts) if k != fold)])
-            moved = values.copy()
-            moved[free] -= scaled_lstsq(rows[:, :-1][:, free], rows[:, -1])
-            found.append(moved)
+            found.append(after_one_step(values, rows[:, :-1], -rows[:, -1], free=free))
         return found
 
 
