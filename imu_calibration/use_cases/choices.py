@@ -32,9 +32,9 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.recordings import (
-    Arm,
     Stand,
     Topics,
+    options_of,
     provenance_of,
 )
 from imu_calibration.use_cases.resources import config_file
@@ -349,7 +349,7 @@ def provenance_with(
         Table or arm.
 
     """
-    used = dict(choices) | (vars(stand) if isinstance(stand, Arm) else {'table': stand})
+    used = dict(choices) | options_of(stand)
     used['tolerances'] = used.get('tolerances') or config_file('tolerances.yaml')
     if isinstance(setting := used.get('setting'), Mapping):
         used['setting'] = [f'{name}={value}' for name, value in setting.items()]

@@ -441,6 +441,11 @@ Stand = str | PathLike | Table | Arm
 """A table description or a robot description (file), a table, or an arm."""
 
 
+def options_of(stand: Stand | None) -> dict[str, Any]:
+    """Return a table or an arm as options of a document: the fields of an arm, or the table."""
+    return vars(stand) if isinstance(stand, Arm) else {'table': stand}
+
+
 def table_of(
     stand: Stand,
     recordings: Sequence[str | PathLike | SampleBlock] = (),

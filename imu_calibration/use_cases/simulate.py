@@ -33,7 +33,13 @@ from imu_calibration.simulation.session import (
 )
 from imu_calibration.simulation.session import simulate_session as run_session
 from imu_calibration.use_cases.choices import Choices, catalogue_of
-from imu_calibration.use_cases.recordings import LIKELY_LINK, Arm, Stand, name_of, table_of
+from imu_calibration.use_cases.recordings import (
+    LIKELY_LINK,
+    Stand,
+    name_of,
+    options_of,
+    table_of,
+)
 from imu_calibration.use_cases.references import inputs_of
 from imu_calibration.use_cases.resources import config_file
 
@@ -172,7 +178,7 @@ def simulate(
         encoder_resolution=math.radians(encoder_resolution_deg),
         stamp_jitter=stamp_jitter_us * 1e-6,
     )
-    frame_id = table.imu_link if isinstance(table, Arm) and table.imu_link else LIKELY_LINK
+    frame_id = options_of(table).get('imu_link') or LIKELY_LINK
     options = SimulationOptions(
         imu_rate, joint_rate, noise, frame_id=frame_id, temperature_start_c=25.0 if warm else None
     )
