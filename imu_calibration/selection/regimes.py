@@ -267,6 +267,22 @@ class _Ranges:
     """1 in each bin of a range, shape (r, k)."""
 
 
+@dataclass(frozen=True, eq=False)
+class _RefinedRange:
+    """A range of a variable in which the residual has another offset."""
+
+    inside: np.ndarray
+    """Share of each block in the range, shape (b,)."""
+    bounds: tuple[float, float] | None
+    """Bounds of the variable; None where it has no scale."""
+    words: str
+    """Description of the range."""
+    offset: float
+    """The offset, in the unit of the residual."""
+    squares: float
+    """Residual sum of squares with the offset."""
+
+
 class RegimeSearch:
     """
     Search for ranges of variables in which the residual of a sensor differs.
@@ -355,24 +371,25 @@ class RegimeSearch:
         limit = _cost(least_energy, len(self.time)) - SURE
         regimes = []
         for each, number in likely:
-            mark, bounds, words, size, after = self._refined(rest, white, each, number)
+            refined = self._refined(rest, white, each, number)
             # Share of the excess over noise, which is 1 for each block.
-            excess = max(energy[0] - len(mark), TINY)
-            share = 1.0 - max(after - len(mark), 0.0) / excess
-            if share >= MOST_OF_IT and _cost(after, len(mark)) < limit:
+            count = len(refined.inside)
+            excess = max(energy[0] - count, TINY)
+            share = 1.0 - max(refined.squares - count, 0.0) / excess
+            if share >= MOST_OF_IT and _cost(refined.squares, count) < limit:
                 regimes.append(
                     RestRegime(
                         self.sensor,
                         axis,
                         each.variable.name,
-                        words + ', by another offset',
+                        refined.words + ', by another offset',
                         float(share),
                         p_value,
-                        float(size),
-                        mark > 0.5,
+                        float(refined.offset),
+                        refined.inside > 0.5,
                         self.time,
                         True,
-                        bounds,
+                        refined.bounds,
                         each.variable.is_rate,
                     )
                 )
@@ -380,12 +397,8 @@ class RegimeSearch:
 
     def _refined(
         self, rest: AxisResidual, white: Callable, each: _Ranges, number: int
-    ) -> tuple[np.ndarray, tuple[float, float] | None, str, float, float]:
-        """
-        Return the description of a range with refined bounds.
-
-        It is (share of each block inside, bounds, words, offset, residual sum of squares).
-        """
+    ) -> _RefinedRange:
+        """Return a range with refined bounds."""
         variable = each.variable
         chosen = variable.chosen(each.member[number])
         bounds = variable.bounds(chosen)
@@ -407,7 +420,7 @@ class RegimeSearch:
             bounds = options[best]
             mark = inside[:, best]
         (size,), (after,) = rest.offsets(white(mark[:, None]))
-        return mark, bounds, variable.words(chosen, bounds), size, after
+        return _RefinedRange(mark, bounds, variable.words(chosen, bounds), size, after)
 
     def scatters(
         self, axis: str, rough: np.ndarray, weight: np.ndarray, *, level: float
