@@ -42,7 +42,9 @@ def thirds(samples):
     return sum(middle) / len(middle), sum(last) / len(last)
 
 
-def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
+def soak(
+    seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None, diagnosis_period=60.0
+):
     """
     Run both nodes on `seconds` of simulated data.
 
@@ -56,6 +58,8 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
         Where the calibration is saved.
     tell : callable, optional
         Called with a line of progress now and then.
+    diagnosis_period : float
+        Seconds, not of the data, between diagnoses; 0: none.
 
     Returns
     -------
@@ -69,7 +73,7 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
         station.watch_diagnostics()
         running = {
             'calibration_node': station.calibration_node(
-                folder, autosave_period=10.0, diagnosis_period=60.0
+                folder, autosave_period=10.0, diagnosis_period=diagnosis_period
             ),
             'compensator_node': station.start('compensator_node'),
         }
