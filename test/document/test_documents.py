@@ -140,7 +140,7 @@ def any_calibration(draw):
     )
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(any_calibration())
 def test_any_calibration_survives_yaml_whole(calibration):
     text = calibration_to_text(calibration)
