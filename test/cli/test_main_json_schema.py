@@ -3,6 +3,7 @@
 import json
 import shutil
 from importlib.util import find_spec
+from pathlib import Path
 from types import SimpleNamespace
 
 import jsonschema
@@ -15,7 +16,7 @@ from imu_calibration.cli.watch import NodeStatus
 
 from worlds.candidates import searching_few
 
-ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
+ROOT = Path(__file__).resolve().parents[2]
 SESSION, TABLE, TRUTH = (
     f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml')
 )
