@@ -55,7 +55,7 @@ SHAFT = {'table': 'shaft', 'profile': 'sweeps'}
 @pytest.fixture(scope='module')
 def late():
     """A session on a shaft whose driver stamps 12 ms late, and the table."""
-    pair = make_pair('driver_lag', 31, **SHAFT, **COARSE)
+    pair = make_pair('driver_lag', 31, **SHAFT)
     return pair.first, Table.from_mapping(pair.table)
 
 

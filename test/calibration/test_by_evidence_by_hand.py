@@ -13,6 +13,7 @@ import imu_calibration as imu
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
+from imu_calibration.references.options import CalibrationOptions
 
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES, simulate
 from worlds.physics_hand import hold_and_turn, warmed_up
@@ -69,7 +70,7 @@ def test_diagnose_hands_over_what_calibrate_does(bent, asked):
 
 @pytest.mark.long
 def test_live_it_is_in_the_model_as_well(bent, asked):
-    live = make_live()
+    live = make_live(options=CalibrationOptions())
     poses = run(live, bent[0])
     result = live.solve(pending=True)
     assert result.calibration.statistics['added'] == [QUADRATIC]

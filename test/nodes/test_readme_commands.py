@@ -132,7 +132,7 @@ class Terminal:
         """Press Ctrl-C; return the exit code."""
         try:
             os.killpg(self.process.pid, signal.SIGINT)
-            return self.process.wait(30)
+            return self.process.wait(PATIENCE)
         except (subprocess.TimeoutExpired, ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
             return self.process.wait()

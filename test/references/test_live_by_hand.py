@@ -35,10 +35,10 @@ def blocks(imu, seed=0, mean=40):
         yield SampleBlock(imu.select(slice(start, stop)))
 
 
-def make_live(saved=None, **by_hand):
+def make_live(saved=None, options=OPTIONS, **by_hand):
     """Return a LiveByHand that looks for rest as often as it can."""
     settings = LiveByHandSettings(**{'gravity': GRAVITY, **by_hand})
-    return LiveByHand(OPTIONS, LiveSettings(), settings, saved=saved, clock=lambda: 0.0)
+    return LiveByHand(options, LiveSettings(), settings, saved=saved, clock=lambda: 0.0)
 
 
 def run(live, imu, seed=0):
