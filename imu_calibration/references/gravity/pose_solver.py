@@ -116,9 +116,10 @@ def first_state(model: HandModel, poses: Poses) -> State:
         least = np.inf
         for start in _starting_points(model, poses):
             end = gauss_newton(squares, start, n_steps=MAX_NEWTON_STEPS)
-            if squares.is_possible(end) and squares.cost(end) < least:
+            cost = squares.cost(end) if squares.is_possible(end) else np.inf
+            if cost < least:
                 values = end
-                least = squares.cost(end)
+                least = cost
     bias, matrix, *_ = model.linear(values)
     true = np.linalg.solve(matrix, (poses.force - bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)
