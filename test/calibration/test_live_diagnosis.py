@@ -34,6 +34,7 @@ from imu_calibration.references.options import CalibrationOptions
 from ros.threads import until
 from worlds import physics
 from worlds.candidates import FEW
+from worlds.misfit_coverage import COARSE
 from worlds.misfit_worlds import make_pair
 
 OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW))
@@ -139,9 +140,7 @@ def test_a_delay_is_taken_at_its_size_like_offline():
 
     Those of all windows are taken anew where the search found the delay.
     """
-    pair = make_pair(
-        'driver_lag', 31, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0
-    )
+    pair = make_pair('driver_lag', 31, table='shaft', profile='sweeps', **COARSE)
     table = Table.from_mapping(pair.table)
     live = LiveCalibration(table, OPTIONS)
     for block in blocks(pair.first.imu, pair.first.joints):

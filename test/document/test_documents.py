@@ -9,7 +9,7 @@ import copy
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from refusal import refused
 
@@ -140,7 +140,6 @@ def any_calibration(draw):
     )
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
 @given(any_calibration())
 def test_any_calibration_survives_yaml_whole(calibration):
     text = calibration_to_text(calibration)

@@ -23,6 +23,7 @@ from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 from worlds.candidates import FEW
+from worlds.misfit_coverage import COARSE
 from worlds.misfit_worlds import make_pair
 from worlds.physics import make_session
 from worlds.tables import three_axis_table
@@ -170,10 +171,9 @@ def test_what_a_smaller_recording_shows_is_taken_in():
 
     Two minutes of motion with the same IMU and a driver that is 12 ms late do.
     """
-    rates = {'imu_rate': 50.0, 'joint_rate': 50.0}
-    pair = make_pair('driver_lag', 31, **rates)
+    pair = make_pair('driver_lag', 31, **COARSE)
     resting = make_session(
-        63, noise='realistic', grade='industrial', profile='static_only', unit=31, **rates
+        63, noise='realistic', grade='industrial', profile='static_only', unit=31, **COARSE
     )
     table = Table.from_mapping(pair.table)
     found = imu_calibration.calibrate([pair.first.block, resting.block], table, candidates=FEW)

@@ -94,7 +94,7 @@ def test_only_live_tests_are_repeated(tmp_path, text, code, unstable):
             sys.executable,
             TEST / 'run_lanes.py',
             *'core live -- -p xdist -n'.split(),
-            str(+unstable),
+            str(int(unstable)),
         ],
         cwd=tmp_path,
         env=os.environ | {'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1'},
