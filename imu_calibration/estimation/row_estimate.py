@@ -259,10 +259,10 @@ def _covariance_of_scatter(rows: RowSet, scatter: GroupVariances, free: np.ndarr
     """
     Return the part of the covariance that is due to the scatter of the components beyond the noise.
 
-    With the whitened design A of nuisances and free parameters, the variance V of the rows and
+    With the changes G of the parameters by errors of the rows, the variance V of the rows and
     their noise N::
 
-        G = (A' A)^-1 A' (1 - N / V)^(1/2)        covariance = G G'
+        covariance = G (V - N) G'
 
     Returns
     -------
@@ -271,11 +271,20 @@ def _covariance_of_scatter(rows: RowSet, scatter: GroupVariances, free: np.ndarr
 
     """
     variance = scatter.total(rows.noise, rows.component, inflated=True)
-    design = np.hstack([rows.nuisance, rows.main[:, free]]) / np.sqrt(variance)[:, None]
-    factor = triangular_of_band(design)
-    solved = scipy.linalg.cho_solve((factor, False), design.T)
-    n_nuisances = rows.nuisance.shape[1]
-    gain = solved[n_nuisances:] * np.sqrt(1 - rows.noise / variance)
+    gain = gain_of_rows(rows, scatter, free) * np.sqrt(variance - rows.noise)
     found = np.zeros((len(free),) * 2)
     found[np.ix_(free, free)] = gain @ gain.T
     return found
+
+
+def gain_of_rows(rows: RowSet, scatter: GroupVariances, free: np.ndarray) -> np.ndarray:
+    """
+    Return the changes of the free parameters by errors of the rows, shape (n_free, m).
+
+    ``(A' V^-1 A)^-1 A' V^-1`` without the rows of the nuisances, A being the columns of nuisances
+    and free parameters, V the inflated variances.
+    """
+    root = np.sqrt(scatter.total(rows.noise, rows.component, inflated=True))
+    design = np.hstack([rows.nuisance, rows.main[:, free]]) / root[:, None]
+    solved = scipy.linalg.cho_solve((triangular_of_band(design), False), design.T)
+    return solved[rows.nuisance.shape[1] :] / root

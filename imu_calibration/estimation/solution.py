@@ -28,6 +28,8 @@ HELD_PRIORS = 'held_parameters'
 The uncertainty of priors at which parameters are fixed, and the squared shift of replaced
 parameters.
 """
+PLACEMENTS = 'placements'
+"""Errors that the rests of a placement by hand have in common."""
 MODEL_ERROR = 'model_error'
 """Scatter between parts of the recording beyond noise."""
 DRIFT = 'drift'
@@ -395,17 +397,12 @@ class Solution:
     @property
     def judged_sd(self) -> np.ndarray:
         """Standard deviations that are compared with the tolerances, shape (n_params,)."""
-        return np.sqrt(
-            np.diag(
-                total(
-                    {
-                        name: term
-                        for name, term in self.terms.items()
-                        if name not in self.judged_without
-                    }
-                )
-            )
-        )
+        return self.sd_without(*self.judged_without)
+
+    def sd_without(self, *names: str) -> np.ndarray:
+        """Return the standard deviations without some terms of the covariance, (n_params,)."""
+        kept = {name: term for name, term in self.terms.items() if name not in names}
+        return np.sqrt(np.diag(total(kept)))
 
     @property
     def prior_mean(self) -> np.ndarray:
@@ -443,7 +440,9 @@ def with_weak_replaced(solution: AnySolution, tolerances: np.ndarray) -> AnySolu
     """
     effects = solution.model.effects
     applied = np.repeat([e.compensation == 'exact' for e in effects], [e.size for e in effects])
-    weak = np.flatnonzero(applied & ~solution.held & (solution.judged_sd > tolerances))
+    # Errors of placements count for what is printed, but do not draw the estimate to its prior.
+    sd = solution.sd_without(PLACEMENTS, *solution.judged_without)
+    weak = np.flatnonzero(applied & ~solution.held & (sd > tolerances))
     values, terms, replaced = replace_weak(
         solution.values,
         solution.terms,

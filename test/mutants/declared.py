@@ -1335,6 +1335,20 @@ READINGS = _of(
         'False',
         'test_compensate_text_log.py::test_a_corrected_log_of_one_sensor_in_a_folder_is_found',
     ),
+    (
+        'rests of a placement are independent',
+        'covariance_of_placements',
+        'np.maximum(_1 - ..., 0.0)',
+        'np.zeros_like(_1)',
+        'test_tested_directions.py::test_rests_of_a_placement',
+    ),
+    (
+        'errors of placements draw estimates to their prior',
+        'with_weak_replaced',
+        '_1.sd_without(PLACEMENTS, ...)',
+        '_1.judged_sd',
+        'test_tested_directions.py::test_rests_of_a_placement',
+    ),
 )
 MUTANTS = (
     *NOISE,

@@ -13,6 +13,7 @@ from imu_calibration.calibration.held_out_poses import HeldOutPoses, folds_by_ha
 from imu_calibration.calibration.proof import prove
 from imu_calibration.document.decision import HELPS, UNPROVEN, decide
 from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.estimation.solution import PLACEMENTS, tolerances_of, with_weak_replaced
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_parameters import (
     CROSS_TERMS,
@@ -37,8 +38,15 @@ def shortest_turn(up):
     return Rotation.from_rotvec(np.pi / 2 * axis)
 
 
-def board(seed, *, placements, rests, shared, cross=0.0, turns=False):
+def board(seed, **options):
+    """Samples and ranges of `board_of`."""
+    return board_of(seed, **options)[:2]
+
+
+def board_of(seed, *, placements, rests, shared, cross=0.0, turns=False):
     """
+    Return (samples, ranges at rest, truth) of a board.
+
     A board placed on its faces within 1 to 3 deg of the axes, with several rests each.
 
     `shared`: sd of an error of the accelerometer that the rests of a placement have in common,
@@ -72,7 +80,7 @@ def board(seed, *, placements, rests, shared, cross=0.0, turns=False):
     for error, start, stop in zip(errors, edges, edges[1:]):
         force[start:stop] += error
     imu = replace(imu, force_s=force)
-    return imu if turns else clipped(imu, 0.3), ranges
+    return imu if turns else clipped(imu, 0.3), ranges, truth
 
 
 def calibrated(imu, ranges):
@@ -154,3 +162,25 @@ def placed(seed, *, count, cross, wrong=0.0):
     poses = SimpleNamespace(force=force, conditions={})
     directions = force / np.linalg.norm(force, axis=1)[:, None]
     return model, replace(model, untested=CROSS_TERMS), poses, directions
+
+
+@pytest.mark.parametrize(('seed', 'count', 'shared'), [(10337, 9, 0.0374), (10341, 8, 0.0299)])
+def test_rests_of_a_placement_are_one_observation_of_its_error(seed, count, shared):
+    # As three independent rests each, parameters were 4 sd wrong.
+    imu, ranges, truth = board_of(seed, placements=count, rests=3, shared=shared, turns=True)
+    found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
+    at = [found.param_names.index(name) for name in PARAM_NAMES[:21]]
+    errors = np.abs(found.values[at] - truth[:21])
+    assert np.max(errors / found.sd_without(PLACEMENTS)[at]) > 3.5
+    assert np.max(errors / found.sd[at]) < 3.0
+
+    # The estimates are those of independent rests.
+    tolerances = tolerances_of(found.model)
+    alone = {name: term for name, term in found.terms.items() if name != PLACEMENTS}
+    values = with_weak_replaced(replace(found, terms=alone), tolerances).values
+    np.testing.assert_array_equal(with_weak_replaced(found, tolerances).values, values)
+
+
+def test_a_rest_by_itself_has_no_error_in_common():
+    imu, ranges = board(10338, placements=14, rests=1, shared=0.03, turns=True)
+    assert PLACEMENTS not in calibrate_by_hand(imu, HandOptions(GRAVITY), ranges).terms

@@ -19,10 +19,12 @@ from imu_calibration.estimation.row_estimate import RowEstimate
 from imu_calibration.estimation.solution import (
     DRIFT,
     GRAVITY,
+    PLACEMENTS,
     SAMPLE_NOISE,
     Solution,
     Status,
     bounded_by_prior,
+    of_fit,
     statuses,
     tolerances_of,
     total,
@@ -35,7 +37,13 @@ from imu_calibration.references.gravity.bias_movement import (
     with_movement,
     without_movement,
 )
-from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State, TurnData
+from imu_calibration.references.gravity.equations import (
+    COMPONENTS,
+    GravityRows,
+    Poses,
+    State,
+    TurnData,
+)
 from imu_calibration.references.gravity.g_sensitivity import (
     NO_EVIDENCE,
     g_sensitivity_evidence,
@@ -48,6 +56,7 @@ from imu_calibration.references.gravity.hand_parameters import (
     KnownTurn,
 )
 from imu_calibration.references.gravity.moved_attitudes import require_no_sway
+from imu_calibration.references.gravity.placements import covariance_of_placements, excess
 from imu_calibration.references.gravity.pose_solver import (
     CONTRADICTED_TURNS,
     first_state,
@@ -330,8 +339,10 @@ def solve_by_hand(data: HandData, options: HandOptions) -> HandCalibration:
         demanded = placements_demand(model, held.hand_model, measured, up=up, used=used)
         chosen = free if demanded else held
         fit = fit_placements(chosen.hand_model, chosen.values, measured, up=up, used=used)
-        excess = fit.excess(total(chosen.terms))
-        return replace(chosen, terms=with_term(chosen.terms, SAMPLE_NOISE, excess))
+        if fit.covariance is None:
+            return chosen
+        more = excess(fit.covariance, total(chosen.terms), fit.index)
+        return replace(chosen, terms=with_term(chosen.terms, SAMPLE_NOISE, more))
     errors = [np.array([_missed_by(hand, turn) for turn in testing]) for hand in (free, held)]
     return held if contradicted_by_turns(*errors) else free
 
@@ -415,6 +426,14 @@ def _solved(
         with_movement(covariance := total(found.terms), model, movements) - covariance,
     )
     terms = with_term(terms, DRIFT, _hidden_covariance(model, poses))
+    rows = GravityRows(model, poses, turns).linearise(found.state)
+    common = covariance_of_placements(rows, found)
+    if common.any():
+        # These errors also scatter the parameters between parts of the recording: added is what
+        # exceeds the other terms.
+        free = np.flatnonzero(found.free)
+        expected = (of_fit(found.terms) + common)[np.ix_(free, free)]
+        terms[PLACEMENTS] = excess(expected, total(terms), free)
     terms = bounded_by_prior(terms, found.held, model.priors)
     # The result has all poses unchanged, also excluded and drifting ones.
     used, poses = (

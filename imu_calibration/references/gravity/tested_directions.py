@@ -17,6 +17,7 @@ from imu_calibration.estimation.gauss_newton import gauss_newton, halved
 from imu_calibration.estimation.group_variances import student_factor
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
+from imu_calibration.references.gravity.placements import placements
 from imu_calibration.references.gravity.pose_solver import NormSquares, first_state
 from imu_calibration.references.gravity.poses import ATTITUDES_APART
 
@@ -27,8 +28,6 @@ these axes: 9 deg from both axes. Faces within 3 deg have 0.05.
 """
 LEAST_PLACEMENTS = 2
 """Fewest placements off the axes: one can be held out."""
-PLACED_AGAIN = 0.0125
-"""Consecutive rests within this angle are one placement, rad: they have the same error."""
 TESTING_TURNS = 4
 """Fewest turns between different attitudes that test the angles between axes."""
 FEWEST_SPARE = 3
@@ -76,12 +75,6 @@ def off_axis_lacking(up: np.ndarray) -> tuple[str, ...]:
     return tuple(lacking)
 
 
-def placements(up: np.ndarray) -> np.ndarray:
-    """Return the first rest of each placement, indices, for unit vectors of shape (k, 3)."""
-    step = np.linalg.norm(np.diff(up, axis=0), axis=1)
-    return np.flatnonzero(np.append(True, step > PLACED_AGAIN))
-
-
 @dataclass(frozen=True, eq=False)
 class PlacementFit:
     """
@@ -109,31 +102,6 @@ class PlacementFit:
         gain = max(held.squares - self.squares, 0.0)
         ratio = (gain / n_more) / (self.squares / self.spare)
         return bool(f_sf(ratio, n_more, self.spare) < DEMANDED)
-
-    def excess(self, covariance: np.ndarray) -> np.ndarray:
-        """
-        Return the covariance that errors of placements add to that of independent rests.
-
-        With the root L of the covariance C of this fit, and ``L^-1 A L^-T = U diag(w) U^T`` for
-        the covariance A of rests::
-
-            L U diag(max(1 - w, 0)) U^T L^T        C - A where C is larger, otherwise 0
-
-        Parameters
-        ----------
-        covariance : array, shape (n_params, n_params)
-
-        """
-        added = np.zeros_like(covariance)
-        if self.covariance is None:
-            return added
-        block = np.ix_(self.index, self.index)
-        root = np.linalg.cholesky(self.covariance)
-        inverse = np.linalg.inv(root)
-        shares, axes = np.linalg.eigh(inverse @ covariance[block] @ inverse.T)
-        grown = root @ axes
-        added[block] = (grown * np.maximum(1.0 - shares, 0.0)) @ grown.T
-        return added
 
 
 class _PlacementSquares(NormSquares):

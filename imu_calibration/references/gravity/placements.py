@@ -1,0 +1,131 @@
+"""
+Placements: consecutive rests of one attitude, and the errors that these rests have in common.
+
+A board that is put on a face lies there as it did before in each of the next rests: an error of
+the face, of the table or of the sensor is the same in all of them.
+"""
+
+import numpy as np
+import scipy.linalg
+
+from imu_calibration.estimation.group_variances import GroupVariances, estimate_group_variances
+from imu_calibration.estimation.row_estimate import RowEstimate, RowSet, gain_of_rows
+from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD
+
+PLACED_AGAIN = 0.0125
+"""Consecutive rests within this angle are one placement, rad: they have the same error."""
+VARIANCE_STEPS = 5
+"""Largest number of estimates of the variance; two to four are usual."""
+
+
+def placements(up: np.ndarray) -> np.ndarray:
+    """Return the first rest of each placement, indices, for unit vectors of shape (k, 3)."""
+    step = np.linalg.norm(np.diff(up, axis=0), axis=1)
+    return np.flatnonzero(np.append(True, step > PLACED_AGAIN))
+
+
+def excess(covariance: np.ndarray, known: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """
+    Return the covariance that exceeds a known one of some parameters, shape (n_params, n_params).
+
+    With the root L of the covariance C, and ``L^-1 A L^-T = U diag(w) U^T`` for the known one A::
+
+        L U diag(max(1 - w, 0)) U^T L^T        C - A where C is larger, otherwise 0
+
+    Parameters
+    ----------
+    covariance : array, shape (m, m)
+    known : array, shape (n_params, n_params)
+    index : array of int, shape (m,)
+        Parameters of `covariance`.
+
+    """
+    block = np.ix_(index, index)
+    root = np.linalg.cholesky(covariance)
+    inverse = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(inverse @ known[block] @ inverse.T)
+    grown = root @ axes
+    added = np.zeros_like(known)
+    added[block] = (grown * np.maximum(1.0 - shares, 0.0)) @ grown.T
+    return added
+
+
+def covariance_of_placements(rows: RowSet, found: RowEstimate) -> np.ndarray:
+    """
+    Return the covariance that common errors of rests add to the one of independent errors.
+
+    The estimate is ``x = sum g_i y_i`` over the rows y. An error of the variance v that all rests
+    of a placement have in common, in addition to independent ones of the variance s^2, adds::
+
+        sum over placements of  g g' max(v - sum a_i^2 s^2, 0)        g = sum g_i
+
+    with the weights a_i of the rests in their mean.
+
+    Parameters
+    ----------
+    rows : RowSet
+        `GravityRows` at the estimate.
+    found : RowEstimate
+
+    Returns
+    -------
+    ndarray, shape (n_params, n_params)
+        Zero where each placement has one rest.
+
+    """
+    n_params = rows.main.shape[1]
+    added = np.zeros((n_params, n_params))
+    first = placements(found.state.up)
+    if len(first) == len(found.state.up):
+        return added
+    placement = np.searchsorted(first, np.arange(len(found.state.up)), side='right') - 1
+
+    # Weights of the rests in the mean of each placement and axis, shape (n_means, m).
+    pose = COMPONENTS.index('pose')
+    of_poses = np.flatnonzero(rows.component == pose)
+    mean = 3 * placement[rows.group[of_poses, 0]] + np.arange(len(of_poses)) % 3
+    weights = np.zeros((3 * len(first), len(rows.residual)))
+    weights[mean, of_poses] = 1 / found.scatter.total(rows.noise, rows.component)[of_poses]
+    weights /= weights.sum(axis=1, keepdims=True)
+
+    # Excess of the variance of the means over that of independent rests.
+    variance = _variance_of_means(rows, found, weights).upper[0]
+    more = np.maximum(variance - (weights**2).sum(axis=1) * found.scatter.upper[pose], 0.0)
+    common = gain_of_rows(rows, found.scatter, found.free) @ (weights > 0).T
+    added[np.ix_(found.free, found.free)] = (common * more) @ common.T
+    return added
+
+
+def _variance_of_means(rows: RowSet, found: RowEstimate, weights: np.ndarray) -> GroupVariances:
+    """
+    Return the variance of the means of placements beyond the noise of their samples.
+
+    By restricted likelihood on the means and on the differences within placements: the rows of
+    each placement are transformed to their mean and to the directions across it.
+    """
+    total = found.scatter.total(rows.noise, rows.component)
+    columns = np.column_stack([rows.nuisance, rows.main[:, found.free], rows.residual])
+    white = columns / np.sqrt(total)[:, None]
+
+    transformed = [white[rows.component != COMPONENTS.index('pose')], weights @ columns]
+    for row in weights:
+        own = np.flatnonzero(row)
+        across = scipy.linalg.null_space(np.sqrt(row[own])[None])
+        transformed.append(across.T @ white[own])
+    n_before, n_means = len(transformed[0]), len(weights)
+    stacked = np.concatenate(transformed)
+    noise = np.ones(len(stacked))
+    group = np.full(len(stacked), -1)
+    noise[n_before : n_before + n_means] = weights**2 @ rows.noise
+    group[n_before : n_before + n_means] = 0
+
+    fallback = np.array([SCATTER_SD[0] ** 2])
+    variances = GroupVariances(fallback, np.zeros(1), fallback)
+    for _ in range(VARIANCE_STEPS):
+        before = variances.variance
+        variances = estimate_group_variances(
+            stacked[:, :-1], stacked[:, -1], noise, group=group, start=before, fallback=fallback
+        )
+        if np.allclose(variances.variance, before, rtol=0.01):
+            break
+    return variances
