@@ -1340,14 +1340,14 @@ READINGS = _of(
         'covariance_of_placements',
         'np.maximum(_1 - ..., 0.0)',
         'np.zeros_like(_1)',
-        'test_tested_directions.py::test_rests_of_a_placement',
+        'test_tested_directions.py::test_rests_of_a_placement_are_one_observation_of_its_error',
     ),
     (
         'errors of placements draw estimates to their prior',
         'with_weak_replaced',
         '_1.sd_without(PLACEMENTS, ...)',
         '_1.judged_sd',
-        'test_tested_directions.py::test_rests_of_a_placement',
+        'test_tested_directions.py::test_rests_of_a_placement_are_one_observation_of_its_error',
     ),
 )
 MUTANTS = (
