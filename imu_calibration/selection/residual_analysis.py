@@ -17,18 +17,22 @@ from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
+from imu_calibration.selection.bias_courses import temperature_courses
 from imu_calibration.selection.formulas import FormulaChoice
 from imu_calibration.selection.investigation import Investigation, investigate
 from imu_calibration.selection.proposals import Proposal, find_formulas, propose
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regimes import RestRegime, find_regimes
 from imu_calibration.selection.residual_blocks import BlockFits, RestBlocks, rest_blocks
+from imu_calibration.selection.search import TIE
 from imu_calibration.selection.spectrum import find_sway, find_tones
 from imu_calibration.selection.stamp_jitter import StampJitter
 from imu_calibration.selection.unexplained import (
+    CURVES_IN_TIME,
     Unexplained,
     beyond_noise,
     biases_off,
+    curves_in_time,
     scatter_in_motion,
     unexplained,
 )
@@ -50,6 +54,8 @@ class ResidualAnalysis(Investigation):
 
     table: Table
     """The reference."""
+    replaced: Sequence[Question] = ()
+    """Effects that a formula, a regime or the temperature replaces (`superseded`)."""
     _fits: dict = field(default_factory=dict, init=False, repr=False)
     _formulas: dict = field(default_factory=dict, init=False, repr=False)
 
@@ -70,10 +76,61 @@ class ResidualAnalysis(Investigation):
     def rests(self) -> dict[str, Unexplained]:
         """Sensor -> Unexplained, with the axes that carry it where it is significant."""
         found = unexplained(self.problem, self.explained, self.named)
-        return {
-            sensor: replace(rest, axes=self.fits(sensor).axes()) if rest.significant else rest
-            for sensor, rest in found.items()
-        }
+        for sensor, rest in found.items():
+            if rest.significant:
+                found[sensor] = replace(
+                    rest,
+                    axes=self.fits(sensor).axes(),
+                    correlates_with=self._measured_cause(sensor, rest.correlates_with),
+                )
+        return found
+
+    def _measured_cause(self, sensor: str, name: str | None) -> str | None:
+        """
+        Return the variable of the largest correlation, judged on locked blocks where it is slow.
+
+        There a course of the temperature takes the place of another one that predicts worse, and of
+        the time unless that predicts better.
+        """
+        courses = self._excess_with_courses(sensor, self.named)
+        if name in courses:
+            return min(courses, key=courses.__getitem__)
+        if name != CURVES_IN_TIME:
+            return name
+        fits = self.fits(sensor)
+        time = self.blocks[sensor].time
+        excess = min(fits.fit(_of_all_axes(curves)).excess for curves in curves_in_time(time))
+        return self.late_temperature(sensor, self.named, excess) or name
+
+    def late_temperature(
+        self, sensor: str, chosen: Sequence[Question], excess: float
+    ) -> str | None:
+        """
+        Return the course of the temperature that predicts locked blocks best beside a choice.
+
+        None if it predicts them worse than an explanation without a measured cause, which leaves
+        `excess` (`BlockFit.excess`). Within the resolution of the search the measured cause is
+        preferred.
+        """
+        courses = self._excess_with_courses(sensor, chosen)
+        best = min(courses, key=courses.__getitem__, default=None)
+        # Squares are twice the nats.
+        return None if best is None or courses[best] >= excess + 2 * TIE else best
+
+    def _excess_with_courses(self, sensor: str, chosen: Sequence[Question]) -> dict[str, float]:
+        """
+        Return course of the temperature -> excess of the locked blocks with it beside a choice.
+
+        Empty without a temperature, or with the times of several recordings.
+        """
+        blocks = self.blocks[sensor]
+        if blocks.ref.temperature_c is None or len(self.problem.recording.sessions) > 1:
+            return {}
+        fits = self.fits(sensor, chosen)
+        found = {}
+        for course in temperature_courses(blocks.time, blocks.means(blocks.ref.temperature_c)):
+            found[course.name] = fits.fit(_of_all_axes(course.values[:, None])).excess
+        return found
 
     @cached_property
     def blocks(self) -> dict[str, RestBlocks]:
@@ -260,6 +317,7 @@ class ResidualAnalysis(Investigation):
             self,
             named=[question for question in self.named if question not in gone],
             rejected=[*self.rejected, *gone],
+            replaced=[*self.replaced, *gone],
             rivals=[rival for rival in self.rivals if rival.question.name not in names],
         )
         other.__dict__['blocks'] = self.blocks
@@ -340,12 +398,37 @@ def superseded(found: ResidualAnalysis) -> list[Question]:
     return [question for question in found.named if _done_without(found, question)]
 
 
+def _of_all_axes(columns: np.ndarray) -> np.ndarray:
+    """Return columns of blocks, shape (b, k), for each axis, shape (b, k, 3)."""
+    return np.repeat(columns[:, :, None], len(AXES), axis=2)
+
+
+def _follows_temperature(found: ResidualAnalysis, question: Question) -> bool:
+    """
+    Return whether a course of the temperature explains a drift as well.
+
+    A bias that follows a measured temperature late, as a thermal mass does, settles almost like a
+    drift in time.
+    """
+    if not question.effect.smooth or 'temperature' in question.effect.needs:
+        return False
+    others = [other for other in found.named if other is not question]
+    for sensor in question.effect.sensors:
+        with_drift = found.fits(sensor, found.named).fit().excess
+        if found.late_temperature(sensor, others, with_drift) is None:
+            return False
+    return True
+
+
 def _done_without(found: ResidualAnalysis, question: Question) -> bool:
     """
     Return whether a finding hardly reduces the residual with a substitute.
 
     The residual is that of the finding's sensors, and the substitute is in some of them.
     """
+    if _follows_temperature(found, question):
+        return True
+
     # Sensors in which a substitute is possible.
     sensors = question.effect.sensors
     thermal = 'temperature' in question.effect.needs

@@ -30,6 +30,8 @@ ALPHA = 1e-4
 """Significance that a correlation must have."""
 IN_MOTION = 'motion (moving windows against windows at rest)'
 """Name of the variable that separates moving windows from windows at rest."""
+CURVES_IN_TIME = 'time'
+"""Name of the variable for a polynomial of the time and for steps."""
 MUCH_SCATTER = 10.0
 """
 Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of
@@ -295,6 +297,14 @@ def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray
     yield IN_MOTION, recording.moving[:, None].astype(float), every
 
 
+def curves_in_time(time: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the columns of a polynomial of the time and of steps, each shape (k, m)."""
+    share = (time - time.mean()) / max(np.ptp(time), 1e-9)
+    yield np.stack([share, share**2, share**3], axis=1)
+    levels = np.quantile(share, (0.2, 0.35, 0.5, 0.65, 0.8))
+    yield np.stack([share > level for level in levels], axis=1).astype(float)
+
+
 def slow_explanations(
     time: np.ndarray, temperature: np.ndarray
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -311,11 +321,8 @@ def slow_explanations(
 
     """
     every = np.ones(len(time), bool)
-    share = (time - time.mean()) / max(np.ptp(time), 1e-9)
-    yield 'time', np.stack([share, share**2, share**3], axis=1), every
-    levels = np.quantile(share, (0.2, 0.35, 0.5, 0.65, 0.8))
-    steps = np.stack([share > level for level in levels], axis=1)
-    yield 'time', steps.astype(float), every
+    for curves in curves_in_time(time):
+        yield CURVES_IN_TIME, curves, every
     if not np.all(np.isfinite(temperature)) or np.ptp(temperature) <= LEAST_WARMING:
         return
     warm = (temperature - temperature.mean()) / np.ptp(temperature)

@@ -1,11 +1,11 @@
-"""A finding is withdrawn when an offset in a regime of motion takes its place."""
+"""A finding is withdrawn when a regime of motion or the temperature's past takes its place."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from imu_calibration.selection.residual_analysis import superseded
+from imu_calibration.selection.residual_analysis import ResidualAnalysis, superseded
 
 PLACE = np.arange(8) < 3
 """Blocks of the regime, shape (b,)."""
@@ -33,7 +33,8 @@ def test_an_offset_in_a_regime_replaces_a_finding_that_is_needless_beside_it(
 ):
     # The finding reduces the excess by 10, and beside the regime by `beside`: less than 5 % of it.
     question = SimpleNamespace(
-        effect=SimpleNamespace(sensors=('gyroscope',), needs=()), name='gyro_quadratic'
+        effect=SimpleNamespace(sensors=('gyroscope',), needs=(), smooth=False),
+        name='gyro_quadratic',
     )
     fits = {True: Fits(2.0, 2.0), False: Fits(12.0, 2.0 + beside)}
     found = SimpleNamespace(
@@ -46,4 +47,43 @@ def test_an_offset_in_a_regime_replaces_a_finding_that_is_needless_beside_it(
         proposed=lambda sensor, left_out: None,
         regimes=lambda sensor, chosen: [SimpleNamespace(axis='y', inside=PLACE, offset=offset)],
     )
+    assert superseded(found) == ([question] if withdrawn else [])
+
+
+@pytest.mark.parametrize(
+    ('drift', 'sessions', 'withdrawn'), ((2.0, 1, True), (-40.0, 1, False), (2.0, 2, False))
+)
+def test_a_course_of_the_temperature_that_predicts_as_well_replaces_a_drift(
+    drift, sessions, withdrawn
+):
+    # The course leaves an excess of 5, a drift that predicts better by more than 16 is kept.
+    time = np.linspace(0.0, 400.0, 60)
+    warm = 25 + 8 * (1 - np.exp(-time / 150))
+
+    class Fits:
+        def __init__(self, excess):
+            self.excess = excess
+
+        def fit(self, columns=None):
+            return SimpleNamespace(excess=self.excess if columns is None else 5.0)
+
+    question = SimpleNamespace(
+        effect=SimpleNamespace(sensors=('gyroscope',), needs=('time',), smooth=True),
+        name='gyro_bias_drift',
+    )
+    fits = {True: Fits(drift), False: Fits(900.0)}
+    found = SimpleNamespace(
+        named=[question],
+        rests={'gyroscope': SimpleNamespace(significant=False)},
+        proposals={'gyroscope': None},
+        problem=SimpleNamespace(recording=SimpleNamespace(sessions=[time] * sessions)),
+        blocks={
+            'gyroscope': SimpleNamespace(
+                time=time, ref=SimpleNamespace(temperature_c=warm), means=lambda rows: rows
+            )
+        },
+        fits=lambda sensor, chosen: fits[bool(chosen)],
+    )
+    found._excess_with_courses = lambda *given: ResidualAnalysis._excess_with_courses(found, *given)
+    found.late_temperature = lambda *given: ResidualAnalysis.late_temperature(found, *given)
     assert superseded(found) == ([question] if withdrawn else [])

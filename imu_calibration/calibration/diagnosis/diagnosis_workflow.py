@@ -14,6 +14,7 @@ from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
     IMPOSSIBLE,
     LEAVES_MOST,
+    REPLACED,
     UNCERTAIN,
 )
 from imu_calibration.core.units import error_text
@@ -36,6 +37,7 @@ WHY_NOT = {
         'the windows do not agree on it: the evidence comes from few windows, or some contradict'
         ' it; record more windows of the same motions'
     ),
+    REPLACED: 'a formula, a place or the temperature explains the same part of the residual',
     UNCERTAIN: (
         'none of its coefficients is significant in the calibration with all uncertainties; record'
         ' motions that separate them'

@@ -108,6 +108,8 @@ DISAGREED = 'refused: the windows do not agree on it'
 """Verdict on an effect with evidence from few windows only, or with contradictory windows."""
 IMPOSSIBLE = 'refused: its size is impossible, or within the steps of the encoders'
 """Verdict on an effect with an estimate that no instrument can have."""
+REPLACED = 'refused: a formula, a place or the temperature explains the same'
+"""Verdict on an effect without which the residual is explained as well."""
 UNCERTAIN = 'refused: none of its coefficients is significant in the calibration'
 """Verdict on an effect that a solution with all allowances does not determine."""
 
@@ -172,6 +174,7 @@ def candidates_of(
     *,
     agree: Callable[[Sequence[Question], Question], bool] | None = None,
     withdrawn: Sequence[Question] = (),
+    replaced: Sequence[Question] = (),
 ) -> tuple[Candidate, ...]:
     """
     Return every effect that a search tested in addition to the findings, the strongest first.
@@ -179,8 +182,10 @@ def candidates_of(
     Of a warm-up its best time constant.
 
     `agree(chosen, question)` is whether the windows agree on one of the chosen effects; `withdrawn`
-    are effects that the search chose and the halves of the recording or the calibration refused.
+    are effects that the search chose and the halves of the recording or the calibration refused,
+    `replaced` those that another explanation of the residual replaces.
     """
+    superseded = {question.name for question in replaced}
     refused_later = {question.name for question in withdrawn}
     found, mates, rows = {question.name for question in named}, {}, {}
     for question in named:
@@ -192,7 +197,11 @@ def candidates_of(
             continue
         beside = None if question.name in found else search.score(named, question)
         verdict = _verdict_of(question.name, alone, beside, found=found, mates=mates)
-        if verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question):
+        if verdict == LEAVES_MOST and question.name in superseded:
+            verdict = REPLACED
+        elif (
+            verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question)
+        ):
             verdict = DISAGREED
         elif verdict == LEAVES_MOST and question.name in refused_later:
             verdict = UNCERTAIN
@@ -421,7 +430,13 @@ def build_diagnosis(
     return Diagnosis(
         tuple(findings),
         unexplained,
-        candidates_of(problem.search, named, agree=_agreement(problem), withdrawn=found.unstable),
+        candidates_of(
+            problem.search,
+            named,
+            agree=_agreement(problem),
+            withdrawn=found.unstable,
+            replaced=analysis.replaced,
+        ),
         tuple(found.not_testable),
         baseline,
         solution,
