@@ -87,14 +87,10 @@ class ResidualAnalysis(Investigation):
 
     def _measured_cause(self, sensor: str, name: str | None) -> str | None:
         """
-        Return the variable of the largest correlation, judged on locked blocks where it is slow.
+        Return the variable of the largest correlation, where that is the time judged on locked blocks.
 
-        There a course of the temperature takes the place of another one that predicts worse, and of
-        the time unless that predicts better.
+        There a course of the temperature takes its place unless the time predicts better.
         """
-        courses = self._excess_with_courses(sensor, self.named)
-        if name in courses:
-            return min(courses, key=courses.__getitem__)
         if name != CURVES_IN_TIME:
             return name
         fits = self.fits(sensor)
