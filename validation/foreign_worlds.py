@@ -149,13 +149,12 @@ def _about(axis, angle):
     return mats
 
 
-def _kinematics(angle, step):
+def _inputs(angle, turn):
     """
-    Return (joint rates, n-to-s matrices, specific force in s, rate in s).
+    Return (n-to-s matrices, specific force in s, rate in s) of joint angles and rates.
 
     They are at the intersection of the axes.
     """
-    turn = np.gradient(angle, step, axis=0)
     outer, middle, inner = (_about(axis, angle[:, k]) for k, axis in enumerate((2, 1, 0)))
     mat_ns = outer @ middle @ inner
     mat_sn = mat_ns.transpose(0, 2, 1)
@@ -168,7 +167,31 @@ def _kinematics(angle, step):
         axis=1,
     )
     rate_n = earth + (axes * turn[:, :, None]).sum(axis=1)
-    return turn, mat_sn, mat_sn @ [0.0, 0.0, GRAVITY], (mat_sn @ rate_n[:, :, None])[:, :, 0]
+    return mat_sn, mat_sn @ [0.0, 0.0, GRAVITY], (mat_sn @ rate_n[:, :, None])[:, :, 0]
+
+
+def least_squares(world: World) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """
+    Return sensor -> (bias, matrix) by least squares.
+
+    Each sample in the time of the joints has the same weight; the table is as described.
+    """
+    time = (world.stamp_ns - START_NS) / 1e9
+    joint_time = (world.joint_ns - START_NS) / 1e9
+    turn = np.gradient(world.angle, joint_time, axis=0)
+    inside = (time > joint_time[1]) & (time < joint_time[-2])
+    angle = np.stack([np.interp(time[inside], joint_time, part) for part in world.angle.T], axis=1)
+    turn = np.stack([np.interp(time[inside], joint_time, part) for part in turn.T], axis=1)
+    _, force, rate = _inputs(angle, turn)
+    fits = {}
+    for sensor, true, readings in (
+        ('accelerometer', force, world.force),
+        ('gyroscope', rate, world.rate),
+    ):
+        columns = np.column_stack([np.ones(len(true)), true])
+        fit = np.linalg.lstsq(columns, readings[inside], rcond=None)[0]
+        fits[sensor] = (fit[0], fit[1:].T)
+    return fits
 
 
 def make_world(kind: str, unit: int, motion: int) -> World:
@@ -181,7 +204,8 @@ def make_world(kind: str, unit: int, motion: int) -> World:
     step = 1.0 / RATE / FINE
     angle = _motion(rng, step)
     time = step * np.arange(len(angle))
-    turn, mat_sn, force, rate = _kinematics(angle, step)
+    turn = np.gradient(angle, step, axis=0)
+    mat_sn, force, rate = _inputs(angle, turn)
     warm = (
         24.0
         + own.uniform(6, 9) * -np.expm1(-time / (0.4 * time[-1]))

@@ -23,6 +23,7 @@ from imu_calibration.calibration.proof import prove
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.solved import ModelSource, Solved
 from imu_calibration.document.proof_entry import Proof
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import tolerances_of, with_weak_replaced
 from imu_calibration.references.options import CalibrationOptions
 
@@ -105,9 +106,11 @@ def conclude(
     proof: Proof = {}
     if is_judged:
         held_out = data.held_out(solution)
-        fits = better_plain_fits(
-            held_out, under_test={*changes.unexplained, *under_test}, as_asked=options.as_asked
-        )
+        concerned = {*changes.unexplained, *under_test}
+        if changes.changed_at is not None:
+            # No search has tested the residual of the complete recording.
+            concerned.update(SENSORS)
+        fits = better_plain_fits(held_out, under_test=concerned, as_asked=options.as_asked)
         proof = prove(with_fits(held_out, fits))
     applied = with_plain_fits(solution, fits)
 

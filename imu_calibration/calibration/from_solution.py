@@ -78,6 +78,11 @@ class ModelChanges:
     Sd of independent errors of the stamps and the variance ratios they cause (`StampJitter`), empty
     where not significant.
     """
+    changed_at: float | None = None
+    """
+    Time of a change of parameters at one moment (`find_onset`), s: effects and residual are those of
+    the longer part.
+    """
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""

@@ -121,7 +121,7 @@ class HeldOutWindows(HeldOutData[Solution]):
             if effect.sensor == sensor and not is_of_reference(effect):
                 free[amplitudes] = True
         free &= ~fixed_parameters(model) & ~self.solution.held
-        if not np.any(free & ~estimate.fitted):
+        if not np.any(free):
             return
         prior = make_prior(model)
         n_pieces = 0

@@ -35,7 +35,7 @@ def better_plain_fits(
     held_out: HeldOutData[Any], *, under_test: Collection[str], as_asked: bool = False
 ) -> tuple[PlainFit, ...]:
     """
-    Return the plain fits to apply: they predict held-out data better than a solution.
+    Return the plain fits to apply: no solution predicts each kind of held-out data better.
 
     Data are held out in turn, and as complete regimes and parts of the session: an effect that
     stands in for another cause predicts the motions from which it was estimated only.
@@ -57,10 +57,11 @@ def better_plain_fits(
         # The other sensor is the one that is applied: it has the directions of turns.
         applied = with_plain_fits(held_out.solution, better).values
         fit = compared_fit(held_out, sensor, applied)
-        is_better = sensor in under_test and fit.is_close
-        if not is_better and (sensor in under_test or fit.estimate.dropped):
-            elsewhere = held_out.fits_elsewhere(sensor, fit.estimate, applied)
-            is_better = any(each.is_better for each in elsewhere)
+        elsewhere = held_out.fits_elsewhere(sensor, fit.estimate, applied)
+        if sensor in under_test:
+            is_better = fit.is_close or any(each.is_close for each in elsewhere)
+        else:
+            is_better = bool(fit.estimate.dropped) and any(each.is_better for each in elsewhere)
         if is_better:
             better.append(fit)
     return tuple(better)

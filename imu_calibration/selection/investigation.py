@@ -69,6 +69,11 @@ class Investigation(SelectedEffects):
     """
 
     @property
+    def changed_at(self) -> float | None:
+        """Time of the onset, s."""
+        return None if self.onset is None else self.onset.time
+
+    @property
     def param_names(self) -> Sequence[str]:
         """Names of the parameters of the baseline and of the effects under test."""
         return self.problem.space.names

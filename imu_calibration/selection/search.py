@@ -469,6 +469,11 @@ class SelectedEffects:
     """Saturations (`Saturation`)."""
 
     @property
+    def changed_at(self) -> float | None:
+        """Time at which parameters change, s; None where no search looked for it."""
+        return None
+
+    @property
     def jitter_entry(self) -> Mapping[str, Any]:
         """Independent errors of the stamps, for a document."""
         return {}

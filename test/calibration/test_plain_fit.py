@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from imu_calibration.calibration import plain_fit
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.diagnosis.diagnose import (
     ProposedExtension,
@@ -20,6 +21,7 @@ from imu_calibration.calibration.diagnosis.diagnose import (
     helpful_formulas,
 )
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
+from imu_calibration.calibration.held_out_data import PlainFit
 from imu_calibration.calibration.table_calibration import TableRecordings
 from imu_calibration.calibration.window_readings import errors_on_table
 from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
@@ -183,6 +185,50 @@ def test_a_drift_with_an_uncertain_time_constant_is_applied_at_its_mean():
     plain = with_plain_values(calibration, 'heat', 611)
     ratio = errors_on_second('heat', 611, calibration) / errors_on_second('heat', 611, plain)
     assert np.all(ratio < 1.05)
+
+
+@pytest.mark.parametrize(
+    ('of_folds', 'elsewhere', 'n_applied'),
+    [(0.9, [0.9, 0.9], 1), (1.1, [1.1, 1.1], 0), (1.1, [1.1, 1.01], 1), (1.1, [], 0)],
+)
+def test_the_solution_has_to_predict_each_kind_of_held_out_data_better(
+    of_folds, elsewhere, n_applied, monkeypatch
+):
+    # On a table, least squares with the same effects predict the other regimes equally well, so
+    # that another weight of the windows is no reason for the solution (a cable: 1.05 before).
+    def fit(error):
+        return PlainFit('gyroscope', SimpleNamespace(dropped=()), error, 1.0, 'rad/s')
+
+    held_out = SimpleNamespace(
+        solution=SimpleNamespace(model=None, values=None, param_names=()),
+        judged={'gyroscope': None},
+        fits_elsewhere=lambda *_: iter(map(fit, elsewhere)),
+    )
+    monkeypatch.setattr(plain_fit, 'compared_fit', lambda *_: fit(of_folds))
+    fits = plain_fit.better_plain_fits(held_out, under_test=['gyroscope'], as_asked=True)
+    assert len(fits) == n_applied
+
+
+def test_least_squares_with_the_same_effects_predict_other_regimes_equally_well():
+    # Without them the solution was applied by its folds alone.
+    _, _, solved, _ = world('cable', 604)
+    held_out = solved.data.held_out(solved.solution)
+    values = solved.solution.values
+    estimate = plain_fit.compared_fit(held_out, 'gyroscope', values).estimate
+    elsewhere = list(held_out.fits_elsewhere('gyroscope', estimate, values))
+    assert not estimate.dropped
+    assert len(elsewhere) == 2 and all(fit.is_close for fit in elsewhere)
+
+
+@pytest.mark.parametrize(('changed_at', 'sensors'), [(12.0, set(SENSORS)), (None, set())])
+def test_after_a_change_at_one_moment_the_residual_is_unexplained(changed_at, sensors):
+    # A belt that slipped was found; the search was that of the longer part (1.08 before).
+    _, _, solved, options = world('cable', 604)
+    changes = ModelChanges(changed_at=changed_at)
+    searched = replace(solved, extension=ModelExtension(changes=changes))
+    statistics = conclude(searched, options).calibration.statistics
+    assert set(statistics.get('least_squares', ())) == sensors
+    assert statistics.get('changed_at') == changed_at
 
 
 def formula(name, column, unit):
