@@ -80,8 +80,8 @@ class ModelChanges:
     """
     changed_at: float | None = None
     """
-    Time of a change of parameters at one moment (`find_onset`), s: effects and residual are those of
-    the longer part.
+    Time of a change of parameters at one moment (`find_onset`), s: effects and residual are of the
+    longer part.
     """
 
     def to_mapping(self) -> dict:

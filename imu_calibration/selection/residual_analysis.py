@@ -87,7 +87,7 @@ class ResidualAnalysis(Investigation):
 
     def _measured_cause(self, sensor: str, name: str | None) -> str | None:
         """
-        Return the variable of the largest correlation, where that is the time judged on locked blocks.
+        Return the variable of the largest correlation; the time is judged on locked blocks.
 
         There a course of the temperature takes its place unless the time predicts better.
         """
