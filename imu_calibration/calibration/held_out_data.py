@@ -1,13 +1,15 @@
 """Held-out data of a reference, with the errors of any parameters on them."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Generic
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Generic
 
 import numpy as np
 
 from imu_calibration.calibration.from_solution import Estimate
+from imu_calibration.effects.forward_equations import Centre, applied_values
+from imu_calibration.estimation.solution import Solution
 
 HARDLY_WORSE = 1.02
 """
@@ -77,6 +79,27 @@ class PlainEstimate:
 
 
 @dataclass(frozen=True, eq=False)
+class PlainEquations(ABC):
+    """Equations of bias and matrix of one sensor, for blocks of windows or poses."""
+
+    n_steps: ClassVar[int] = 1
+    """Number of steps to the estimate from all data; 1 for linear equations."""
+    plan: PlainEstimate
+    """The parameters that are estimated, with their start values."""
+
+    @abstractmethod
+    def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Return the parameters after a step with the blocks or poses of a mask."""
+
+    def estimate(self, masks: Sequence[np.ndarray]) -> PlainEstimate:
+        """Return the estimate from all data, and one step from it without the data of each mask."""
+        values = self.plan.values
+        for _ in range(self.n_steps):
+            values = self.moved(values, np.ones_like(masks[0]))
+        return replace(self.plan, values=values, folds=[self.moved(values, ~out) for out in masks])
+
+
+@dataclass(frozen=True, eq=False)
 class PlainFit:
     """A plain estimate, and the errors with which it and a solution predict held-out data."""
 
@@ -120,6 +143,8 @@ class HeldOutData(ABC, Generic[Estimate]):
     Parameters without each fold, as compensation applies them (`applied_values`), each shape
     (n_params,).
     """
+    masks: Sequence[np.ndarray]
+    """True for the blocks, poses or other parts of the data in each fold, each shape (n_parts,)."""
 
     @property
     @abstractmethod
@@ -139,9 +164,9 @@ class HeldOutData(ABC, Generic[Estimate]):
         yield folds
 
     @abstractmethod
-    def plain_estimates(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEstimate]:
+    def plain_equations(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEquations]:
         """
-        Yield plain estimates of a sensor, with the reference as described first.
+        Yield the equations of a plain fit of a sensor, with the reference as described first.
 
         `applied`: parameters of the solution and of plain fits of other sensors, shape (n_params,).
         """
@@ -151,3 +176,18 @@ class HeldOutData(ABC, Generic[Estimate]):
         self, sensor: str, estimate: PlainEstimate, applied: np.ndarray
     ) -> Iterator[PlainFit]:
         """Yield the errors on regimes and parts of the session that no estimate has seen."""
+
+
+def masks_in_turn(n_parts: int, n_folds: int) -> list[np.ndarray]:
+    """Return the mask of each fold; parts are assigned to folds in turn."""
+    number = np.arange(n_parts)
+    return [number % n_folds == fold for fold in range(n_folds)]
+
+
+def applied_folds(
+    solution: Solution, without: Iterable[np.ndarray], centre: Centre
+) -> list[np.ndarray]:
+    """Return the parameters `without` each fold as compensation applies them."""
+    return [
+        applied_values(solution.model, values, centre, absent=solution.absent) for values in without
+    ]

@@ -15,9 +15,12 @@ from imu_calibration.calibration.held_out_data import (
     HeldOutData,
     HeldOutErrors,
     JudgedData,
+    PlainEquations,
     PlainEstimate,
     PlainFit,
+    applied_folds,
     errors_of_rows,
+    masks_in_turn,
 )
 from imu_calibration.calibration.plain_fit import PARTS_OF_TIME, compared_fit, plan_of
 from imu_calibration.compensation.compensate import Corrected, compensated_samples
@@ -29,9 +32,8 @@ from imu_calibration.document.trust import (
     uncorrected_in_time,
 )
 from imu_calibration.effects.base import UNITS
-from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.gauss_newton import after_one_step
-from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
+from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.strapdown import total_rotation
@@ -93,8 +95,6 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
 
     turns: Sequence[TurnData]
     """Turns of the estimate."""
-    masks: Sequence[np.ndarray]
-    """True for the poses of a part that is held out, each shape (n_poses,)."""
     least_turns: int = 0
     """Fewest remaining turns when those of a part are evaluated."""
 
@@ -108,11 +108,9 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         least_turns: int = 0,
     ) -> 'HeldOutPoses':
         """Return the poses with the parameters of a solution without each part."""
-        centre = uncorrected_by_hand(hand).centre
-        folds = []
-        for values in values_without(hand, turns, masks):
-            folds.append(applied_values(hand.model, values, centre))
-        return cls(hand, folds, turns, masks, least_turns)
+        without = values_without(hand, turns, masks)
+        folds = applied_folds(hand, without, uncorrected_by_hand(hand).centre)
+        return cls(hand, folds, masks, turns, least_turns)
 
     @cached_property
     def parts(self) -> list[HeldOutPart]:
@@ -172,20 +170,15 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         of_sensor = np.char.startswith(self.solution.param_names, sensor)
         return [np.where(of_sensor, nominal, values) for values in folds]
 
-    def plain_estimates(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEstimate]:
-        """Yield the plain fit of a sensor, and one step from it without the poses of each mask."""
+    def plain_equations(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEquations]:
+        """Yield the equations of a sensor."""
         hand = self.solution
         plan = plan_of(hand, sensor, hand.prior_mean)
-        fitted = plan.fitted & ~hand.hand_model.fixed
-        estimator: _Lengths | _Turns = _Lengths(hand)
+        plan = replace(plan, fitted=plan.fitted & ~hand.hand_model.fixed)
         if sensor == 'gyroscope':
-            estimator = _Turns(hand, self.turns, applied)
-        everything = np.ones(len(hand.poses.time), bool)
-        values = plan.values
-        for _ in range(STEPS):
-            values = estimator.moved(values, fitted, everything)
-        folds = [estimator.moved(values, fitted, ~out) for out in self.masks]
-        yield replace(plan, fitted=fitted, values=values, folds=folds)
+            yield _Turns(plan, hand, self.turns, applied)
+        else:
+            yield _Lengths(plan, hand)
 
     def fits_elsewhere(
         self, sensor: str, estimate: PlainEstimate, applied: np.ndarray
@@ -236,9 +229,7 @@ def values_without(
         is_out = np.append(out, False)[system.group].any(axis=1)
         factor = triangular_of_band(rows[~is_out])[n_nuisances:, n_nuisances:]
         kept = np.concatenate([factor, prior])
-        moved = hand.values.copy()
-        moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])
-        found.append(moved)
+        found.append(after_one_step(hand.values, kept[:, :-1], kept[:, -1], free=free))
     return found
 
 
@@ -248,9 +239,9 @@ def folds_by_hand(poses: Poses) -> list[np.ndarray]:
 
     An eighth of them, or with few attitudes one pose; none with too few.
     """
-    number = np.arange(len(poses.start))
-    for count, least in ((HAND_PROOF_FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
-        folds = [number % count == fold for fold in range(count)]
+    n_poses = len(poses.start)
+    for count, least in ((HAND_PROOF_FOLDS, ATTITUDES_LEAST), (n_poses, FEW_ATTITUDES)):
+        folds = masks_in_turn(n_poses, count)
         if all(distinct_attitudes(poses.force[~out]) >= least for out in folds):
             return folds
     return []
@@ -351,31 +342,33 @@ def _parts_of_time(hand: HandCalibration) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lengths:
+class _Lengths(PlainEquations):
     """Equations ``|true force| = gravity`` of the poses."""
 
+    n_steps = STEPS
     hand: HandCalibration
 
-    def moved(self, values: np.ndarray, fitted: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return the parameters after a step with some of the poses."""
-        poses = self.hand.poses
+        free, poses = self.plan.fitted, self.hand.poses
         # the rows are minus the derivative of the errors
         errors, rows = self.hand.hand_model.norm_rows(values, poses.force, **poses.conditions)
-        return after_one_step(values, rows[kept], errors[kept], free=fitted)
+        return after_one_step(values, rows[kept][:, free], errors[kept], free=free)
 
 
 @dataclass(frozen=True, eq=False)
-class _Turns:
+class _Turns(PlainEquations):
     """Equations of a gyroscope: the mean rate at rest is its bias, turns determine its matrix."""
 
+    n_steps = STEPS
     hand: HandCalibration
     turns: Sequence[TurnData]
     reference: np.ndarray
     """Parameters of which those of the accelerometer determine the directions, shape (n,)."""
 
-    def moved(self, values: np.ndarray, fitted: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return the parameters after a step with some of the poses, and the turns between them."""
-        hand, model = self.hand, self.hand.hand_model
+        hand, model, fitted = self.hand, self.hand.hand_model, self.plan.fitted
         bias = np.zeros(len(values), bool)
         bias[model.gyro_bias] = True
         moved = values.copy()
@@ -391,5 +384,6 @@ class _Turns:
                 used.append(turn)
         rows = GravityRows(model, hand.poses, used).linearise(state)
         of_turns = rows.component == COMPONENTS.index('turn')
-        matrix = fitted & ~bias
-        return after_one_step(moved, rows.main[of_turns], rows.residual[of_turns], free=matrix)
+        free = fitted & ~bias
+        design = rows.main[of_turns][:, free]
+        return after_one_step(moved, design, rows.residual[of_turns], free=free)

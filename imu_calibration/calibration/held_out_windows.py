@@ -17,8 +17,11 @@ from imu_calibration.calibration.held_out_data import (
     HeldOutData,
     HeldOutErrors,
     JudgedData,
+    PlainEquations,
     PlainEstimate,
     PlainFit,
+    applied_folds,
+    masks_in_turn,
 )
 from imu_calibration.calibration.plain_fit import PARTS_OF_TIME, is_of_reference, plan_of
 from imu_calibration.calibration.proof import MIN_REGIME_BLOCKS, proof_entry, smallest
@@ -28,6 +31,7 @@ from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.effects.forward_equations import Centre, applied_values, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulated_rows import one_attitude
+from imu_calibration.estimation.gauss_newton import after_one_step
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.solution import Solution
@@ -63,10 +67,9 @@ class HeldOutWindows(HeldOutData[Solution]):
     @classmethod
     def of(cls, windows: HeldOut, solution: Solution, centre: Centre) -> 'HeldOutWindows':
         """Return the windows with the parameters of a solution without each fold."""
-        folds = []
-        for values in windows.values_without(solution):
-            folds.append(applied_values(solution.model, values, centre, absent=solution.absent))
-        return cls(solution, folds, windows, centre)
+        folds = applied_folds(solution, windows.values_without(solution), centre)
+        masks = masks_in_turn(len(windows.blocks), TABLE_FOLDS)
+        return cls(solution, folds, masks, windows, centre)
 
     @cached_property
     def _nominal(self) -> np.ndarray:
@@ -100,10 +103,11 @@ class HeldOutWindows(HeldOutData[Solution]):
         yield folds
         yield [with_reference(self.solution.model, values, self._nominal) for values in folds]
 
-    def plain_estimates(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEstimate]:
-        """Yield estimates with the table and the clock as described, and as estimated."""
+    def plain_equations(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEquations]:
+        """Yield the equations with the table and the clock as described, and as estimated."""
         for reference in (self._nominal, self._nominal_sensors):
-            yield _plain_estimate(self.windows, self.solution, sensor, reference)
+            plan = plan_of(self.solution, sensor, reference)
+            yield _Pieces.of(self.windows, self.solution.model, sensor, plan)
 
     def fits_elsewhere(
         self, sensor: str, estimate: PlainEstimate, applied: np.ndarray
@@ -355,22 +359,6 @@ def _slopes(
     return slopes
 
 
-def _plain_estimate(
-    held_out: HeldOut, solution: Solution, sensor: str, reference: np.ndarray
-) -> PlainEstimate:
-    """Return the estimate of a sensor with the table and the clock of `reference`."""
-    model = solution.model
-    plan = plan_of(solution, sensor, reference)
-    start = plan.values
-    rows, targets = _equations(held_out, model, sensor, start=start, fitted=plan.fitted)
-    folds = []
-    for fold in range(TABLE_FOLDS):
-        others = [k for k in range(len(rows)) if k % TABLE_FOLDS != fold]
-        folds.append(_solved(start, plan.fitted, rows, targets, others))
-    values = _solved(start, plan.fitted, rows, targets, range(len(rows)))
-    return replace(plan, values=values, folds=folds)
-
-
 def _groups_by_regime(held_out: HeldOut, sensor: str) -> list[np.ndarray]:
     """Return ``[columns | output]`` of the pieces of each regime of motion, as factors."""
     stacked: dict[tuple[str, str], np.ndarray] = {}
@@ -447,40 +435,43 @@ def _error_on_groups(
     return float(np.sqrt(squares))
 
 
-def _equations(
-    held_out: HeldOut, model: SensorModel, sensor: str, *, start: np.ndarray, fitted: np.ndarray
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
+@dataclass(frozen=True, eq=False)
+class _Pieces(PlainEquations):
     """
-    Return for each block the rows and right sides of ``output = columns @ coefficients(values)``.
+    Equations ``output = columns @ coefficients(values)`` of the pieces of each block.
 
-    The coefficients are linear in bias and matrix, so that one step from `start` is exact.
+    The coefficients are linear in bias and matrix, so that one step from the start is exact.
     """
-    total = coefficients(model, sensor, start)
-    slopes = _slopes(model, sensor, start, steps=dict.fromkeys(np.flatnonzero(fitted), 1.0))
-    width = len(total)
-    rows = []
-    targets = []
-    for block in held_out.blocks:
-        pieces = [np.zeros((0, width + 2 * N_AXES))]
-        for kept in (block.pieces, block.earlier):
-            pieces += [part for (name, _), part in kept.items() if name == sensor]
-        stacked = np.concatenate(pieces)
-        columns, output = stacked[:, :width], stacked[:, -N_AXES:]
-        rows.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
-        targets.append((output - columns @ total).ravel())
-    return rows, targets
 
+    rows: list[np.ndarray]
+    """Derivatives by the fitted parameters of each block, shape (m, n_fitted)."""
+    targets: list[np.ndarray]
+    """Output minus prediction at the start of each block, shape (m,)."""
 
-def _solved(
-    start: np.ndarray,
-    fitted: np.ndarray,
-    rows: list[np.ndarray],
-    targets: list[np.ndarray],
-    blocks: Sequence[int],
-) -> np.ndarray:
-    """Return the parameters that fit the rows of some blocks, numbers in their list."""
-    design = np.concatenate([rows[k] for k in blocks])
-    target = np.concatenate([targets[k] for k in blocks])
-    values = start.copy()
-    values[fitted] += scaled_lstsq(design, target)
-    return values
+    @classmethod
+    def of(
+        cls, held_out: HeldOut, model: SensorModel, sensor: str, plan: PlainEstimate
+    ) -> '_Pieces':
+        """Return the equations of the pieces of a sensor."""
+        total = coefficients(model, sensor, plan.values)
+        steps = dict.fromkeys(np.flatnonzero(plan.fitted).tolist(), 1.0)
+        slopes = _slopes(model, sensor, plan.values, steps=steps)
+        width = len(total)
+        rows = []
+        targets = []
+        for block in held_out.blocks:
+            pieces = [np.zeros((0, width + 2 * N_AXES))]
+            for kept in (block.pieces, block.earlier):
+                pieces += [part for (name, _), part in kept.items() if name == sensor]
+            stacked = np.concatenate(pieces)
+            columns, output = stacked[:, :width], stacked[:, -N_AXES:]
+            rows.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
+            targets.append((output - columns @ total).ravel())
+        return cls(plan, rows, targets)
+
+    def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Return the parameters that fit some of the blocks, from any values."""
+        blocks = np.flatnonzero(kept)
+        design = np.concatenate([self.rows[k] for k in blocks])
+        target = np.concatenate([self.targets[k] for k in blocks])
+        return after_one_step(self.plan.values, design, target, free=self.plan.fitted)

@@ -81,7 +81,8 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
     folds = [np.where(is_fixed, applied, values) for values in held_out.folds]
     of_solution = judged.rms(smallest_errors(held_out, sensor, folds))
     fits: list[PlainFit] = []
-    for estimate in held_out.plain_estimates(sensor, applied):
+    for equations in held_out.plain_equations(sensor, applied):
+        estimate = equations.estimate(held_out.masks)
         folds = [np.where(is_fixed, applied, values) for values in estimate.folds]
         error = judged.rms(held_out.errors(sensor, folds))
         fits.append(PlainFit(sensor, estimate, error, of_solution, judged.unit))

@@ -83,12 +83,12 @@ def after_one_step(
     ----------
     values : array, shape (n,)
         Where the rows are linearised.
-    design, misfit : array, shape (m, n) and (m,)
+    design, misfit : array, shape (m, n_free) and (m,)
         ``misfit = design @ change + error`` in standard deviations, measured minus predicted.
     free : array of bool, shape (n,)
         Parameters that move.
 
     """
     moved = values.copy()
-    moved[free] += scaled_lstsq(design[:, free], misfit)
+    moved[free] += scaled_lstsq(design, misfit)
     return moved

@@ -19,9 +19,16 @@ from imu_calibration.estimation.scaled_solve import (
     solve_scaled,
 )
 from imu_calibration.estimation.solution import CONVENTION_SHARE
-from imu_calibration.selection.parameter_space import ParameterSpace, white_means, within_of_axis
+from imu_calibration.selection.parameter_space import (
+    ParameterSpace,
+    normal_matrix,
+    white_means,
+    within_of_axis,
+)
 from imu_calibration.selection.reduced_recording import Recent
 
+ParameterFit = tuple[np.ndarray, np.ndarray]
+"""Values of parameters and their covariance, shape (n,) and (n, n)."""
 MIN_FOLD_WINDOWS = 8
 """Least number of windows for held-out folds."""
 MOST_FITS = 128
@@ -106,7 +113,7 @@ class Evidence:
         right = self.total[:-1, -1] + known * self._prior_mean
         return matrix, right
 
-    def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def fit(self, used: Sequence[int], number: int | None = None) -> ParameterFit:
         """
         Return (values, covariance) of the parameters `used`.
 
@@ -150,6 +157,12 @@ class Evidence:
         """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
         fall = max(self.loss(smaller) - self.loss(larger), 0.0)
         return float(chi2_sf(fall, len(larger) - len(smaller)))
+
+    def fits_of_halves(
+        self, used: Sequence[int]
+    ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
+        """Return the fits of parameters to the first and second half of the rows, and to both."""
+        raise NotImplementedError
 
     def left_by_others(self, used: Sequence[int]) -> np.ndarray:
         """
@@ -250,6 +263,22 @@ class WindowEvidence(Evidence):
             at = self.space.places(sensor, axis)
             found[:, at[:, None], at] += parts.sum(axis=0)
         return found
+
+    def fits_of_halves(
+        self, used: Sequence[int]
+    ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
+        """Return the fits of parameters to both halves of the windows, and to all of them."""
+        first, second = (
+            solve_normal(normal, np.array(used), self._prior_sd, prior_mean=self._prior_mean)
+            for normal in self._halves
+        )
+        return first, second, self.fit(used)
+
+    @cached_property
+    def _halves(self) -> list[np.ndarray]:
+        """Normal matrices of the first and second half of the windows."""
+        early = np.arange(len(self.fold)) < len(self.fold) // 2
+        return [normal_matrix(self.space, self.noise, half) for half in (early, ~early)]
 
     def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
         """Return the covariance of the parameters `used` from one sensor and the prior."""
@@ -380,11 +409,7 @@ For halves of equal precision: values that differ by half of the joint estimate.
 """
 
 
-def agree(
-    halves: Sequence[tuple[np.ndarray, np.ndarray]],
-    whole: tuple[np.ndarray, np.ndarray],
-    at: Sequence[int],
-) -> bool:
+def agree(halves: Sequence[ParameterFit], whole: ParameterFit, at: Sequence[int]) -> bool:
     """
     Return whether the estimates of some parameters from two halves agree within their precision.
 

@@ -463,10 +463,6 @@ class WindowTests:
 
         return without_weakest(admissible, least_helpful)
 
-    def agrees_in_halves(self, named: Sequence[Question], question: Question) -> bool:
-        """Return whether both halves of the recording show an effect alike."""
-        return self.problem.agrees_in_halves(named, question)
-
     def significant(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects that are significant without those that were removed."""
         return self.problem.search.drop_insignificant(named)

@@ -18,7 +18,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.selection.evidence import WindowEvidence, agree, folds_of
+from imu_calibration.selection.evidence import WindowEvidence, folds_of
 from imu_calibration.selection.noise_beside_effects import (
     in_trusted_band,
     noise_before_fit,
@@ -189,24 +189,6 @@ class LinearisedProblem:
             * _curvature(question, self.values(chosen), self.recording.model, self.duration) ** 2
         )
 
-    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
-        """
-        Return whether both halves of the recording show an effect alike (`evidence.agree`).
-
-        Effects that are smooth in time are different in the halves by nature.
-        """
-        if question.effect.smooth:
-            return True
-        used = self.search.indices(chosen)
-        at = [used.index(k) for k in question.parameters]
-        fits = [
-            solve_normal(
-                normal, np.asarray(used), self.space.prior_sd, prior_mean=self.space.prior_mean
-            )
-            for normal in self._halves
-        ]
-        return agree(fits, self.evidence.fit(used), at)
-
     def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
         """
         Return whether an effect is also significant against its scatter over windows.
@@ -215,13 +197,6 @@ class LinearisedProblem:
         """
         p_value = self.evidence.p_value_by_scatter(self.search.indices(chosen), question.parameters)
         return p_value * len(self.questions) < FAMILY_WISE
-
-    @cached_property
-    def _halves(self) -> list[np.ndarray]:
-        """Normal matrices of the first and second half of the selection windows."""
-        judged = self.evidence.space
-        early = np.arange(len(judged.recording.windows)) < len(judged.recording.windows) // 2
-        return [normal_matrix(judged, self.noise, half) for half in (early, ~early)]
 
     def acts_beside(self, chosen: Sequence[Question]) -> bool:
         """

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from imu_calibration.selection.questions import Question
 
@@ -10,14 +10,15 @@ from imu_calibration.selection.questions import Question
 class EffectTests(Protocol):
     """Tests of a choice of effects on the data of a reference."""
 
+    @property
+    def problem(self) -> Any:
+        """Rows with their `search`."""
+
     def explaining(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the effects of which each explains most of the excess variance."""
 
     def predicting(self, named: Sequence[Question]) -> list[Question]:
         """Return the effects that improve the prediction of held-out data."""
-
-    def agrees_in_halves(self, named: Sequence[Question], question: Question) -> bool:
-        """Return whether the estimates of an effect from both halves of the data agree."""
 
     def significant(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects that are significant without those that were removed."""
@@ -49,7 +50,8 @@ def select_findings(tests: EffectTests, chosen: Sequence[Question]) -> Findings:
 
     # An effect of the sensor is the same in both halves. Without the others a finding may predict
     # no longer, or be no longer significant.
-    unstable = [question for question in named if not tests.agrees_in_halves(named, question)]
+    search = tests.problem.search
+    unstable = [question for question in named if not search.agrees_in_halves(named, question)]
     if unstable:
         named = tests.predicting([question for question in named if question not in unstable])
     return Findings(tests.significant(named), unstable)

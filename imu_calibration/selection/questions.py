@@ -118,6 +118,24 @@ def sort_effects(
     return known, lacking
 
 
+def lacking_temperature(effect: Effect, span: float | None) -> tuple[str, str] | None:
+    """
+    Return (why, needs) of an effect that the temperature of a recording does not show.
+
+    `span`: range of the temperature, K; None where it is not known throughout.
+    """
+    if 'temperature' not in effect.needs:
+        return None
+    if span is None:
+        return 'the temperature is not known throughout', 'record imu/temperature'
+    if span < TEMPERATURE_SPAN:
+        return (
+            f'the temperature changed by {span:.2f} K only',
+            'record while the sensor warms up by at least some kelvins',
+        )
+    return None
+
+
 def _vibrates(windows: Sequence[Window]) -> bool:
     """Return whether vibration differs between rests."""
     rests = [window for window in windows if window.kind == 'static' and len(window) > 3]
@@ -142,13 +160,8 @@ def _why_not(
     shaken: bool,
 ) -> tuple[str, str] | None:
     moving = kinds & {'spin', 'dynamic'}
-    if 'temperature' in effect.needs and span is None:
-        return 'no temperature was recorded with all windows', 'record imu/temperature'
-    if 'temperature' in effect.needs and span is not None and span < TEMPERATURE_SPAN:
-        return (
-            f'the temperature changed by {span:.2f} K only',
-            'record while the sensor warms up by at least some kelvins',
-        )
+    if why := lacking_temperature(effect, span):
+        return why
     if 'rotation' in effect.needs and not moving:
         return 'the recording has no rotation', 'spin and swing the table'
     if 'dynamic' in effect.needs and not moving:

@@ -15,7 +15,7 @@ from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.estimation.whitening import Whitening
-from imu_calibration.selection.evidence import Evidence
+from imu_calibration.selection.evidence import Evidence, ParameterFit
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +119,10 @@ class RowEvidence(Evidence):
         for block in blocks:
             acting = [k for k in smooth if np.any(block.rows[:, :, k])]
             self._noise.append(_noise(block, [*baseline, *acting]))
-        groups = np.unique(np.concatenate([block.group for block in blocks]))
-        n_folds = len(groups) if len(groups) <= ONE_BY_ONE else GROUP_FOLDS
-        self.folds = [np.searchsorted(groups, block.group) % n_folds for block in blocks]
+        self.groups = np.unique(np.concatenate([block.group for block in blocks]))
+        """Numbers of the groups of rows, shape (n_groups,)."""
+        n_folds = len(self.groups) if len(self.groups) <= ONE_BY_ONE else GROUP_FOLDS
+        self.folds = [np.searchsorted(self.groups, block.group) % n_folds for block in blocks]
         self._white = self._whitened()
         self._acting = [np.any(white != 0, axis=0) for white in self._white]
         """Of each block, the columns that are not zero."""
@@ -132,6 +133,18 @@ class RowEvidence(Evidence):
         super().__init__(
             total, np.array(without), prior_sd=space.prior_sd, prior_mean=np.zeros(space.size)
         )
+
+    def fits_of_halves(
+        self, used: Sequence[int]
+    ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
+        """Return the fits of parameters to both halves of the groups of rows, and to all."""
+        first, second = np.array_split(self.groups, 2)
+        fits = []
+        for out in (second, first, self.groups[:0]):
+            # The effects are no noise: their parameters are part of the baseline.
+            blocks = without_groups(self.blocks, out)
+            fits.append(RowEvidence(blocks, self.space, (), baseline=used).fit(used))
+        return fits[0], fits[1], fits[2]
 
     @staticmethod
     def _products(white: Sequence[np.ndarray]) -> np.ndarray:
@@ -255,6 +268,12 @@ class RowEvidence(Evidence):
             white = np.concatenate(self._white)
             self._bases[used] = orthonormal_basis(white[:, list(used)], DEPENDENT)
         return self._bases[used]
+
+
+def without_groups(blocks: Sequence[RowBlock], groups: np.ndarray) -> list[RowBlock]:
+    """Return the blocks without some groups of rows; a block of few rows is omitted."""
+    kept = [block.select(~np.isin(block.group, groups)) for block in blocks]
+    return [block for block in kept if block.known.size > FEWEST_SPARE_ROWS]
 
 
 def _noise(block: RowBlock, used: Sequence[int]) -> tuple[np.ndarray, tuple[BiasProcess, ...]]:

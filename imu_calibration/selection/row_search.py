@@ -1,12 +1,11 @@
 """Search of effects on few rows of any reference, repeated without each part of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from imu_calibration.core.progress import reported
-from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
 from imu_calibration.selection.order_of_tests import (
@@ -15,7 +14,12 @@ from imu_calibration.selection.order_of_tests import (
     without_weakest,
 )
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.row_evidence import RowBlock, RowEvidence, RowSpace
+from imu_calibration.selection.row_evidence import (
+    RowBlock,
+    RowEvidence,
+    RowSpace,
+    without_groups,
+)
 from imu_calibration.selection.search import Search
 
 OUTER = 12
@@ -44,55 +48,10 @@ class RowProblem:
             self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf
         )
 
-    @property
-    def groups(self) -> np.ndarray:
-        """Numbers of the groups of rows, shape (n_groups,)."""
-        return np.unique(np.concatenate([block.group for block in self.blocks]))
-
     def without(self, groups: np.ndarray) -> 'RowProblem':
         """Return the same problem without some groups of rows."""
-        return RowProblem(
-            self._blocks_without(groups), self.space, self.questions, baseline=self.search.baseline
-        )
-
-    def _blocks_without(self, groups: np.ndarray) -> list[RowBlock]:
-        blocks = [block.select(~np.isin(block.group, groups)) for block in self.blocks]
-        return [block for block in blocks if block.known.size > 3]
-
-    def explaining(self, chosen: Sequence[Question]) -> list[Question]:
-        """
-        Return the effects of which each explains most of the excess variance.
-
-        Sizes beyond the range of known instruments are tested only for the remaining excess.
-        """
-        named = list(pruned(chosen, self.explained.share))
-        if self.explained.rest(named):
-            wide = self.search.asking_any_size()
-            known, self.search = self.search, wide
-            others = list(pruned(wide.run(), self.explained.share))
-            if self.explained.rest(others) < self.explained.rest(named):
-                return others
-            self.search = known
-        return named
-
-    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
-        """
-        Return whether the estimates of an effect from both halves of the groups agree.
-
-        The halves are the groups before and after the middle (`evidence.agree`).
-
-        Effects that are smooth in time differ by nature.
-        """
-        if question.effect.smooth:
-            return True
-        used = self.search.indices(chosen)
-        groups = self.groups
-        # the chosen effects are no noise here, so they are part of the baseline
-        first, second, whole = (
-            RowEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
-            for out in (*np.array_split(groups, 2), groups[:0])
-        )
-        return agree((first, second), whole, [used.index(k) for k in question.parameters])
+        blocks = without_groups(self.blocks, groups)
+        return RowProblem(blocks, self.space, self.questions, baseline=self.search.baseline)
 
     def gain(
         self,
@@ -172,14 +131,30 @@ def choose_effects(problem: RowProblem) -> RowChoice:
     return RowChoice(found.named, found.unstable, tests.held_out)
 
 
+@dataclass(eq=False)
 class RowTests:
     """The tests of a choice on few rows (`EffectTests`)."""
 
-    def __init__(self, problem: RowProblem):
-        self.explaining = problem.explaining
-        self.agrees_in_halves = problem.agrees_in_halves
-        self.problem = problem
-        self.held_out: list[ChoiceWithout] = []
+    problem: RowProblem
+    held_out: list[ChoiceWithout] = field(default_factory=list)
+    """The search without each part of the groups; empty before it is needed."""
+
+    def explaining(self, chosen: Sequence[Question]) -> list[Question]:
+        """
+        Return the effects of which each explains most of the excess variance.
+
+        Sizes beyond the range of known instruments are tested only for the remaining excess.
+        """
+        explained = self.problem.explained
+        named = list(pruned(chosen, explained.share))
+        if not explained.rest(named):
+            return named
+        wide = self.problem.search.asking_any_size()
+        others = list(pruned(wide.run(), explained.share))
+        if not explained.rest(others) < explained.rest(named):
+            return named
+        self.problem.search = wide
+        return others
 
     def predicting(self, named: Sequence[Question]) -> list[Question]:
         """Return the findings that improve the prediction of rows held out from their choice."""
@@ -205,13 +180,14 @@ class RowTests:
 
 def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
     """Return the complete search, repeated without each part of the groups in turn."""
-    groups = problem.groups
+    groups = problem.evidence.groups
     times = min(OUTER, len(groups))
     found = []
     for number in reported('repeating the search', range(times), times):
         out = groups[number::times]
         smaller = problem.without(out)
-        found.append(ChoiceWithout(out, smaller.explaining(smaller.search.run()), smaller))
+        named = RowTests(smaller).explaining(smaller.search.run())
+        found.append(ChoiceWithout(out, named, smaller))
     return found
 
 

@@ -14,7 +14,7 @@ from imu_calibration.core.progress import reported
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.selection.evidence import Evidence
+from imu_calibration.selection.evidence import Evidence, agree
 from imu_calibration.selection.questions import Question
 
 FAMILY_WISE = 0.001
@@ -294,6 +294,18 @@ class Search:
             if not loss < 2 * MIN_GAIN_NATS:
                 return False
         return True
+
+    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
+        """
+        Return whether the estimates of a chosen effect from both halves of the data agree.
+
+        Effects that are smooth in time differ by nature.
+        """
+        if question.effect.smooth:
+            return True
+        used = self.indices(chosen)
+        *halves, whole = self.evidence.fits_of_halves(used)
+        return agree(halves, whole, [used.index(k) for k in question.parameters])
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
         """

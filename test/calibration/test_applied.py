@@ -133,7 +133,7 @@ def test_the_proof_from_window_statistics_differs_by_the_square_of_the_errors():
         applied_values(result.solution.model, result.solution.values),
     )
     dealt = result.gathered.held_out.restricted(result.data.model, model)
-    found = prove(HeldOutWindows(result.solution, [values], dealt, {}))
+    found = prove(HeldOutWindows(result.solution, [values], [], dealt, {}))
     checked = imu.check(session.samples, result.calibration, session.table)
     for sensor, entry in checked.proof.items():
         assert found[sensor].after == pytest.approx(entry.after, rel=0.02)

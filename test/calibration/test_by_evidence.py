@@ -150,7 +150,7 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
         question for question in half.problem.questions if question.name == 'gyro_g_sensitivity'
     )
     assert (
-        not half.problem.agrees_in_halves([question], question)
+        not half.problem.search.agrees_in_halves([question], question)
         and half.problem.search.score([], question).significant
     )
     added = _disagreement(replace(half, unstable=[question]), bare.param_names)

@@ -27,7 +27,7 @@ from imu_calibration.references.gravity.pose_residual import regimes_by_hand
 from imu_calibration.references.gravity.pose_rows import build_rows
 from imu_calibration.selection import regimes
 from imu_calibration.selection.gain import APPLIED, OF_MODEL
-from imu_calibration.selection.row_search import RowProblem
+from imu_calibration.selection.row_search import RowTests
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values
 from imu_calibration.simulation.session import simulate_session as simulate_session
@@ -161,7 +161,7 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
     model = SensorModel(joint_names=table.joint_names)
     imu = simulate_session(model, random_values(model), table, profile=profile)[0]
     # What is asked about is known before the search.
-    monkeypatch.setattr(RowProblem, 'explaining', lambda self, chosen: [])
+    monkeypatch.setattr(RowTests, 'explaining', lambda self, chosen: [])
     found = investigate_by_hand(gather_by_hand(imu), HandOptions(GRAVITY))
     assert {'gyro_rate_product', 'gyro_quadratic'} <= {
         entry['effect'] for entry in found.not_testable

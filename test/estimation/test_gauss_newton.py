@@ -44,7 +44,8 @@ def test_one_step_solves_linear_rows_and_moves_free_parameters_only():
     design = np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 3.0], [2.0, 0.0, 1.0]])
     values = np.array([1.0, 1.0, 1.0])
     change = np.array([0.5, 0.0, -0.25])
-    moved = after_one_step(values, design, design @ change, free=change != 0)
+    free = change != 0
+    moved = after_one_step(values, design[:, free], design @ change, free=free)
     np.testing.assert_allclose(moved, values + change, rtol=1e-12)
     assert moved[1] == 1.0
 

@@ -826,15 +826,22 @@ def test_halves_agree_within_chance(apart, agree):
     """
     An effect of two standard deviations of the whole, halves that differ by so many of theirs.
     """
-    problem = LinearisedProblem.__new__(LinearisedProblem)
-    problem.space = SimpleNamespace(prior_sd=np.full(1, 1e6), prior_mean=np.zeros(1))
-    problem._halves = [
+    halves = [
         np.array([[1.0, value], [value, value**2]])
         for value in (apart / np.sqrt(2), -apart / np.sqrt(2))
     ]
-    problem.search = SimpleNamespace(indices=lambda chosen: (0,))
-    problem.evidence = SimpleNamespace(fit=lambda used: (np.array([2.0]), np.eye(1) / 2))
-    assert problem.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
+    evidence = WindowEvidence.__new__(WindowEvidence)
+    Evidence.__init__(
+        evidence,
+        np.zeros((2, 2)),
+        np.array(halves),
+        prior_sd=np.full(1, 1e6),
+        prior_mean=np.zeros(1),
+    )
+    evidence._halves = halves
+    evidence.fit = lambda used: (np.array([2.0]), np.eye(1) / 2)
+    search = Search(evidence, (), [QUADRATIC])
+    assert search.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
 
 
 def judging_tests(
@@ -852,10 +859,11 @@ def judging_tests(
     monkeypatch.setattr(investigation.WindowTests, 'explaining', lambda tests, chosen: chosen)
     problem = SimpleNamespace(
         search=SimpleNamespace(
-            allowed=lambda named, question: True, drop_insignificant=drop_insignificant
+            allowed=lambda named, question: True,
+            drop_insignificant=drop_insignificant,
+            agrees_in_halves=lambda named, question: agree(question),
         ),
         windows_agree=windows_agree,
-        agrees_in_halves=lambda named, question: agree(question),
     )
     return investigation.WindowTests(problem, None)
 

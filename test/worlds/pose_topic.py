@@ -15,7 +15,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
-from imu_calibration.calibration.held_out_data import HeldOutData, JudgedData, errors_of_rows
+from imu_calibration.calibration.held_out_data import (
+    HeldOutData,
+    JudgedData,
+    errors_of_rows,
+    masks_in_turn,
+)
 from imu_calibration.calibration.result import Needs
 from imu_calibration.calibration.solved import Solved
 from imu_calibration.document.statistics import RecordingStatistics, SensorEntry
@@ -231,13 +236,13 @@ class HeldOutBlocks(HeldOutData):
 
     @classmethod
     def of(cls, data, solution):
-        number = np.arange(len(data.blocks))
+        masks = masks_in_turn(len(data.blocks), FOLDS)
         folds, lags = [], []
-        for fold in range(FOLDS):
-            without, state = solve(data, solution.model, number % FOLDS == fold)
+        for out in masks:
+            without, state = solve(data, solution.model, out)
             folds.append(without.values)
             lags.append(state.lag)
-        return cls(solution, folds, data, lags)
+        return cls(solution, folds, masks, data, lags)
 
     @property
     def judged(self):
@@ -248,15 +253,15 @@ class HeldOutBlocks(HeldOutData):
         """Return the rotations that are missed."""
         rows = PoseRows(self.data, self.solution.model)
         errors = np.zeros((len(self.data.blocks), 3))
-        for fold, (values, lag) in enumerate(zip(folds, self.lags)):
+        for out, values, lag in zip(self.masks, folds, self.lags):
             missed = rows.linearise(PoseState(values, lag)).residual.reshape(-1, 3)
-            errors[fold::FOLDS] = missed[fold::FOLDS]
+            errors[out] = missed[out]
         return errors_of_rows(errors)
 
     def nominal(self, sensor, folds):
         return [PoseRows(self.data, self.solution.model).nominal] * FOLDS
 
-    def plain_estimates(self, sensor, applied):
+    def plain_equations(self, sensor, applied):
         raise NotImplementedError
 
     def fits_elsewhere(self, sensor, estimate, applied):

@@ -453,9 +453,9 @@ def _agreement(problem: LinearisedProblem) -> Callable:
     """Return whether windows and both halves of the recording agree on a chosen effect."""
 
     def agree(chosen: Sequence[Question], question: Question) -> bool:
-        return problem.windows_agree(chosen, question) and problem.agrees_in_halves(
-            chosen, question
-        )
+        if not problem.windows_agree(chosen, question):
+            return False
+        return problem.search.agrees_in_halves(chosen, question)
 
     return agree
 

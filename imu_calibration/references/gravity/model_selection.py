@@ -30,8 +30,8 @@ from imu_calibration.references.gravity.pose_residual import unexplained_by_hand
 from imu_calibration.references.gravity.pose_rows import build_rows, gravity_turns
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.questions import (
-    TEMPERATURE_SPAN,
     Question,
+    lacking_temperature,
     sort_effects,
     time_constants,
 )
@@ -222,15 +222,9 @@ def _why_not(
         return 'poses by hand are at rest, so that the vibration does not vary', 'record on a table'
     if not possible_by_hand(effect):
         return 'gravity in poses and the turns between them do not show it', 'record on a table'
-    if 'temperature' in effect.needs:
-        if poses.temperature_c is None:
-            return 'no temperature was recorded', 'record imu/temperature'
-        span = np.ptp(poses.temperature_c)
-        if span < TEMPERATURE_SPAN:
-            return (
-                f'the temperature changed by {span:.2f} K only',
-                'record while the sensor warms up by at least some kelvins',
-            )
+    span = None if poses.temperature_c is None else float(np.ptp(poses.temperature_c))
+    if why := lacking_temperature(effect, span):
+        return why
     if effect.role is Role.CROSS and not follows_gravity:  # the same test as in calibration
         return (
             'rates at rest do not separate it from a bias that moves in time',

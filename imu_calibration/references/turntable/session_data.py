@@ -284,7 +284,7 @@ class HeldOut:
         found = []
         for fold in range(TABLE_FOLDS):
             rows = np.concatenate([known, *(part for k, part in enumerate(parts) if k != fold)])
-            found.append(after_one_step(values, rows[:, :-1], -rows[:, -1], free=free))
+            found.append(after_one_step(values, rows[:, :-1][:, free], -rows[:, -1], free=free))
         return found
 
 
