@@ -24,11 +24,11 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
+from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import (
     AZIMUTH_REMEDY,
     BIAS_PROCESS,
-    GRAVITY,
     HELD_PRIORS,
     PLACE_REMEDY,
     REJECTED,
@@ -375,17 +375,12 @@ def _besides(
     return [(names, text) for text, names in others.items()]
 
 
-def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
-    """
-    Return the solution with the uncertainty of gravity in its covariance.
-
-    This uncertainty is a common scale of the accelerometer matrix.
-    """
-    direction = np.zeros(len(solution.values))
-    part = solution.model.part('accelerometer', Role.LINEAR)
-    direction[part] = solution.values[part] * table.gravity_sd_value / table.gravity_value
-    return replace(
-        solution, terms=with_term(solution.terms, GRAVITY, np.outer(direction, direction))
+def noise_entry(noise: NoiseModel) -> SensorEntry:
+    """Return the statistics of the noise of one sensor and of the scatter of its means."""
+    return SensorEntry(
+        noise_sd=noise.white_sd,
+        between_window_sd=noise.offset_sd,
+        wander_sd=float(np.sqrt(noise.bias_variance)),
     )
 
 
@@ -399,11 +394,9 @@ def statistics(solution: Solution, gathered: SessionData) -> RecordingStatistics
             attitude = AttitudeScatter(variance_ratio=dependence.ratio, p_value=dependence.p_value)
         has_biases = sensor in solution.session_biases
         moving, of_means = solution.residual_rms[sensor]
-        sensors[sensor] = SensorEntry(
-            noise_sd=noise.white_sd,
+        sensors[sensor] = replace(
+            noise_entry(noise),
             low_frequency_factor=noise.inflation,
-            between_window_sd=noise.offset_sd,
-            wander_sd=float(np.sqrt(noise.bias_variance)),
             wander_time_s=float('nan') if noise.bias_time is None else noise.bias_time,
             residual_rms_moving=moving,
             residual_rms_window_means=of_means,

@@ -1,12 +1,13 @@
 """Poses and turns of a calibration by hand, with the errors that they have before and after."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from imu_calibration.calibration.advice import missing_motion
+from imu_calibration.calibration.from_solution import noise_entry
 from imu_calibration.calibration.hand_recording import HandRecording
 from imu_calibration.calibration.held_out_poses import (
     TURNS_LEAST,
@@ -22,13 +23,15 @@ from imu_calibration.calibration.result import (
     Needs,
     WindowErrors,
 )
-from imu_calibration.document.statistics import RecordingStatistics, SensorEntry
+from imu_calibration.document.statistics import RecordingStatistics
 from imu_calibration.document.trust import Uncorrected
-from imu_calibration.effects.base import Role
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.solution import common_scale
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
+from imu_calibration.references.gravity.equations import COMPONENTS
 from imu_calibration.references.gravity.hand_calibration import (
     GAUGE,
     HandCalibration,
@@ -141,21 +144,12 @@ class PoseObservations:
         """Return the statistics of poses and turns, noise and scatter."""
         by_hand = solution.statistics
         delay = self.recording.delay
+        sensors = {}
+        for sensor, component in zip(SENSORS, COMPONENTS):
+            dof = float(by_hand[f'{component}_dof'])
+            sensors[sensor] = replace(noise_entry(solution.noise[sensor]), between_window_dof=dof)
         return RecordingStatistics(
-            sensors={
-                'accelerometer': SensorEntry(
-                    noise_sd=[float(sd) for sd in by_hand['force_noise_sd']],
-                    between_window_sd=float(by_hand['pose_scatter_sd']),
-                    between_window_dof=float(by_hand['pose_dof']),
-                    wander_sd=0.0,
-                ),
-                'gyroscope': SensorEntry(
-                    noise_sd=[float(sd) for sd in by_hand['rate_noise_sd']],
-                    between_window_sd=float(by_hand['drift_scatter_sd']),
-                    between_window_dof=float(by_hand['drift_dof']),
-                    wander_sd=0.0,
-                ),
-            },
+            sensors=sensors,
             windows={'static': by_hand.get('poses', 0), 'turns': by_hand.get('turns', 0)},
             samples_used={'all': len(self.recording.imu)},
             by_hand=by_hand,
@@ -229,9 +223,7 @@ class PoseObservations:
         calibration = result.calibration
         is_known = result.options.gravity is not None
         relative = calibration.common_scale.get('sd', GRAVITY_SD / result.gravity)
-        part = calibration.model.part('accelerometer', Role.LINEAR)
-        gravity = np.zeros(len(calibration.values))
-        gravity[part] = np.abs(calibration.values[part]) * relative
+        gravity = np.abs(common_scale(calibration.model, calibration.values)) * relative
         known = 'known' if is_known else 'not given: the standard one is known'
         return ErrorBudget(
             tuple(calibration.model.param_names),

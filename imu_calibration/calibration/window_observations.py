@@ -20,7 +20,6 @@ from imu_calibration.calibration.from_solution import (
     motions_needed,
     statistics,
     weak_on_table,
-    with_gravity_uncertainty,
 )
 from imu_calibration.calibration.held_out_windows import HeldOutWindows, nominal_values
 from imu_calibration.calibration.result import (
@@ -47,7 +46,7 @@ from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
-from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.solution import GRAVITY, Solution, common_scale, with_term
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
@@ -368,7 +367,11 @@ class WindowObservations:
 
     def with_reference_errors(self, solution: Solution) -> Solution:
         """Return the solution with the uncertainty of gravity in its covariance."""
-        return with_gravity_uncertainty(solution, self.table)
+        table = self.table
+        scale = common_scale(solution.model, solution.values)
+        moved = scale * table.gravity_sd_value / table.gravity_value
+        terms = with_term(solution.terms, GRAVITY, np.outer(moved, moved))
+        return replace(solution, terms=terms)
 
     def searches(
         self, solution: Solution, options: CalibrationOptions

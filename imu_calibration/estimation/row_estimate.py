@@ -22,7 +22,7 @@ from imu_calibration.estimation.scaled_solve import (
     covariance_with_held,
     triangular_of_band,
 )
-from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
+from imu_calibration.estimation.solution import terms_of_fit
 
 MAX_NEWTON_STEPS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""
@@ -149,7 +149,7 @@ def estimate_rows(
     factor = _factor(rows, last.scatter)
     own, of_held = covariance_with_held(factor, free, held, prior_sd=priors)
     of_scatter = _covariance_of_scatter(rows, last.scatter, free)
-    terms = {SAMPLE_NOISE: own - of_scatter, BIAS_PROCESS: of_scatter, HELD_PRIORS: of_held}
+    terms = terms_of_fit(own, of_scatter, of_held)
     n_steps = first.n_steps + last.n_steps
     return RowEstimate(last.state, terms, held, free, last.scatter, factor, n_steps)
 

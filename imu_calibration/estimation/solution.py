@@ -12,7 +12,7 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from imu_calibration.core.text_enum import StrEnum
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
@@ -122,6 +122,25 @@ def total(terms: Terms) -> np.ndarray:
 def with_term(terms: Terms, name: str, covariance: np.ndarray) -> dict[str, np.ndarray]:
     """Return the terms with a covariance added to one of them."""
     return {**terms, name: terms.get(name, 0.0) + covariance}
+
+
+def common_scale(model: SensorModel, values: np.ndarray) -> np.ndarray:
+    """
+    Return the change of the parameters with a common scale of the accelerometer, shape (n_params,).
+
+    A wrong gravity has this effect: rests determine only the matrix over gravity.
+    """
+    change = np.zeros(len(values))
+    part = model.part('accelerometer', Role.LINEAR)
+    change[part] = values[part]
+    return change
+
+
+def terms_of_fit(
+    own: np.ndarray, of_bias: np.ndarray, of_held: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the terms of a covariance: `own` of the free parameters contains `of_bias`."""
+    return {SAMPLE_NOISE: own - of_bias, BIAS_PROCESS: of_bias, HELD_PRIORS: of_held}
 
 
 def bounded_by_prior(terms: Terms, held: np.ndarray, prior_sd: np.ndarray) -> dict:

@@ -26,11 +26,9 @@ from imu_calibration.estimation.session_noise import (
     updated_noise,
 )
 from imu_calibration.estimation.solution import (
-    BIAS_PROCESS,
-    HELD_PRIORS,
-    SAMPLE_NOISE,
     AttitudeDependence,
     Solution,
+    terms_of_fit,
 )
 from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.whitening import predict_session_offsets
@@ -146,12 +144,7 @@ def solve(
     # The covariance as a sum of named terms: C = C_noise + C_bias + C_held + C_model.
     of_bias = own @ system.bias_information(values, noises) @ own
     of_model = model_error(system, values, noises, free=free & ~held)
-    terms = {
-        SAMPLE_NOISE: own - of_bias,
-        BIAS_PROCESS: of_bias,
-        HELD_PRIORS: of_held,
-        **of_model.terms(own + of_held),
-    }
+    terms = {**terms_of_fit(own, of_bias, of_held), **of_model.terms(own + of_held)}
     quality = _fit_quality(system, values, noises)
     return Solution(
         model,

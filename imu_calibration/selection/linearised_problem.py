@@ -30,9 +30,13 @@ from imu_calibration.selection.parameter_space import (
     normal_matrix,
     parameter_space,
     questions,
-    smooth_parameters,
 )
-from imu_calibration.selection.questions import Question, extended_model, time_constants
+from imu_calibration.selection.questions import (
+    Question,
+    extended_model,
+    smooth_parameters,
+    time_constants,
+)
 from imu_calibration.selection.reduced_recording import (
     ReducedRecording,
     make_bank,

@@ -349,15 +349,6 @@ def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Ques
     return asked
 
 
-def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ...]]]:
-    """Return sensor -> list of the parameters of effects that are smooth in time."""
-    found: dict[str, list[tuple[int, ...]]] = {sensor: [] for sensor in SENSORS}
-    for question in asked:
-        if question.effect.smooth and question.sensor in found:
-            found[question.sensor].append(question.parameters)
-    return found
-
-
 def normal_matrix(
     space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None
 ) -> np.ndarray:

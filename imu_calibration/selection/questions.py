@@ -50,6 +50,15 @@ class Question:
         return self.effect.sensor
 
 
+def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ...]]]:
+    """Return sensor -> list of the parameters of effects that are smooth in time."""
+    found: dict[str, list[tuple[int, ...]]] = {sensor: [] for sensor in SENSORS}
+    for question in asked:
+        if question.effect.smooth and question.sensor in found:
+            found[question.sensor].append(question.parameters)
+    return found
+
+
 def testable_effects(
     model: SensorModel, table: Table, windows: Sequence[Window]
 ) -> tuple[list[Effect], list[dict]]:

@@ -4,8 +4,9 @@ Evidence from few rows of any reference: poses and turns by hand, blocks of a po
 Rows are few, so that variances are estimated too and every group of rows is held out in turn.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -97,8 +98,9 @@ class RowEvidence(Evidence):
     ----------
     blocks : sequence of RowBlock
     space : RowSpace
-    smooth : sequence of int
-        Parameters of effects that are smooth in time, included when the noise is estimated.
+    smooth : dict
+        Sensor -> parameters of each effect that is smooth in time, included when the noise is
+        estimated.
     baseline : sequence of int
         Parameters of the model under diagnosis.
 
@@ -108,7 +110,7 @@ class RowEvidence(Evidence):
         self,
         blocks: Sequence[RowBlock],
         space: RowSpace,
-        smooth: Sequence[int],
+        smooth: Mapping[str, Sequence[tuple[int, ...]]],
         *,
         baseline: Sequence[int],
     ):
@@ -117,7 +119,7 @@ class RowEvidence(Evidence):
         # Smooth effects are included: the noise is not estimated from what they explain.
         self._noise = []
         for block in blocks:
-            acting = [k for k in smooth if np.any(block.rows[:, :, k])]
+            acting = chain.from_iterable(smooth.get(block.sensor, ()))
             self._noise.append(_noise(block, [*baseline, *acting]))
         self.groups = np.unique(np.concatenate([block.group for block in blocks]))
         """Numbers of the groups of rows, shape (n_groups,)."""
@@ -143,7 +145,7 @@ class RowEvidence(Evidence):
         for out in (second, first, self.groups[:0]):
             # The effects are no noise: their parameters are part of the baseline.
             blocks = without_groups(self.blocks, out)
-            fits.append(RowEvidence(blocks, self.space, (), baseline=used).fit(used))
+            fits.append(RowEvidence(blocks, self.space, {}, baseline=used).fit(used))
         return fits[0], fits[1], fits[2]
 
     @staticmethod

@@ -13,7 +13,7 @@ from imu_calibration.selection.order_of_tests import (
     select_findings,
     without_weakest,
 )
-from imu_calibration.selection.questions import Question
+from imu_calibration.selection.questions import Question, smooth_parameters
 from imu_calibration.selection.row_evidence import (
     RowBlock,
     RowEvidence,
@@ -37,10 +37,8 @@ class RowProblem:
         *,
         baseline: Sequence[int],
     ):
-        smooth: list[int] = []
-        for question in questions:
-            if question.effect.smooth and not question.effect.time_constant:
-                smooth += question.parameters
+        untimed = [question for question in questions if not question.effect.time_constant]
+        smooth = smooth_parameters(untimed)
         self.blocks, self.space, self.questions = blocks, space, questions
         self.evidence = RowEvidence(blocks, space, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)

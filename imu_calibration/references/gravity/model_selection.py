@@ -252,7 +252,7 @@ def _questions(
     An effect that is collinear with the baseline in these poses is moved to `not_testable`.
     """
     by_name, asked = {e.name: e for e in effects}, []
-    probe = RowEvidence(blocks, space, (), baseline=base)
+    probe = RowEvidence(blocks, space, {}, baseline=base)
     for label, part in space.parts.items():
         name = label.split('@')[0]
         parameters = tuple(range(part.start, part.stop))

@@ -26,7 +26,12 @@ from imu_calibration.estimation.row_estimate import (
     estimate_rows,
 )
 from imu_calibration.estimation.scaled_solve import triangular_of_band
-from imu_calibration.estimation.solution import GRAVITY, UNMODELLED_EARTH_RATE, total
+from imu_calibration.estimation.solution import (
+    GRAVITY,
+    UNMODELLED_EARTH_RATE,
+    common_scale,
+    total,
+)
 from imu_calibration.estimation.window_outliers import OUTLIER_P_VALUE
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.sphere import fit_sphere
@@ -70,11 +75,12 @@ def solve_joint(
         fallback=np.square(SCATTER_SD),
         withheld=model.withheld,
     )
-    reference, values = GravityRows(model, poses, turns), found.state.values
+    reference = GravityRows(model, poses, turns)
+    scale = common_scale(model.model, found.state.values)
     terms = {
         **found.terms,
         **_model_error(reference, found).terms(total(found.terms)),
-        GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
+        GRAVITY: (gravity_sd / model.gravity) ** 2 * np.outer(scale, scale),
         UNMODELLED_EARTH_RATE: _of_earth(model, found.state, poses, found.free),
     }
     return replace(found, terms=terms), reference.memory
@@ -201,18 +207,6 @@ class _NormsAndPriors(NormSquares):
         """Return whether no scale is negative: there lies the mirrored solution, or none."""
         is_finite = np.isfinite(values).all()
         return bool(is_finite and np.diag(self.model.linear(values)[1]).min() > 0.0)
-
-
-def _of_gravity(model: HandModel, values: np.ndarray, relative_sd: float) -> np.ndarray:
-    """
-    Return the contribution of a wrong gravity to the covariance.
-
-    Poses at rest determine only matrix / gravity.
-    """
-    common = np.zeros(len(values))
-    part = model.model.part('accelerometer', Role.LINEAR)
-    common[part] = values[part]
-    return relative_sd**2 * np.outer(common, common)
 
 
 def _of_earth(model: HandModel, state: State, poses: Poses, free: np.ndarray) -> np.ndarray:
