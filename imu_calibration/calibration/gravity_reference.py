@@ -75,7 +75,7 @@ class GravityReference:
         """Return the error with the number of poses."""
         from imu_calibration.references.gravity.model_selection import too_few_poses
 
-        return too_few_poses(len(result.solution.poses.start))
+        return too_few_poses(len(result.solution.poses))
 
     def identify(self, result: HandResult) -> 'Diagnosis':
         """Return the errors of the model in poses and turns."""

@@ -6,7 +6,7 @@ no further effect.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -196,7 +196,7 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
 
 def norm_errors(hand: HandCalibration, values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return ``|corrected force| - gravity`` of the poses of a mask, m/s^2."""
-    poses = _selected(hand.poses, mask)
+    poses = hand.poses.select(mask)
     corrected = corrected_with(
         hand.hand_model, values, poses.force, temperature_c=poses.temperature_c
     )
@@ -239,7 +239,7 @@ def folds_by_hand(poses: Poses) -> list[np.ndarray]:
 
     An eighth of them, or with few attitudes one pose; none with too few.
     """
-    n_poses = len(poses.start)
+    n_poses = len(poses)
     for count, least in ((HAND_PROOF_FOLDS, ATTITUDES_LEAST), (n_poses, FEW_ATTITUDES)):
         folds = masks_in_turn(n_poses, count)
         if all(distinct_attitudes(poses.force[~out]) >= least for out in folds):
@@ -260,14 +260,6 @@ def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
         hand.poses.time,
         end=end_by_hand(hand.poses),
         latest=latest_settling(hand.model, hand.values, hand.sd),
-    )
-
-
-def _selected(poses: Poses, mask: np.ndarray) -> Poses:
-    """Return some of the poses."""
-    parts = {f.name: getattr(poses, f.name) for f in fields(poses)}
-    return replace(
-        poses, **{name: part[mask] for name, part in parts.items() if isinstance(part, np.ndarray)}
     )
 
 

@@ -104,7 +104,7 @@ class PoseObservations:
 
         # The search compares both sensors in poses and turns: with one sensor it has no data.
         data = self.data
-        if options.as_asked or data.absent or len(data.poses.start) < MIN_FOLD_POSES:
+        if options.as_asked or data.absent or len(data.poses) < MIN_FOLD_POSES:
             return
         yield investigate_by_hand(data, hand_options(options), solution)
 

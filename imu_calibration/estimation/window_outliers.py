@@ -1,6 +1,6 @@
 """Windows whose means deviate from the other windows of their kind."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,38 +59,50 @@ def outlier_windows(
             of_kinds.append(_outliers_of_kind(kinds == kind, excluded, fit))
         # The kind with the least probable outlier.
         most = min(of_kinds, key=lambda outliers: outliers.least_p_value)
-        found[sensor] = frozenset(system.keys[window] for window in most.windows)
+        found[sensor] = frozenset(system.keys[window] for window in most.numbers)
     return found
 
 
 @dataclass(frozen=True)
-class _KindOutliers:
-    """Outliers among the windows of one kind."""
+class Outliers:
+    """Outliers among the windows or poses of one kind."""
 
     least_p_value: float
-    """Of all windows under test."""
-    windows: tuple[int, ...]
+    """Of all under test, corrected for their number (Bonferroni)."""
+    numbers: tuple[int, ...]
     """Numbers of the outliers."""
 
 
-def _outliers_of_kind(of_kind: np.ndarray, excluded: np.ndarray, fit: '_MeanFit') -> _KindOutliers:
+def find_outliers(p_values: Mapping[int, float], *, n_tests: int, most: int) -> Outliers:
+    """
+    Return the outliers among windows or poses, at most some.
+
+    Parameters
+    ----------
+    p_values : dict
+        Number -> p-value of the tests with the largest residuals.
+    n_tests, most : int
+        Number of tests that might have been made, and of outliers at most.
+
+    """
+    corrected = sorted((p_value * n_tests, number) for number, p_value in p_values.items())
+    outliers = [number for p_value, number in corrected[:most] if p_value < OUTLIER_P_VALUE]
+    return Outliers(corrected[0][0] if corrected else 1.0, tuple(outliers))
+
+
+def _outliers_of_kind(of_kind: np.ndarray, excluded: np.ndarray, fit: '_MeanFit') -> Outliers:
     """Return the outliers among the windows of a kind (mask) that are not `excluded` (mask)."""
     count = int(of_kind.sum())
     kept = np.flatnonzero(of_kind & ~excluded)
     n_allowed = max(1, int(MAX_WINDOW_OUTLIERS * count)) - (count - len(kept))
     if n_allowed <= 0:
-        return _KindOutliers(1.0, ())
+        return Outliers(1.0, ())
 
     # The windows with the largest residuals are tested.
     squares = (fit.residual[kept] ** 2).sum(axis=1)
     tested = kept[np.argsort(-squares, kind='stable')][:OUTLIER_CANDIDATES]
-    # Bonferroni: the p-value times the number of windows that might have been tested.
-    found = sorted((fit.p_value(window, kept) * len(kept), int(window)) for window in tested)
-    found = found[:n_allowed]
-    if not found:
-        return _KindOutliers(1.0, ())
-    outliers = tuple(window for p_value, window in found if p_value < OUTLIER_P_VALUE)
-    return _KindOutliers(found[0][0], outliers)
+    p_values = {int(window): fit.p_value(window, kept) for window in tested}
+    return find_outliers(p_values, n_tests=len(kept), most=n_allowed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -191,21 +191,14 @@ def _rest(
     )
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
+    found = Unexplained(significant, rms, float(sigma), None, 0.0, residual, noise_sd)
     if not significant:
-        return Unexplained(False, rms, float(sigma), None, 0.0, residual, noise_sd)
+        return found
     if sigma_means <= SIGNIFICANT_SDS:
         inside = np.mean(
             [floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])]
         )
-        return Unexplained(
-            True,
-            float(np.sqrt(inside * within / explained.n_within)),
-            float(sigma),
-            None,
-            0.0,
-            residual,
-            noise_sd,
-        )
+        return replace(found, rms=float(np.sqrt(inside * within / explained.n_within)))
     if rms == 0:  # less than biases may wander, and more than neighbours may differ
         rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
     # The fit has absorbed a part of the cause, as far as the columns of the model resemble it.
@@ -214,7 +207,7 @@ def _rest(
         used = np.flatnonzero(values[space.places(sensor, axis)[:-1]])
         fitted.append(space.mean[sensor][axis][:, used])
     name, share = correlate(_explanations(recording), residual, noise_sd, fitted=fitted)
-    return Unexplained(True, rms, float(sigma), name, share, residual, noise_sd)
+    return replace(found, rms=rms, correlates_with=name, share=share)
 
 
 def correlate(

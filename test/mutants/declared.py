@@ -731,8 +731,8 @@ HAND = _of(
     ),
     (
         'what does not belong to the others stays',
-        'without_outlying_poses',
-        '_1 * len(_2) < OUTLIER_P_VALUE',
+        'find_outliers',
+        '_1 < OUTLIER_P_VALUE',
         '_1 < 0',
         'test_poses_faults.py::test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out',
     ),

@@ -528,7 +528,7 @@ def traces_of_poses(baseline: HandCalibration, hand: HandCalibration) -> Traces:
         {'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': h.rate_rows()[0]}
         for h in (baseline, hand)
     ]
-    count = len(poses.start)
+    count = len(poses)
     return Traces(
         poses.time,
         np.full(count, 'static'),
@@ -574,7 +574,7 @@ def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagno
     gain = None
     if named:
         gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor)
-    count = len(found.baseline.poses.start)
+    count = len(found.baseline.poses)
     return Diagnosis(
         findings,
         found.unexplained,

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import bias_sum_rows
 from imu_calibration.estimation.row_estimate import RowSet
@@ -41,7 +42,7 @@ Least scatter of the drifts in units of the noise of the means, so that no row h
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
+class Poses(AlignedArrays):
     """Means over the intervals at rest."""
 
     force: np.ndarray

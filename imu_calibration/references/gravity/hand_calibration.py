@@ -290,7 +290,7 @@ def gather_by_hand(
         require_no_sway(imu, poses.force, list(zip(poses.start, poses.stop)), least=MIN_ATTITUDES)
         raise NotObservableError(
             f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still'
-            f' ({POSES_FULL} or more for all parameters), got {attitudes} in {len(poses.start)}'
+            f' ({POSES_FULL} or more for all parameters), got {attitudes} in {len(poses)}'
             ' intervals at rest; hold the IMU still in more attitudes, or describe the table or'
             ' arm that moved it',
             key='table',
@@ -539,7 +539,7 @@ def _statistics(
     of_accelerometer = np.char.startswith(model.model.param_names, 'accelerometer')
     spare = len(after) - int(np.sum(of_accelerometer & found.free))
     result = {
-        'poses': len(poses.start),
+        'poses': len(poses),
         'turns': len(turns),
         'steps': found.steps,
         'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))),

@@ -162,8 +162,8 @@ def investigate_by_hand(
 
     """
     poses = data.poses
-    if len(poses.start) < MIN_FOLD_POSES:
-        raise too_few_poses(len(poses.start))
+    if len(poses) < MIN_FOLD_POSES:
+        raise too_few_poses(len(poses))
     accelerometer = options.accelerometer or BASE
     gyroscope = options.gyroscope or BASE
     baseline = solved

@@ -1,6 +1,7 @@
 """Residual of a calibration by hand that no effect explains, and where it is largest."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -73,31 +74,23 @@ def unexplained_by_hand(
             excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
             if own > sigma:
                 sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
-    count = len(hand.poses.start)
+    count = len(hand.poses)
     first = next(k for k, block in enumerate(blocks) if block.sensor == sensor)
     layers, noise_sd = residuals[first], np.sqrt(blocks[first].floor)
     significant = bool(sigma > SIGNIFICANT_SDS and count >= MIN_EXPLAINED_WINDOWS)
     unit = None if chosen is None or chosen.duration is None else TURN_RESIDUAL_UNIT
+    sigma = float(max(sigma, -99.0))
+    found = Unexplained(significant, rms, sigma, None, 0.0, layers, noise_sd, unit)
     if not significant:
-        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, layers, noise_sd, unit)
+        return found
     name, share = correlate(_explanations(hand), layers, noise_sd)
     if chosen is not None and chosen.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
     heldout = evidence.heldout_residuals(used)[first]
     excess = ((heldout / noise_sd) ** 2 - 1.0).sum(axis=0)
     axes = largest_axes(excess) if len(excess) == len(AXES) and excess.max() > 0 else ()
-    return Unexplained(
-        True,
-        rms,
-        float(sigma),
-        name,
-        share,
-        layers,
-        noise_sd,
-        unit,
-        axes,
-        regimes_by_hand(hand, blocks[first], heldout),
-    )
+    regimes = regimes_by_hand(hand, blocks[first], heldout)
+    return replace(found, correlates_with=name, share=share, axes=axes, regimes=regimes)
 
 
 def _explanations(hand: HandCalibration) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:

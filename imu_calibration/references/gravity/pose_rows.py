@@ -149,7 +149,7 @@ def _norm_block(
 ) -> RowBlock:
     """One row per pose: ``|true force| - gravity``."""
     poses = hand.poses
-    count = len(poses.start)
+    count = len(poses)
     residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
     # The derivative of the norm by the reading, as by the bias.
     back = base[:, 0:3]
@@ -177,7 +177,7 @@ def _rest_block(
 ) -> RowBlock:
     """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
     poses = hand.poses
-    count = len(poses.start)
+    count = len(poses)
     residual, base = hand.rate_rows()
     earth = base.shape[2]
     rows = np.zeros((count, 3, space.size + 1))

@@ -32,7 +32,7 @@ from imu_calibration.estimation.solution import (
     common_scale,
     total,
 )
-from imu_calibration.estimation.window_outliers import OUTLIER_P_VALUE
+from imu_calibration.estimation.window_outliers import find_outliers
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.sphere import fit_sphere
 from imu_calibration.references.gravity.equations import (
@@ -92,7 +92,7 @@ def _model_error(reference: GravityRows, found: RowEstimate) -> ModelError:
 
     None where parts are fitted almost exactly: they have no scatter to compare.
     """
-    model, free, count = reference.model, found.free, len(reference.poses.start)
+    model, free, count = reference.model, found.free, len(reference.poses)
     rows = reference.linearise(found.state)
     # The rows of poses and turns, without those that directions and parameters need; the bias of
     # the gyroscope is determined at rest.
@@ -293,21 +293,17 @@ def without_outlying_poses(
     # The turn that begins in a pose.
     turn_of = {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
 
-    left: dict[str, list[int]] = {}
+    left: dict[str, tuple[int, ...]] = {}
     for component, kind in enumerate(COMPONENTS):
         of_kind = rows.component == component
         all_of_kind = _distance(rest[of_kind], basis[of_kind], LEAST_SHARE_OF_KIND)
-        tested = []
+        p_values = {}
         for number in np.unique(pose[of_kind]).tolist():
             own = of_kind & (pose == number)
             p_value = _p_value(_distance(rest[own], basis[own], LEAST_ERROR_SHARE), all_of_kind)
-            tested.append((p_value, turn_of[number] if kind == 'turn' else number))
-        # Only the worst few, with Bonferroni's correction for the choice.
-        allowed = max(1, int(MAX_POSE_OUTLIERS * len(tested)))
-        out = []
-        for p_value, number in sorted(tested)[:allowed]:
-            if p_value * len(tested) < OUTLIER_P_VALUE:
-                out.append(number)
+            p_values[turn_of[number] if kind == 'turn' else number] = p_value
+        most = max(1, int(MAX_POSE_OUTLIERS * len(p_values)))
+        out = find_outliers(p_values, n_tests=len(p_values), most=most).numbers
         if out:
             left[kind] = out
     if left.get('pose'):
@@ -359,8 +355,8 @@ def _p_value(own: _Misfit, all_rows: _Misfit) -> float:
     return chance_of_fall(own.square, own.rank, rest=all_rows.square - own.square, spare=spare)
 
 
-def _loosened(sem: np.ndarray, index: list[int]) -> np.ndarray:
-    """Return standard errors with those of the poses `index` so large that they hardly count."""
+def _loosened(sem: np.ndarray, outliers: Sequence[int]) -> np.ndarray:
+    """Return standard errors with negligible weights of the outliers, numbers of poses."""
     loose = sem.copy()
-    loose[index] *= OUTLIER_SD_FACTOR
+    loose[list(outliers)] *= OUTLIER_SD_FACTOR
     return loose

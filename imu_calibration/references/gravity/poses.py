@@ -235,7 +235,7 @@ def collect_turns(
     limit = max(MAX_TURN_GAP, 5 * poses.period)
     ended = at_range_end(rate)
     density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
-    for first in range(len(poses.start) - 1):
+    for first in range(len(poses) - 1):
         piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
         reason = _unusable(time[piece], ended[piece], limit)
         if reason:
