@@ -14,7 +14,9 @@ GONE = 5.0
 """Seconds without a message after which the node counts as ended."""
 WATCH_PERIOD_SECONDS = 0.25
 ONCE_SECONDS = 10.0
-"""Default patience where one status is wanted, and the longest wait for the picture."""
+"""
+Default patience where one status is wanted, and the longest wait for a complete screen without any.
+"""
 NOTICE_SECONDS = 3.0
 """Seconds of waiting after which the missing node is named."""
 
@@ -71,8 +73,9 @@ def _watch(watcher, options):
             f"'{options.node}' must run, no message on /diagnostics in {patience:g} s;"
             f' start it, or name it with --node, as `ros2 node list` shows it{_heard(watcher)}'
         )
-    # The picture is latched: it arrives at once from a node that publishes it.
-    end = time.monotonic() + min(patience, ONCE_SECONDS)
+    # The picture is latched: it arrives at once from a node that publishes it. The first message of
+    # a node that starts has no line of the streams yet.
+    end = time.monotonic() + (patience if patience < math.inf else ONCE_SECONDS)
     while not watcher.complete and time.monotonic() < end:
         watcher.spin(WATCH_PERIOD_SECONDS)
     out = Terminal.of()
@@ -140,8 +143,8 @@ class NodeWatcher:
 
     @property
     def complete(self) -> bool:
-        """Whether there is something to show."""
-        return bool(self.statuses) and bool(self.picture)
+        """Whether every part of the screen was received."""
+        return 'streams' in self.statuses and bool(self.picture)
 
     def _take(self, array):
         for status in array.status:

@@ -17,7 +17,7 @@ import pytest
 
 from imu_calibration.cli import watch
 from imu_calibration.cli.terminal import Terminal
-from imu_calibration.cli.watch import BAR, NodeStatus, bar, ratio_of, screen
+from imu_calibration.cli.watch import BAR, NodeStatus, NodeWatcher, bar, ratio_of, screen
 from imu_calibration.core.errors import InputError
 
 STATUSES = {
@@ -89,30 +89,31 @@ def test_before_anything_came_the_screen_is_short():
     ]
 
 
-class LateNode:
-    """Stands for a watcher: the node starts at a time of a clock, and ends a second later."""
+class LateNode(NodeWatcher):
+    """
+    Stands for a watcher: the node starts at a time of a clock, and ends a second later.
 
-    name, others, picture = 'calibration_node', set(), ''
+    It has states of its streams from a later time on.
+    """
 
-    def __init__(self, start):
-        self.now, self.start, self.heard, self.statuses = 0.0, start, 0.0, {}
+    name, others, picture = 'calibration_node', set(), 'hold it still'
 
-    @property
-    def complete(self):
-        return bool(self.statuses) and bool(self.picture)
+    def __init__(self, start, streams):
+        self.now, self.start, self.streams = 0.0, start, streams
+        self.heard, self.statuses = 0.0, {}
 
     def spin(self, seconds):
         self.now += seconds
-        if self.start <= self.now <= self.start + 1.0:
-            self.statuses, self.heard = STATUSES, self.now
+        if self.start <= self.now <= max(self.start, self.streams) + 1.0:
+            self.heard = self.now
+            for name, status in STATUSES.items():
+                if name != 'streams' or self.now >= self.streams:
+                    self.statuses[name] = status
 
-    def screen(self, out):
-        return screen(self.name, self.statuses, self.picture, out=out)
 
-
-def watched(monkeypatch, start, **options):
+def watched(monkeypatch, start, streams=0.0, **options):
     """Watch a LateNode; return (result or code of the error, its clock at the end)."""
-    node = LateNode(start)
+    node = LateNode(start, streams)
     monkeypatch.setattr(watch, 'time', SimpleNamespace(monotonic=lambda: node.now))
     given = {'node': node.name, 'patience': None, 'once': False, 'json': False} | options
     try:
@@ -133,6 +134,14 @@ def test_it_waits_for_its_node(monkeypatch, capsys):
         assert watched(monkeypatch, 600.0, **options) == (None, limit)
     found, end = watched(monkeypatch, 5.0, once=True)
     assert found.exit_code == 0 and end <= 16.0
+
+
+def test_once_it_waits_for_the_line_of_the_streams(monkeypatch):
+    for streams, patience in ((8.0, None), (40.0, 60.0)):
+        found, end = watched(monkeypatch, 5.0, streams, once=True, patience=patience)
+        assert 'streams' in found.document['status'] and end < streams + 1.0
+    found, end = watched(monkeypatch, 5.0, 100.0, once=True)
+    assert 'streams' not in found.document['status'] and end <= 16.0
 
 
 @pytest.mark.long
