@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -58,14 +59,24 @@ class CandidateMotions:
     ):
         self.places = problem.library.place_of
         self.seconds = problem.seconds + problem.way_seconds[place, self.places]
-        size = posterior.size
         self.information = (problem.information + problem.way_information(place)) / factor
         self.possible = self.seconds > 0
-        after = posterior.after(self.information, self.seconds)
-        before = problem.goal.left(posterior.known[None], margin)[0]
-        self.left = problem.goal.left(after[:, :size, :size], margin)
-        self.gain = np.where(self.possible, before - self.left, 0.0)
-        self.least = MIN_PLAN_GAIN * min(1.0, float(before))
+        self._goal, self._posterior, self._margin = problem.goal, posterior, margin
+        self._before = float(problem.goal.left(posterior.known[None], margin)[0])
+        self.least = MIN_PLAN_GAIN * min(1.0, self._before)
+
+    # Not needed for a mandatory motion, and most of the work.
+    @cached_property
+    def left(self) -> np.ndarray:
+        """Distance to the goal after each motion."""
+        size = self._posterior.size
+        after = self._posterior.after(self.information, self.seconds)
+        return self._goal.left(after[:, :size, :size], self._margin)
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Reduction of the distance to the goal by each motion."""
+        return np.where(self.possible, self._before - self.left, 0.0)
 
     def hopeless(self, number: int) -> bool:
         """Return whether a motion has almost no gain and does not reach the goal."""

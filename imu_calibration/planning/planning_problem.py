@@ -77,6 +77,8 @@ class PlanningProblem:
         self.known: np.ndarray | None = None
         """Information about z of an earlier calibration, in addition to the prior."""
         self.goal: Goal = WithinTolerances(coordinates)
+        self._of_moves: dict[int, np.ndarray] = {}
+        """Place -> information in the moves to all places."""
         self.predictor = WindowPredictor(library.table, coordinates, noise, rate=rate)
 
     @property
@@ -129,11 +131,13 @@ class PlanningProblem:
 
         Shape (k, m, m).
         """
-        posterior = self.posterior()
-        of_moves = []
-        for target in range(len(self.library.places)):
-            of_moves.append(posterior.information_of(self.way_windows[place, target]))
-        return np.array(of_moves)[self.library.place_of]
+        if place not in self._of_moves:
+            posterior = self.posterior()
+            of_moves = []
+            for target in range(len(self.library.places)):
+                of_moves.append(posterior.information_of(self.way_windows[place, target]))
+            self._of_moves[place] = np.array(of_moves)
+        return self._of_moves[place][self.library.place_of]
 
     @property
     def prior(self) -> np.ndarray:
