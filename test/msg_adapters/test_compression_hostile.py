@@ -9,6 +9,7 @@ import sqlite3
 import struct
 from contextlib import closing
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import lz4.frame
@@ -64,6 +65,7 @@ def change_database(bag, *statements):
     connection.close()
 
 
+@cache
 def zeros(n_bytes):
     """A zstd stream of so many zeros, made piece by piece."""
     compressor = zstd().ZstdCompressor(level=1)

@@ -414,9 +414,11 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
 
     What is there stays beside another cause.
     """
-    row, _ = row_of(141, 'gyro_scale_settling', 'realistic', Beyond('gyro_scale_settling', 141))
+    settling = Beyond('gyro_scale_settling', 141)
+    row, _ = row_of(141, 'gyro_scale_settling', 'realistic', settling, candidates=FEW)
     assert row['found'] == [] and row['family'], row
-    row, _ = row_of(81013, 'sticks_when_warm', 'realistic', Beyond('sticks_when_warm', 81013))
+    warm = Beyond('sticks_when_warm', 81013)
+    row, _ = row_of(81013, 'sticks_when_warm', 'realistic', warm, candidates=FEW)
     assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.999, (
         'a step when it is warm looks like a curve of the temperature'
     )
