@@ -49,10 +49,11 @@ def better_plain_fits(
         Whether the model was stated and not searched for: its effects are replaced only by a test.
 
     """
-    replaceable = replaceable_sensors(held_out.solution.model, under_test, as_asked=as_asked)
+    # An effect that compensation does not apply is a residual of each other session.
+    incomplete = {effect.sensor for effect in not_applied(held_out.solution.model)}
     better: list[PlainFit] = []
     for sensor in held_out.judged:
-        if sensor not in replaceable:
+        if as_asked and sensor not in under_test:
             continue
         # The other sensor is the one that is applied: it has the directions of turns.
         applied = with_plain_fits(held_out.solution, better).values
@@ -60,8 +61,16 @@ def better_plain_fits(
         elsewhere = held_out.fits_elsewhere(sensor, fit.estimate, applied)
         if sensor in under_test:
             is_better = fit.is_close or any(each.is_close for each in elsewhere)
+        elif not fit.estimate.dropped:
+            # Only the weights differ, which are those of the noise.
+            is_better = False
+        elif sensor in incomplete:
+            is_better = any(each.is_better for each in elsewhere)
         else:
-            is_better = bool(fit.estimate.dropped) and any(each.is_better for each in elsewhere)
+            # The residual looks like noise, unless effects that absorbed another cause predict all
+            # kinds of held-out data worse.
+            others = list(elsewhere) if fit.is_better else []
+            is_better = bool(others) and all(each.is_better for each in others)
         if is_better:
             better.append(fit)
     return tuple(better)
@@ -92,21 +101,6 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
         if fit.error < CLEARLY_BETTER * chosen.error:
             chosen = fit
     return chosen
-
-
-def replaceable_sensors(
-    model: SensorModel, under_test: Collection[str], *, as_asked: bool
-) -> set[str]:
-    """
-    Return the sensors with a solution that has to predict better than a plain fit.
-
-    Arguments as for `better_plain_fits`.
-    """
-    replaceable = set(under_test)
-    if not as_asked:
-        # An effect that compensation does not apply is a residual of each other session.
-        replaceable |= {effect.sensor for effect in not_applied(model)}
-    return replaceable
 
 
 def with_plain_fits(solution: Estimate, fits: Sequence[PlainFit]) -> Estimate:
