@@ -18,7 +18,6 @@ from imu_calibration.calibration.held_out_data import HeldOutData, PlainEstimate
 from imu_calibration.calibration.proof import smallest_errors
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.forward_equations import not_applied
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import MODEL_ERROR, Solution, with_term
 
 CLEARLY_BETTER = 0.98
@@ -49,7 +48,7 @@ def better_plain_fits(
         Whether the model was stated and not searched for: its effects are replaced only by a test.
 
     """
-    # An effect that compensation does not apply is a residual of each other session.
+    # Effects without a compensation are a residual of each other session.
     incomplete = {effect.sensor for effect in not_applied(held_out.solution.model)}
     better: list[PlainFit] = []
     for sensor in held_out.judged:
@@ -62,13 +61,12 @@ def better_plain_fits(
         if sensor in under_test:
             is_better = fit.is_close or any(each.is_close for each in elsewhere)
         elif not fit.estimate.dropped:
-            # Only the weights differ, which are those of the noise.
+            # The weights differ, by the noise.
             is_better = False
         elif sensor in incomplete:
             is_better = any(each.is_better for each in elsewhere)
         else:
-            # The residual looks like noise, unless effects that absorbed another cause predict all
-            # kinds of held-out data worse.
+            # Effects with a part of another cause: every held-out error is smaller without them.
             others = list(elsewhere) if fit.is_better else []
             is_better = bool(others) and all(each.is_better for each in others)
         if is_better:

@@ -190,14 +190,12 @@ def test_a_drift_with_an_uncertain_time_constant_is_applied_at_its_mean():
 @pytest.mark.parametrize(
     ('under_test', 'dropped', 'of_folds', 'elsewhere', 'n_applied'),
     [
-        # On a table, least squares with the same effects predict the other regimes equally well,
-        # so that another weight of the windows is no reason for the solution (a cable: 1.05).
+        # Least squares with the same effects predict other regimes equally well (a cable: 1.05).
         (['gyroscope'], (), 0.9, [0.9, 0.9], 1),
         (['gyroscope'], (), 1.1, [1.1, 1.1], 0),
         (['gyroscope'], (), 1.1, [1.1, 1.01], 1),
         (['gyroscope'], (), 1.1, [], 0),
-        # A residual that looks like noise: effects have absorbed another cause if all get worse
-        # with them (a soft mount in the size effect: 1.07).
+        # Effects with a part of another cause (a soft mount in the size effect: 1.07).
         ([], ('size',), 0.9, [0.9, 0.9], 1),
         ([], ('size',), 0.9, [0.9, 0.99], 0),
         ([], ('size',), 0.99, [0.9, 0.9], 0),
