@@ -168,6 +168,8 @@ class HeldOutData(ABC, Generic[Estimate]):
         """
         Yield the equations of a plain fit of a sensor, with the reference as described first.
 
+        Without any, the solution is applied.
+
         `applied`: parameters of the solution and of plain fits of other sensors, shape (n_params,).
         """
 

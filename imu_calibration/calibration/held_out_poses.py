@@ -191,7 +191,9 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         """
         parts = HeldOutPoses.of(self.solution, self.turns, _parts_of_time(self.solution))
         if sensor in parts.judged:
-            yield compared_fit(parts, sensor, applied)
+            fit = compared_fit(parts, sensor, applied)
+            if fit is not None:
+                yield fit
 
 
 def norm_errors(hand: HandCalibration, values: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -57,6 +57,8 @@ def better_plain_fits(
         # The other sensor is the one that is applied: it has the directions of turns.
         applied = with_plain_fits(held_out.solution, better).values
         fit = compared_fit(held_out, sensor, applied)
+        if fit is None:
+            continue
         elsewhere = held_out.fits_elsewhere(sensor, fit.estimate, applied)
         if sensor in under_test:
             is_better = fit.is_close or any(each.is_close for each in elsewhere)
@@ -74,9 +76,11 @@ def better_plain_fits(
     return tuple(better)
 
 
-def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -> PlainFit:
+def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -> PlainFit | None:
     """
     Return the plain fit of a sensor with the errors of both estimates on held-out data.
+
+    None for a reference without plain equations.
 
     `applied`: parameters of the other sensor, shape (n_params,).
     """
@@ -87,17 +91,14 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
 
     folds = [np.where(is_fixed, applied, values) for values in held_out.folds]
     of_solution = judged.rms(smallest_errors(held_out, sensor, folds))
-    fits: list[PlainFit] = []
+    chosen: PlainFit | None = None
     for equations in held_out.plain_equations(sensor, applied):
         estimate = equations.estimate(held_out.masks)
         folds = [np.where(is_fixed, applied, values) for values in estimate.folds]
         error = judged.rms(held_out.errors(sensor, folds))
-        fits.append(PlainFit(sensor, estimate, error, of_solution, judged.unit))
-    # Estimates of the table and the clock have to pay: the residual may have moved them.
-    chosen = fits[0]
-    for fit in fits[1:]:
-        if fit.error < CLEARLY_BETTER * chosen.error:
-            chosen = fit
+        # Estimates of the table and the clock have to pay: the residual may have moved them.
+        if chosen is None or error < CLEARLY_BETTER * chosen.error:
+            chosen = PlainFit(sensor, estimate, error, of_solution, judged.unit)
     return chosen
 
 

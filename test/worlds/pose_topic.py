@@ -262,10 +262,10 @@ class HeldOutBlocks(HeldOutData):
         return [PoseRows(self.data, self.solution.model).nominal] * FOLDS
 
     def plain_equations(self, sensor, applied):
-        raise NotImplementedError
+        yield from ()
 
     def fits_elsewhere(self, sensor, estimate, applied):
-        raise NotImplementedError
+        yield from ()
 
 
 def select(data, solution, state):
