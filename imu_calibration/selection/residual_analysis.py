@@ -96,7 +96,8 @@ class ResidualAnalysis(Investigation):
         fits = self.fits(sensor)
         time = self.blocks[sensor].time
         excess = min(fits.fit(_of_all_axes(curves)).excess for curves in curves_in_time(time))
-        return self.late_temperature(sensor, self.named, excess) or name
+        # Within the resolution of the search, twice in squares, the measured cause is preferred.
+        return self.late_temperature(sensor, self.named, excess + 2 * TIE) or name
 
     def late_temperature(
         self, sensor: str, chosen: Sequence[Question], excess: float
@@ -104,14 +105,14 @@ class ResidualAnalysis(Investigation):
         """
         Return the course of the temperature that predicts locked blocks best beside a choice.
 
-        None if it predicts them worse than an explanation without a measured cause, which leaves
-        `excess` (`BlockFit.excess`). Within the resolution of the search the measured cause is
-        preferred.
+        None if another explanation, which leaves `excess` (`BlockFit.excess`), predicts as well: of
+        n courses the best one has smaller squares by 2 ln(n).
         """
         courses = self._excess_with_courses(sensor, chosen)
-        best = min(courses, key=courses.__getitem__, default=None)
-        # Squares are twice the nats.
-        return None if best is None or courses[best] >= excess + 2 * TIE else best
+        if not courses:
+            return None
+        best = min(courses, key=courses.__getitem__)
+        return best if courses[best] + 2 * np.log(len(courses)) < excess else None
 
     def _excess_with_courses(self, sensor: str, chosen: Sequence[Question]) -> dict[str, float]:
         """
@@ -401,7 +402,7 @@ def _of_all_axes(columns: np.ndarray) -> np.ndarray:
 
 def _follows_temperature(found: ResidualAnalysis, question: Question) -> bool:
     """
-    Return whether a course of the temperature explains a drift as well.
+    Return whether a course of the temperature explains more than a drift.
 
     A bias that follows a measured temperature late, as a thermal mass does, settles almost like a
     drift in time.

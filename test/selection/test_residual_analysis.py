@@ -51,12 +51,12 @@ def test_an_offset_in_a_regime_replaces_a_finding_that_is_needless_beside_it(
 
 
 @pytest.mark.parametrize(
-    ('drift', 'sessions', 'withdrawn'), ((2.0, 1, True), (-40.0, 1, False), (2.0, 2, False))
+    ('drift', 'sessions', 'withdrawn'), ((12.0, 1, True), (8.0, 1, False), (12.0, 2, False))
 )
-def test_a_course_of_the_temperature_that_predicts_as_well_replaces_a_drift(
+def test_a_course_of_the_temperature_that_predicts_better_replaces_a_drift(
     drift, sessions, withdrawn
 ):
-    # The course leaves an excess of 5, a drift that predicts better by more than 16 is kept.
+    # The best course leaves an excess of 5, to which twice the logarithm of their number is added.
     time = np.linspace(0.0, 400.0, 60)
     warm = 25 + 8 * (1 - np.exp(-time / 150))
 
