@@ -197,14 +197,13 @@ def candidates_of(
             continue
         beside = None if question.name in found else search.score(named, question)
         verdict = _verdict_of(question.name, alone, beside, found=found, mates=mates)
-        if verdict == LEAVES_MOST and question.name in superseded:
-            verdict = REPLACED
-        elif (
-            verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question)
-        ):
-            verdict = DISAGREED
-        elif verdict == LEAVES_MOST and question.name in refused_later:
-            verdict = UNCERTAIN
+        if verdict == LEAVES_MOST:
+            if question.name in superseded:
+                verdict = REPLACED
+            elif agree is not None and not agree([*named, question], question):
+                verdict = DISAGREED
+            elif question.name in refused_later:
+                verdict = UNCERTAIN
         rows[question.name] = Candidate(
             question.name,
             question.sensor,
