@@ -65,15 +65,14 @@ class CandidateMotions:
         self._before = float(problem.goal.left(posterior.known[None], margin)[0])
         self.least = MIN_PLAN_GAIN * min(1.0, self._before)
 
-    # Not needed for a mandatory motion, and most of the work.
     @cached_property
     def left(self) -> np.ndarray:
-        """Distance to the goal after each motion."""
+        """Distance to the goal after each motion; mandatory motions are chosen without it."""
         size = self._posterior.size
         after = self._posterior.after(self.information, self.seconds)
         return self._goal.left(after[:, :size, :size], self._margin)
 
-    @property
+    @cached_property
     def gain(self) -> np.ndarray:
         """Reduction of the distance to the goal by each motion."""
         return np.where(self.possible, self._before - self.left, 0.0)
