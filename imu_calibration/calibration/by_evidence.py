@@ -212,14 +212,14 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
         for sensor, residual in search.unexplained_rests().items():
             if residual.significant:
                 unexplained[sensor] = residual.entry
-    times = [search.changed_at for search in searches if search.changed_at is not None]
+    times = (search.changed_at for search in searches)
     return ModelChanges(
         tuple(added_names),
         tuple(question.name for question in first.unstable),
         _implausible_shares(searches),
         unexplained=unexplained,
         stamp_jitter=dict(first.jitter_entry),
-        changed_at=times[0] if times else None,
+        changed_at=next((time for time in times if time is not None), None),
     )
 
 
