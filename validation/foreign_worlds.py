@@ -566,7 +566,11 @@ def _lost(scene):
 
 
 def _soft_mount(scene):
-    """The mount bends under its load and swings at 9 Hz."""
+    """
+    The mount bends under its load and swings at 9 Hz.
+
+    Below that frequency it is a product of two forces, which is the name of its cause.
+    """
     other = (scene.axis + 1) % 3
     bend = 2e-3 * _resonator(scene.force[:, other], 9.0, 0.05, 1.0 / RATE / FINE) / GRAVITY
     return bend * scene.force[:, (scene.axis + 2) % 3]
@@ -612,7 +616,7 @@ UNPLACED = {
     'force_cubed_in_gyro': _signal('gyroscope', lambda s: s.force[:, s.axis] ** 3),
     'tone': _signal('accelerometer', lambda s: np.sin(2 * np.pi * 31.0 * s.time), size=3.0),
     'order': _signal('gyroscope', _order, size=3.0),
-    'soft_mount': _signal('accelerometer', _soft_mount),
+    'soft_mount': _signal('accelerometer', _soft_mount, names=['accel_cross_product']),
     'friction': _signal('gyroscope', lambda s: np.tanh(s.turn[:, 1] / (0.3 * DEG))),
     'bent_scale': _signal(
         'gyroscope',

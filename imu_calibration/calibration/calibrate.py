@@ -107,6 +107,10 @@ def conclude(
     if is_judged:
         held_out = data.held_out(solution)
         concerned = {*changes.unexplained, *under_test}
+        # An effect that is found but not applied remains in the residual.
+        model = solution.model
+        for name in changes.implausible:
+            concerned.add(model.catalogue.owner_of(name, model.joint_names))
         if changes.changed_at is not None:
             # No search has tested the residual of the complete recording.
             concerned.update(SENSORS)

@@ -43,7 +43,7 @@ def better_plain_fits(
     ----------
     held_out : HeldOutData
     under_test : collection of str
-        Sensors with a residual that is neither noise nor an effect of the catalogue.
+        Sensors with a residual that is neither noise nor an effect of the applied model.
     as_asked : bool
         Whether the model was stated and not searched for: its effects are replaced only by a test.
 
@@ -52,7 +52,9 @@ def better_plain_fits(
     incomplete = {effect.sensor for effect in not_applied(held_out.solution.model)}
     better: list[PlainFit] = []
     for sensor in held_out.judged:
-        if as_asked and sensor not in under_test:
+        is_under_test = sensor in under_test
+        # Otherwise only the weights differ, by the noise.
+        if not is_under_test and (as_asked or sensor not in incomplete):
             continue
         # The other sensor is the one that is applied: it has the directions of turns.
         applied = with_plain_fits(held_out.solution, better).values
@@ -60,17 +62,10 @@ def better_plain_fits(
         if fit is None:
             continue
         elsewhere = held_out.fits_elsewhere(sensor, fit.estimate, applied)
-        if sensor in under_test:
+        if is_under_test:
             is_better = fit.is_close or any(each.is_close for each in elsewhere)
-        elif not fit.estimate.dropped:
-            # The weights differ, by the noise.
-            is_better = False
-        elif sensor in incomplete:
-            is_better = any(each.is_better for each in elsewhere)
         else:
-            # Effects with a part of another cause: every held-out error is smaller without them.
-            others = list(elsewhere) if fit.is_better else []
-            is_better = bool(others) and all(each.is_better for each in others)
+            is_better = any(each.is_better for each in elsewhere)
         if is_better:
             better.append(fit)
     return tuple(better)
