@@ -167,7 +167,7 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
     def nominal(self, sensor: str, folds: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return parameters of folds with those of the data sheet for a sensor."""
         nominal = replace(self.solution.hand_model, gyro_factor=1.0).nominal
-        of_sensor = np.char.startswith(self.solution.param_names, sensor)
+        of_sensor = self.solution.model.mask(lambda effect: effect.sensor == sensor)
         return [np.where(of_sensor, nominal, values) for values in folds]
 
     def plain_equations(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEquations]:

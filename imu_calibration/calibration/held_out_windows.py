@@ -7,7 +7,7 @@ table's reference point and the delay of the readings, which compensation does n
 estimated for each side: so a wrong scale that compensates for a lag is visible.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -229,11 +229,9 @@ def reference_model(calibration: Calibration, table: Table) -> SensorModel:
     )
     model = model.at(reference_values(model, calibration))
     # The position of the sensor on the table is no error of either side: it is estimated for each.
-    return (
-        model
-        if model.find('accelerometer', Role.ARM) or table.mount_xyz is not None
-        else model.with_role('accelerometer', Role.ARM)
-    )
+    if not model.find('accelerometer', Role.ARM) and table.mount_xyz is None:
+        model = model.with_role('accelerometer', Role.ARM)
+    return model
 
 
 def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray:
@@ -242,24 +240,15 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
 
     Shape (n_params,).
     """
-    values = nominal_values(model)
-    for effect in calibration.model.effects:
-        if effect.key in model.slices and is_of_reference(effect):
-            values[model.slices[effect.key]] = calibration.values[
-                calibration.model.slices[effect.key]
-            ]
-    return values
+    known = model.start_from(calibration.model, calibration.values)
+    return with_reference(model, nominal_values(model), known)
 
 
 def with_reference(model: SensorModel, values: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
     Return the values with the table and the clock of other values `reference`, shape (n_params,).
     """
-    values = values.copy()
-    for effect in model.effects:
-        if is_of_reference(effect):
-            values[model.slices[effect.key]] = reference[model.slices[effect.key]]
-    return values
+    return np.where(model.mask(is_of_reference), reference, values)
 
 
 def errors_of(
@@ -322,9 +311,7 @@ class _Correction:
         self.inverse = np.linalg.inv(self.matrix)
         self.total = total
         arm = model.part(sensor, Role.ARM)
-        self.arms = _slopes(
-            model, sensor, values, steps=dict.fromkeys(range(arm.start, arm.stop), 1.0)
-        )
+        self.arms = _slopes(model, sensor, values, range(arm.start, arm.stop))
 
     def errors(self, rows: np.ndarray) -> np.ndarray:
         """
@@ -347,16 +334,56 @@ class _Correction:
 
 
 def _slopes(
-    model: SensorModel, sensor: str, values: np.ndarray, *, steps: Mapping[int, float]
+    model: SensorModel,
+    sensor: str,
+    values: np.ndarray,
+    places: Sequence[int] | np.ndarray,
+    steps: np.ndarray | float = 1.0,
 ) -> list[np.ndarray]:
     """Return the change of the coefficients of a sensor with a step of each of some parameters."""
     total = coefficients(model, sensor, values)
     slopes = []
-    for index, step in steps.items():
+    for place, step in zip(places, np.broadcast_to(steps, len(places)), strict=True):
         moved = values.copy()
-        moved[index] += step
+        moved[place] += step
         slopes.append(coefficients(model, sensor, moved) - total)
     return slopes
+
+
+def _linearised(
+    groups: Sequence[np.ndarray],
+    model: SensorModel,
+    sensor: str,
+    values: np.ndarray,
+    *,
+    places: np.ndarray,
+    steps: np.ndarray | float = 1.0,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """
+    Return the equations ``output - columns @ coefficients(values) = design @ change`` of groups.
+
+    Parameters
+    ----------
+    groups : sequence of array
+        Rows that begin with the columns and end with the output, shape (m, n_columns + 3 or more).
+    places, steps : array, shape (n,)
+        Parameters that change, and the unit of each change.
+
+    Returns
+    -------
+    tuple
+        Of each group the design, shape (3 m, n), and the left side, shape (3 m,).
+
+    """
+    total = coefficients(model, sensor, values)
+    slopes = _slopes(model, sensor, values, places, steps)
+    designs = []
+    targets = []
+    for group in groups:
+        columns, output = group[:, : len(total)], group[:, -N_AXES:]
+        designs.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
+        targets.append((output - columns @ total).ravel())
+    return designs, targets
 
 
 def _groups_by_regime(held_out: HeldOut, sensor: str) -> list[np.ndarray]:
@@ -401,17 +428,10 @@ def _error_on_groups(
     One step from `values`, with parameters as compensation applies them where there is a `centre`.
     `n_pieces`: number of pieces that the factors stand for, for the weight of the prior.
     """
-    # Slopes per standard deviation of the prior: the coefficients are linear over it.
-    total = coefficients(model, sensor, values)
+    # Changes in standard deviations of the prior: the coefficients are linear over them.
     index = np.flatnonzero(free)
     sd = model.prior()[1][index]
-    slopes = _slopes(model, sensor, values, steps=dict(zip(index, sd, strict=True)))
-    designs = []
-    targets = []
-    for group in groups:
-        columns, output = group[:, :-N_AXES], group[:, -N_AXES:]
-        designs.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
-        targets.append((output - columns @ total).ravel())
+    designs, targets = _linearised(groups, model, sensor, values, places=index, steps=sd)
 
     # The prior has the weight of its information relative to the residual.
     known = np.zeros((0, len(index)))
@@ -453,21 +473,15 @@ class _Pieces(PlainEquations):
         cls, held_out: HeldOut, model: SensorModel, sensor: str, plan: PlainEstimate
     ) -> '_Pieces':
         """Return the equations of the pieces of a sensor."""
-        total = coefficients(model, sensor, plan.values)
-        steps = dict.fromkeys(np.flatnonzero(plan.fitted).tolist(), 1.0)
-        slopes = _slopes(model, sensor, plan.values, steps=steps)
-        width = len(total)
-        rows = []
-        targets = []
+        width = len(coefficients(model, sensor, plan.values)) + 2 * N_AXES
+        blocks = []
         for block in held_out.blocks:
-            pieces = [np.zeros((0, width + 2 * N_AXES))]
+            pieces = [np.zeros((0, width))]
             for kept in (block.pieces, block.earlier):
                 pieces += [part for (name, _), part in kept.items() if name == sensor]
-            stacked = np.concatenate(pieces)
-            columns, output = stacked[:, :width], stacked[:, -N_AXES:]
-            rows.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
-            targets.append((output - columns @ total).ravel())
-        return cls(plan, rows, targets)
+            blocks.append(np.concatenate(pieces))
+        places = np.flatnonzero(plan.fitted)
+        return cls(plan, *_linearised(blocks, model, sensor, plan.values, places=places))
 
     def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return the parameters that fit some of the blocks, from any values."""

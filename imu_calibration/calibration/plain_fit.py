@@ -16,7 +16,7 @@ import numpy as np
 from imu_calibration.calibration.from_solution import Estimate, ModelChanges
 from imu_calibration.calibration.held_out_data import HeldOutData, PlainEstimate, PlainFit
 from imu_calibration.calibration.proof import smallest_errors
-from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.base import Effect, Role
 from imu_calibration.effects.forward_equations import not_applied
 from imu_calibration.estimation.solution import MODEL_ERROR, Solution, with_term
 
@@ -80,16 +80,16 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
     `applied`: parameters of the other sensor, shape (n_params,).
     """
     judged = held_out.judged[sensor]
-    # Only the parameters of the sensor differ between the folds; the others are as applied.
-    (other,) = set(SENSORS) - {sensor}
-    is_fixed = np.char.startswith(held_out.solution.param_names, other)
+    # The parameters of the other sensor are as applied in all folds.
+    model = held_out.solution.model
+    is_of_other = model.mask(lambda effect: effect.sensor not in (sensor, 'reference'))
 
-    folds = [np.where(is_fixed, applied, values) for values in held_out.folds]
+    folds = [np.where(is_of_other, applied, values) for values in held_out.folds]
     of_solution = judged.rms(smallest_errors(held_out, sensor, folds))
     chosen: PlainFit | None = None
     for equations in held_out.plain_equations(sensor, applied):
         estimate = equations.estimate(held_out.masks)
-        folds = [np.where(is_fixed, applied, values) for values in estimate.folds]
+        folds = [np.where(is_of_other, applied, values) for values in estimate.folds]
         error = judged.rms(held_out.errors(sensor, folds))
         # Estimates of the table and the clock have to pay: the residual may have moved them.
         if chosen is None or error < CLEARLY_BETTER * chosen.error:

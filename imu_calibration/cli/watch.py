@@ -15,7 +15,8 @@ GONE = 5.0
 WATCH_PERIOD_SECONDS = 0.25
 ONCE_SECONDS = 10.0
 """
-Default patience where one status is wanted, and the longest wait for a complete screen without any.
+Default patience where one status is wanted; also the longest wait for a complete screen where the
+patience has no limit.
 """
 NOTICE_SECONDS = 3.0
 """Seconds of waiting after which the missing node is named."""
@@ -73,8 +74,8 @@ def _watch(watcher, options):
             f"'{options.node}' must run, no message on /diagnostics in {patience:g} s;"
             f' start it, or name it with --node, as `ros2 node list` shows it{_heard(watcher)}'
         )
-    # The picture is latched: it arrives at once from a node that publishes it. The first message of
-    # a node that starts has no line of the streams yet.
+    # Wait for the line of the streams, which the first message of a node does not contain, and for
+    # the picture, which is latched: a node that publishes it sends it at once.
     end = time.monotonic() + (patience if patience < math.inf else ONCE_SECONDS)
     while not watcher.complete and time.monotonic() < end:
         watcher.spin(WATCH_PERIOD_SECONDS)

@@ -191,8 +191,7 @@ def check_numbers(calibration: Calibration) -> Calibration:
 
     """
     values, covariance = calibration.values, calibration.covariance
-    effects = calibration.model.effects
-    levels = np.repeat([e.role is Role.LIMIT for e in effects], [e.size for e in effects])
+    levels = calibration.model.mask(lambda effect: effect.role is Role.LIMIT)
     if not np.all(np.isfinite(values[~levels])) or not np.all(np.isfinite(covariance)):
         raise DocumentError(
             'every value of a calibration must be a finite number, some are not; calibrate again',

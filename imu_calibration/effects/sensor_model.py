@@ -1,6 +1,6 @@
 """A model is a list of effects: its parameters, its columns, its prediction."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -261,7 +261,11 @@ class SensorModel:
 
         Shape (n_params,).
         """
-        return np.repeat([not e.nuisance for e in self.effects], [e.size for e in self.effects])
+        return self.mask(lambda effect: not effect.nuisance)
+
+    def mask(self, is_chosen: Callable[[Effect], bool]) -> np.ndarray:
+        """Return a mask of the parameters of the chosen effects, shape (n_params,)."""
+        return np.repeat([is_chosen(e) for e in self.effects], [e.size for e in self.effects])
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
         """

@@ -61,7 +61,9 @@ class CandidateMotions:
         self.seconds = problem.seconds + problem.way_seconds[place, self.places]
         self.information = (problem.information + problem.way_information(place)) / factor
         self.possible = self.seconds > 0
-        self._goal, self._posterior, self._margin = problem.goal, posterior, margin
+        self._goal = problem.goal
+        self._posterior = posterior
+        self._margin = margin
         self._before = float(problem.goal.left(posterior.known[None], margin)[0])
         self.least = MIN_PLAN_GAIN * min(1.0, self._before)
 
