@@ -71,6 +71,4 @@ def fixed_parameters(model: SensorModel) -> np.ndarray:
 
     Saturation is censoring, not a column.
     """
-    return np.concatenate(
-        [np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects]
-    )
+    return model.mask(lambda effect: effect.coefficients is None and effect.warp is None)

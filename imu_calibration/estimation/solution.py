@@ -457,8 +457,7 @@ def with_weak_replaced(solution: AnySolution, tolerances: np.ndarray) -> AnySolu
 
     See `replace_weak`. A replaced parameter is held.
     """
-    effects = solution.model.effects
-    applied = np.repeat([e.compensation == 'exact' for e in effects], [e.size for e in effects])
+    applied = solution.model.mask(lambda effect: effect.compensation == 'exact')
     # Errors of placements count for what is printed, but do not draw the estimate to its prior.
     sd = solution.sd_without(PLACEMENTS, *solution.judged_without)
     weak = np.flatnonzero(applied & ~solution.held & (sd > tolerances))

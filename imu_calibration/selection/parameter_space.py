@@ -223,7 +223,7 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
 
     # The parameters of the model, then those of the banks.
     names = list(model.param_names)
-    smooth = [np.full(effect.size, effect.smooth) for effect in model.effects]
+    smooth = [model.mask(lambda effect: effect.smooth)]
     sds = [prior_sd]
     for entries in recording.bank.values():
         for entry in entries:
@@ -319,11 +319,11 @@ def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray
 
     Those of the baseline, time constants and times of steps.
     """
-    masks = [np.full(e.size, e.key in baseline.slices) for e in model.effects]
-    for effect, mask in zip(model.effects, masks):
+    counted = model.mask(lambda effect: effect.key in baseline.slices)
+    for effect in model.effects:
         if effect.timed:
-            mask[-1] = True
-    return np.concatenate(masks)
+            counted[model.slices[effect.key].stop - 1] = True
+    return counted
 
 
 def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Question]:

@@ -141,8 +141,9 @@ class RowEvidence(Evidence):
     ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
         """Return the fits of parameters to both halves of the groups of rows, and to all."""
         first, second = np.array_split(self.groups, 2)
+        none = self.groups[:0]
         fits = []
-        for out in (second, first, self.groups[:0]):
+        for out in (second, first, none):
             # The effects are no noise: their parameters are part of the baseline.
             blocks = without_groups(self.blocks, out)
             fits.append(RowEvidence(blocks, self.space, {}, baseline=used).fit(used))

@@ -536,7 +536,7 @@ def _statistics(
         for values in (model.nominal, found.state.values)
     )
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
-    of_accelerometer = np.char.startswith(model.model.param_names, 'accelerometer')
+    of_accelerometer = model.model.mask(lambda effect: effect.sensor == 'accelerometer')
     spare = len(after) - int(np.sum(of_accelerometer & found.free))
     result = {
         'poses': len(poses),

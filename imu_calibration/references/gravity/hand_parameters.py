@@ -108,8 +108,8 @@ class HandModel:
     @cached_property
     def withheld(self) -> np.ndarray:
         """Mask of the parameters in `untested` and of absent sensors, shape (n,)."""
-        of_absent = [name.partition('.')[0] in self.absent for name in self.model.param_names]
-        return np.isin(self.model.param_names, self.untested) | np.array(of_absent, bool)
+        of_absent = self.model.mask(lambda effect: effect.sensor in self.absent)
+        return np.isin(self.model.param_names, self.untested) | of_absent
 
     @cached_property
     def nominal(self) -> np.ndarray:
