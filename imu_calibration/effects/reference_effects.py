@@ -433,6 +433,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             name='load_compliance',
             components=MATRIX,
             shape=(3, 3),
+            zero_sums=((0, 4, 8),),
             explanation=(
                 'The mount bends with the load: the sensor turns a little with the force that it'
                 ' carries, which both sensors see.'

@@ -472,7 +472,7 @@ GYROSCOPE = _pair('gyroscope') + (
             0.05 * DEG / STANDARD_GRAVITY**2,
             'half of the g-sensitivity at 1 g',
         ),
-        bias_sums=((0, 1, 2), (6, 7, 8), (12, 13, 14)),
+        zero_sums=((0, 1, 2), (6, 7, 8), (12, 13, 14)),
         motion=('static_dense', 'centrifuge'),
         groups=(base.SQUARES['accelerometer'],),
         input_order=2,

@@ -31,9 +31,9 @@ def make_prior(model: SensorModel) -> Prior:
     Return the prior of a model.
 
     When an arm for each axis and a common one are estimated, the former sum to zero: the origin is
-    the mean of the sensitive points. Sums of parameters that act as a bias (`Effect.bias_sums`) are
-    zero to their tolerance: this row has information, so that data with another specific force than
-    that of rest determine the sum.
+    the mean of the sensitive points. Sums of parameters that gravity does not determine
+    (`Effect.zero_sums`) are zero to their tolerance: this row has information, so that data with
+    another specific force than that of rest determine the sum.
     """
     mean, sd = model.prior()
     mean = np.where(np.isfinite(mean), mean, 0.0)
@@ -46,19 +46,19 @@ def make_prior(model: SensorModel) -> Prior:
         rows.append(gauge)
         sd = sd.copy()
         sd[arms.ravel()] *= np.sqrt(2 / 3)
-    rows.append(bias_sum_rows(model))
+    rows.append(zero_sum_rows(model))
     return Prior(mean, np.concatenate(rows), sd, gauge)
 
 
-def bias_sum_rows(model: SensorModel) -> np.ndarray:
+def zero_sum_rows(model: SensorModel) -> np.ndarray:
     """
-    Return the rows ``sum / tolerance`` of parameters that act as a bias (`Effect.bias_sums`).
+    Return the rows ``sum / tolerance`` of `Effect.zero_sums`.
 
     Shape (k, n_params); the sums are zero with a standard deviation of one row unit.
     """
     rows = []
     for effect in model.effects:
-        for group in effect.bias_sums:
+        for group in effect.zero_sums:
             row = np.zeros(len(model.param_names))
             row[model.slices[effect.key].start + np.array(group)] = 1 / effect.tolerance
             rows.append(row)

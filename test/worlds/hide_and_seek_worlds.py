@@ -122,7 +122,7 @@ def _row(diagnosis, truth, hidden, seconds, labels):
 def by_convention(name, values):
     """Return parameters of an effect with the sums that act as a bias moved into the bias."""
     values = np.array(values, float)
-    for group in _effect(name).bias_sums:
+    for group in _effect(name).zero_sums:
         values[list(group)] -= values[list(group)].mean()
     return values
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.prior import bias_sum_rows
+from imu_calibration.estimation.prior import zero_sum_rows
 from imu_calibration.estimation.row_estimate import RowSet
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
@@ -175,7 +175,7 @@ class GravityRows:
             equations.of_poses(),
             equations.of_drifts(),
             equations.of_calm_drifts(),
-            equations.of_bias_sums(),
+            equations.of_zero_sums(),
         ]
         for number, turn in enumerate(self.turns):
             if turn.rotation is None or turn.rotation_cov is None:
@@ -308,15 +308,15 @@ class _Equations:
             np.repeat(own, 3)[:, None].repeat(2, axis=1),
         )
 
-    def of_bias_sums(self) -> RowSet:
+    def of_zero_sums(self) -> RowSet:
         """
-        Return ``0 = sum / tolerance`` of the parameters that act as a bias (`Effect.bias_sums`).
+        Return ``0 = sum / tolerance`` of `Effect.zero_sums`.
 
         At rest the length of the specific force is that of gravity, so that poses and turns do not
         distinguish such a sum from the bias. The same rows are in the prior on a table.
         """
         model = self.model
-        sums = bias_sum_rows(model.model)
+        sums = zero_sum_rows(model.model)
         count, n_poses = len(sums), len(self.state.up)
         return RowSet(
             -sums @ self.state.values,
