@@ -200,9 +200,9 @@ class Effect:
     """Whether it changes smoothly in time: any other smooth curve resembles it."""
     zero_sums: tuple[tuple[int, ...], ...] = ()
     """
-    Groups of parameters, each with a sum that gravity does not determine: it acts as a bias, because
-    ``f_x^2 + f_y^2 + f_z^2 = g^2``, or as a turn about the force, which no sensor reads. By
-    convention each sum is zero, to its tolerance, unless other data determine it.
+    Groups of parameters, each with a sum that gravity does not determine: it acts as a bias,
+    because ``f_x^2 + f_y^2 + f_z^2 = g^2``, or as a turn about the force, which no sensor reads.
+    By convention each sum is zero, to its tolerance, unless other data determine it.
     """
     against: tuple = ()
     """
