@@ -101,7 +101,13 @@ class SqliteFile(StorageFile):
     def _open(self):
         connection = _connect(self.path, self.logged)
         connection.set_progress_handler(self._count_call, INSTRUCTIONS_PER_CALL)
-        self._is_utf8 = connection.execute('PRAGMA encoding').fetchone() == ('UTF-8',)
+        try:
+            # This reads the header, and fails at a file that is no database.
+            encoding = connection.execute('PRAGMA encoding').fetchone()
+        except sqlite3.Error:
+            connection.close()
+            raise
+        self._is_utf8 = encoding == ('UTF-8',)
         return connection
 
     def _count_call(self):

@@ -7,6 +7,7 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.diagnose import diagnose
 
+from worlds.hide_and_seek_worlds import by_convention
 from worlds.physics import make_session
 
 SQUARES = CATALOGUE.find('gyroscope', 'gyro_force_squared')
@@ -39,9 +40,7 @@ def test_a_single_component_is_found_where_a_sum_is_not_determined(effect, compo
     result = diagnose(session.block, Table.from_mapping(session.table), candidates=FEW).result
     assert [finding.effect for finding in result.diagnosis.findings] == [effect.name]
 
-    expected = hidden.copy()
-    for group in effect.zero_sums:
-        expected[list(group)] -= expected[list(group)].mean()
+    expected = by_convention(effect.name, hidden)
     known = result.calibration
     part = known.model.slices[effect.key]
     distance = (known.values[part] - expected) / known.sd[part]

@@ -3,6 +3,7 @@
 import shutil
 import sqlite3
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from msg_adapters.bag import open_recording
 from msg_adapters.compression import zstd
 from msg_adapters.definitions import standard_definition
 from msg_adapters.rosbag2 import read_metadata
-from msg_adapters.sqlite_file import PAGE_SIZE, STEP_IDS
+from msg_adapters.sqlite_file import PAGE_SIZE, STEP_IDS, SqliteFile
 from msg_adapters.write import encode_imu, encode_joints, write_session
 
 N = 9000
@@ -210,6 +211,22 @@ def test_a_bare_file_and_a_folder_without_metadata(bags, session, tmp_path, kind
         )
     imu, _, lost = read(folder)
     assert len(imu) == 2 * N and not lost
+
+
+def test_a_file_that_is_no_database_is_closed(tmp_path, monkeypatch):
+    (tmp_path / 'text.db3').write_bytes(b'no database ' * 100)
+    opened = []
+
+    class Recorded(sqlite3.Connection):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            opened.append(self)
+
+    monkeypatch.setattr(sqlite3, 'connect', partial(sqlite3.connect, factory=Recorded))
+    with pytest.raises(sqlite3.DatabaseError, match='not a database'):
+        SqliteFile(tmp_path / 'text.db3')
+    with pytest.raises(sqlite3.ProgrammingError, match='closed'):
+        opened[0].execute('SELECT 1')
 
 
 def test_a_missing_or_broken_part_of_a_split_bag_costs_only_itself(bags, session, tmp_path):

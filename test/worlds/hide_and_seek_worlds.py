@@ -120,7 +120,7 @@ def _row(diagnosis, truth, hidden, seconds, labels):
 
 
 def by_convention(name, values):
-    """Return parameters of an effect with the sums that act as a bias moved into the bias."""
+    """Return parameters of an effect; each group whose sum is undetermined gets the mean zero."""
     values = np.array(values, float)
     for group in _effect(name).zero_sums:
         values[list(group)] -= values[list(group)].mean()
