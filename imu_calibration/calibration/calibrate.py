@@ -16,6 +16,7 @@ from imu_calibration.calibration.plain_fit import (
     better_plain_fits,
     changes_with,
     plain_entries,
+    sensors_with_residual,
     with_fits,
     with_plain_fits,
 )
@@ -23,7 +24,6 @@ from imu_calibration.calibration.proof import prove
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.solved import ModelSource, Solved
 from imu_calibration.document.proof_entry import Proof
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import tolerances_of, with_weak_replaced
 from imu_calibration.references.options import CalibrationOptions
 
@@ -83,7 +83,7 @@ def conclude(
         Names of recordings, hashes and options for the document.
     under_test : collection of str
         Sensors of which the effects have to predict better than plain least squares, besides those
-        with an unexplained residual.
+        with a residual that is not noise.
     is_judged : bool
         False where only the status of the parameters is wanted: no data are held out, and the
         document has no proof.
@@ -106,14 +106,7 @@ def conclude(
     proof: Proof = {}
     if is_judged:
         held_out = data.held_out(solution)
-        concerned = {*changes.unexplained, *under_test}
-        # An effect that is found but not applied remains in the residual.
-        model = solution.model
-        for name in changes.implausible:
-            concerned.add(model.catalogue.owner_of(name, model.joint_names))
-        if changes.changed_at is not None:
-            # No search has tested the residual of the complete recording.
-            concerned.update(SENSORS)
+        concerned = sensors_with_residual(changes, solution.model).union(under_test)
         fits = better_plain_fits(held_out, under_test=concerned, as_asked=options.as_asked)
         proof = prove(with_fits(held_out, fits))
     applied = with_plain_fits(solution, fits)

@@ -16,8 +16,9 @@ import numpy as np
 from imu_calibration.calibration.from_solution import Estimate, ModelChanges
 from imu_calibration.calibration.held_out_data import HeldOutData, PlainEstimate, PlainFit
 from imu_calibration.calibration.proof import smallest_errors
-from imu_calibration.effects.base import Effect, Role
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.forward_equations import not_applied
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import MODEL_ERROR, Solution, with_term
 
 CLEARLY_BETTER = 0.98
@@ -28,6 +29,20 @@ PARTS_OF_TIME = 3
 """Parts of a session that are held out in turn: an effect in time is applied at one moment."""
 
 Data = TypeVar('Data', bound=HeldOutData[Any])
+
+
+def sensors_with_residual(changes: ModelChanges, model: SensorModel) -> set[str]:
+    """Return the sensors with a residual that is neither noise nor an effect of the model."""
+    if changes.changed_at is not None:
+        # No search has tested the residual of the complete recording.
+        return set(SENSORS)
+
+    sensors = set(changes.unexplained)
+    # An effect that is found but not applied remains in the residual.
+    for (_, name), effect in model.catalogue.effects(model.joint_names).items():
+        if name in changes.implausible:
+            sensors.update(effect.sensors)
+    return sensors
 
 
 def better_plain_fits(

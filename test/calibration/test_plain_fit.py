@@ -225,6 +225,20 @@ def test_a_sensor_with_an_effect_that_is_found_but_not_applied_is_tested():
     assert list(calibration.statistics['least_squares']) == ['gyroscope']
 
 
+@pytest.mark.parametrize(
+    ('effect', 'sensors'),
+    [
+        ('gyro_force_squared', {'gyroscope'}),
+        # Errors of the reference remain in the sensors that they act on.
+        ('load_compliance', set(SENSORS)),
+        ('axis_offset', {'accelerometer'}),
+    ],
+)
+def test_an_effect_that_is_not_applied_remains_in_the_sensors_that_it_acts_on(effect, sensors):
+    changes = ModelChanges(implausible={effect: 0.9})
+    assert plain_fit.sensors_with_residual(changes, SensorModel()) == sensors
+
+
 def test_least_squares_with_the_same_effects_predict_other_regimes_equally_well():
     # Without them the solution was applied by its folds alone.
     _, _, solved, _ = world('cable', 604)
