@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
+from imu_calibration.effects.base import Role
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.selection.gain import heldout_gain
@@ -76,6 +77,11 @@ hidden.
 """
 COMPONENT_SESSIONS = 12
 """Sessions to which all single components are dealt."""
+MOST_TOLERANCES = 1e6
+"""
+Size of a component, in tolerances, from which the session does not depend on it: a displacement
+along its own axis, for example.
+"""
 FINE = ('tactical', 'navigation')
 """Grades at which the Earth's rate, whose size nobody chooses, is well above detectability."""
 
@@ -121,8 +127,12 @@ def _row(diagnosis, truth, hidden, seconds, labels):
 
 def by_convention(name, values):
     """Return parameters of an effect; each group whose sum is undetermined gets the mean zero."""
-    values = np.array(values, float)
-    for group in _effect(name).zero_sums:
+    effect, values = _effect(name), np.array(values, float)
+    groups = effect.zero_sums
+    if effect.role is Role.ARMS:
+        # The mean of the three sensitive points is the common lever arm.
+        groups = ((0, 3, 6), (1, 4, 7), (2, 5, 8))
+    for group in groups:
         values[list(group)] -= values[list(group)].mean()
     return values
 
@@ -278,6 +288,9 @@ def components_of_seed(seed, noise, cases):
         effect, component = case
         sizes = sizes_for(seed, noise, [effect], {})
         hidden = {effect: sizes.hidden(effect, seed, 5.0, component)}
+        labels = {'component': component, 'seed': seed, 'noise': noise}
+        if np.max(np.abs(hidden[effect])) > MOST_TOLERANCES * _effect(effect).tolerance:
+            return {'part': 'not determined', 'hidden': [effect], **labels}
         start, kind = time.process_time(), noise.partition('@')
         session = physics.make_session(
             seed,
@@ -291,7 +304,7 @@ def components_of_seed(seed, noise, cases):
             session.truth['values'],
             hidden,
             time.process_time() - start,
-            {'part': 'components', 'component': component, 'seed': seed, 'noise': noise},
+            {'part': 'components', **labels},
         )
 
     return _each(cases, row, f'components {seed} {noise}')
