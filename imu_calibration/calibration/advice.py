@@ -22,7 +22,7 @@ from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.estimation.observability import sd_excess, share_gained
 from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY, TURNS_REMEDY, remedy
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS, DIRECTIONS
-from imu_calibration.kinematics.rotations import skew, unit_rows
+from imu_calibration.kinematics.rotations import cross, skew, unit_rows
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses, tangent
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -106,7 +106,7 @@ def shortest_turn(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, float
 
     The turn brings `end` up where `start` was.
     """
-    about = np.cross(end, start)
+    about = cross(end[:, None], start[:, None])[:, 0]
     size = np.linalg.norm(about)
     angle = float(np.arctan2(size, start @ end))
     return (about / size if size > 1e-6 else tangent(start[None])[0, :, 0]), angle
@@ -220,11 +220,11 @@ class HandKnowledge:
     up: np.ndarray | None
     """Current vertical in the sensor frame, shape (3,); None: unknown."""
 
-    def after(self, ups: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    def norms(self, ups: np.ndarray) -> np.ndarray:
         """
-        Return the information after a turn to each of several directions.
+        Return the design of the length of gravity at rest in several directions, shape (k, n).
 
-        With these `turn_rows` (k, 2, 9), and a rest.
+        It depends on the values, not on the information.
         """
         bias, matrix, *_ = self.model.linear(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
@@ -232,11 +232,18 @@ class HandKnowledge:
         # thermal effects
         count = len(ups)
         warmth = np.full(count, self.model.model.temperature_ref_c)
-        norms = self.model.norm_rows(
+        return self.model.norm_rows(
             self.values, forces, time=np.zeros(count), temperature_c=warmth
         )[1]
+
+    def after(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
+        """
+        Return the information after a turn to each of several directions and a rest there.
+
+        With their `norms` (k, n) and `turn_rows` (k, 2, 9).
+        """
         rows = self.rows(norms, turns)
-        return self.information + np.einsum('kri,krj->kij', rows, rows)
+        return self.information + rows.transpose(0, 2, 1) @ rows
 
     def rows(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """
@@ -266,7 +273,11 @@ class HandKnowledge:
         return sd_excess(self.sd(information)[..., only], self.tolerances[only])
 
     def best(
-        self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0
+        self,
+        only: Sequence[int] | slice = slice(None),
+        *,
+        weight: float = 1.0,
+        norms: np.ndarray | None = None,
     ) -> tuple[HandStep, np.ndarray, np.ndarray]:
         """
         Return (best step, gains of `DIRECTIONS`, information after the step).
@@ -278,10 +289,12 @@ class HandKnowledge:
             Parameters for which the gain is computed; by default all.
         weight : float
             Exponent of the seconds; 0: they do not count.
+        norms : ndarray, shape (26, n), optional
+            `norms` of `DIRECTIONS`, where they are known.
 
         """
         steps, turns = steps_from(self.up)
-        information = self.after(DIRECTIONS, turns)
+        information = self.after(self.norms(DIRECTIONS) if norms is None else norms, turns)
         worth = share_gained(
             float(self.missing(self.information, only)), self.missing(information, only)
         )
@@ -294,7 +307,7 @@ class HandKnowledge:
         """Return the knowledge after a step."""
         return replace(
             self,
-            information=self.after(step.up[None], turn_rows(self.up, step.up)[None])[0],
+            information=self.after(self.norms(step.up[None]), turn_rows(self.up, step.up)[None])[0],
             up=step.up,
         )
 
@@ -315,12 +328,13 @@ def foretold(knowledge: HandKnowledge) -> list[HandStep]:
 def _rollout(knowledge: HandKnowledge, weight: float) -> tuple[list[HandStep], float]:
     """Return (the steps by greedy choice, the remaining excess)."""
     steps: list[HandStep] = []
+    norms = knowledge.norms(DIRECTIONS)
     while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_PLANNED_STEPS:
-        step, worth, _ = knowledge.best(weight=weight)
+        step, worth, information = knowledge.best(weight=weight, norms=norms)
         if worth.max() < MIN_POSE_GAIN:
             break
         steps.append(step)
-        knowledge = knowledge.then(step)
+        knowledge = replace(knowledge, information=information, up=step.up)
     return steps, round(float(knowledge.missing(knowledge.information)), 9)
 
 

@@ -14,7 +14,7 @@ from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import zero_sum_rows
 from imu_calibration.estimation.row_estimate import RowSet
-from imu_calibration.kinematics.rotations import skew, unit_rows
+from imu_calibration.kinematics.rotations import cross, skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
@@ -134,8 +134,8 @@ class State:
 def tangent(up: np.ndarray) -> np.ndarray:
     """Return two unit vectors orthogonal to each row of `up`, shape (k, 3, 2)."""
     helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
-    one = unit_rows(np.cross(up, helper))
-    return np.stack([one, np.cross(up, one)], axis=2)
+    one = unit_rows(cross(up.T, helper.T).T)
+    return np.stack([one, cross(up.T, one.T).T], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
