@@ -13,10 +13,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import without_search
 
+from benchmarks import run as benchmarks
 from validation import run
 from validation.recordings import VARIABLE
 
@@ -25,8 +27,12 @@ pytestmark = pytest.mark.live
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ('examples', 'benchmarks', 'tools', 'validation')
 RUN = {
+    'benchmarks/bench_calibrate.py': ('--smallest',),
+    'benchmarks/bench_compensator.py': ('--smallest',),
+    'benchmarks/bench_decode.py': ('--smallest',),
+    'benchmarks/bench_plan.py': ('--smallest',),
+    'benchmarks/bench_verbs.py': ('--smallest',),
     'benchmarks/noise_records.py': ('--smallest',),
-    'benchmarks/run.py': ('--smallest',),
     'tools/exports_page.py': (),
     'tools/tolerance_file.py': (),
     'validation/closed_loop.py': ('--smallest',),
@@ -41,13 +47,10 @@ CANDIDATES = {
     'validation/separating_worlds.py': 'accel_quadratic+accel_scale_asymmetry',
 }
 """Script -> candidates of its search for effects; none for the others."""
+NEEDS_ROS = ('benchmarks/bench_compensator.py',)
 RUN_ELSEWHERE = {
-    'benchmarks/bench_calibrate.py': 'benchmarks/run.py',
-    'benchmarks/bench_compensator.py': 'benchmarks/run.py',
-    'benchmarks/bench_decode.py': 'benchmarks/run.py',
-    'benchmarks/bench_plan.py': 'benchmarks/run.py',
-    'benchmarks/bench_verbs.py': 'benchmarks/run.py',
     'benchmarks/relay_ends.py': 'benchmarks/bench_compensator.py starts it',
+    'benchmarks/run.py': 'test_the_benchmarks_run_one_after_the_other',
     'examples/answers.py': 'test/cli/test_answers.py runs every command of every page',
     'examples/coverage_picture.py': 'test/calibration/test_coverage.py draws the picture',
     'examples/demo.py': 'make demo-check',
@@ -102,6 +105,25 @@ def test_what_is_smaller_is_no_default_of_an_argument():
     assert not bound
 
 
+@pytest.mark.parametrize('missed', [(), ('bench_decode', 'bench_plan')])
+def test_the_benchmarks_run_one_after_the_other(missed, monkeypatch, capsys):
+    started = []
+
+    def started_with(command, **_):
+        started.append(command)
+        return SimpleNamespace(returncode=int(Path(command[1]).stem in missed))
+
+    monkeypatch.setattr(sys, 'argv', ['run.py', '--smallest'])
+    monkeypatch.setattr(benchmarks.subprocess, 'run', started_with)
+    assert benchmarks.main() == int(bool(missed))
+    expected = []
+    for path in sorted((ROOT / 'benchmarks').glob('bench_*.py')):
+        expected.append([sys.executable, str(path), '--smallest'])
+    assert started == expected
+    missed_line = 'targets missed: ' + ', '.join(missed)
+    assert (missed_line in capsys.readouterr().out) == bool(missed)
+
+
 @pytest.mark.long
 def test_the_scripts_run(tmp_path):
     # With what was compiled already: it belongs to the times of the files, which are kept.
@@ -111,7 +133,7 @@ def test_the_scripts_run(tmp_path):
     environment |= {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MPLBACKEND': 'agg'}
     lines = []
     for script, arguments in RUN.items():
-        if script != 'benchmarks/run.py' or importlib.util.find_spec('rclpy'):
+        if script not in NEEDS_ROS or importlib.util.find_spec('rclpy'):
             module = script.removesuffix('.py').replace('/', '.')
             lines.append(shlex.join([CANDIDATES.get(script, 'none'), module, *arguments]))
     done = subprocess.run(
