@@ -13,7 +13,12 @@ from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.document.outcome import parameter_count
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.observability import added_information, sd_excess, share_gained
+from imu_calibration.estimation.observability import (
+    added_information,
+    coefficient_slopes,
+    sd_excess,
+    share_gained,
+)
 from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import LACKING, REMEDY_KEYS
@@ -21,8 +26,8 @@ from imu_calibration.estimation.standard_motions import (
     ALL_MOTIONS,
     DIRECTIONS,
     MOTIONS,
+    REST_WITH_UP,
     Motion,
-    rest_with_up,
 )
 from imu_calibration.kinematics.rotations import unit_rows
 
@@ -216,12 +221,19 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     def left(information: np.ndarray) -> np.ndarray:
         return sd_excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
 
+    slopes = coefficient_slopes(solution.model, solution.values, solution.noise)
+
     def added(motion: Motion) -> np.ndarray:
         return added_information(
-            solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity
+            solution.model,
+            solution.values,
+            solution.noise,
+            motion=motion,
+            gravity=result.gravity,
+            slopes=slopes,
         )
 
-    after = np.array([left(base + added(rest_with_up(up))) for up in DIRECTIONS])
+    after = np.array([left(base + added(rest)) for rest in REST_WITH_UP])
     worth = share_gained(left(base), after)
     possible = possible_motions(cast(WindowObservations, result.data).table)
     motions = [

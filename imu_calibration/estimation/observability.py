@@ -1,10 +1,13 @@
 """Observability of parameters: what standard motions add to the information of a recording."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.sensor_model import ColumnLayout, SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
@@ -40,6 +43,7 @@ def added_information(
     *,
     motion: Motion,
     gravity: float,
+    slopes: dict[str, np.ndarray] | None = None,
 ) -> np.ndarray:
     """
     Return the information matrix that one minute of a standard motion would add.
@@ -47,40 +51,99 @@ def added_information(
     Shape (n_params, n_params).
 
     Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this
-    session.
+    session. `slopes` is the result of `coefficient_slopes` where it is known already.
     """
     total = np.zeros((len(values), len(values)))
-    slopes = {sensor: coefficient_jacobian(model, sensor, values) for sensor in noise}
-    for piece in motion.make(gravity):
-        for sensor in noise:
-            total += _piece_information(model.layout(sensor), slopes[sensor], noise[sensor], piece)
+    slopes = coefficient_slopes(model, values, noise) if slopes is None else slopes
+    for sensor in noise:
+        columns = _motion_columns(_HashableLayout.of(model.layout(sensor)), motion, gravity)
+        total += columns.information(slopes[sensor], noise[sensor])
     return total
 
 
-def _piece_information(
-    layout: ColumnLayout, slope: np.ndarray, noise: NoiseModel, piece: Reference
-) -> np.ndarray:
+def coefficient_slopes(
+    model: SensorModel, values: np.ndarray, sensors: Iterable[str]
+) -> dict[str, np.ndarray]:
     """
-    Return the information of one piece for one sensor, shape (n_params, n_params).
+    Return the derivative of the coefficients of each sensor, (n_columns, 3, n_params).
+    """
+    return {sensor: coefficient_jacobian(model, sensor, values) for sensor in sensors}
 
-    ``slope`` is the derivative of the coefficients by the parameters, shape (n_columns, 3,
-    n_params).
+
+@dataclass(frozen=True)
+class _HashableLayout:
+    """The columns of one sensor, equal to those of another model with the same columns."""
+
+    rows: tuple[tuple[str, int, int], ...]
+    """Name, first column and last column + 1 of each group."""
+    groups: tuple[ColumnGroup, ...]
+    """What the columns of the groups are."""
+    point: tuple[tuple[str, bytes], ...]
+    """Values of the effects where the columns were linearised."""
+    layout: ColumnLayout = field(compare=False)
+    """The layout itself."""
+
+    @classmethod
+    def of(cls, layout: ColumnLayout) -> '_HashableLayout':
+        rows = tuple((name, part.start, part.stop) for name, part in layout.rows.items())
+        point = tuple(
+            (name, np.asarray(values, float).tobytes()) for name, values in layout.point.items()
+        )
+        return cls(rows, tuple(layout.groups.values()), point, layout)
+
+
+@dataclass(frozen=True, eq=False)
+class _MotionColumns:
+    """Columns of one sensor in a motion, without the noise and the values of the parameters."""
+
+    means: np.ndarray
+    """Mean of each piece, shape (n_pieces, n_columns)."""
+    counts: np.ndarray
+    """Samples of each piece, shape (n_pieces,)."""
+    within: np.ndarray | None
     """
-    columns = [_columns(layout, name, rows, piece) for name, rows in layout.rows.items()]
-    design = np.concatenate(columns, axis=1)
-    static = len(piece) == 1
-    count = REST_SAMPLES if static else SAMPLES_PER_POINT * len(piece)
-    mean = design.mean(axis=0)
-    within = (design - mean).T @ (design - mean) * (0.0 if static else SAMPLES_PER_POINT)
-    information = np.zeros((slope.shape[2], slope.shape[2]))
-    for axis in range(3):
-        # The mean has an offset of the window besides its noise, the centred rows have none.
-        row = mean @ slope[:, axis]
-        variance = noise.low_variance[axis]
-        of_mean = variance / count + noise.offset_sd**2 + noise.bias_variance
-        information += np.outer(row, row) / of_mean
-        information += slope[:, axis].T @ within @ slope[:, axis] / variance
-    return information
+    Sum of squares about the means of all samples, shape (n_columns, n_columns); None of rests.
+    """
+
+    def information(self, slope: np.ndarray, noise: NoiseModel) -> np.ndarray:
+        """
+        Return the information, shape (n_params, n_params).
+
+        ``slope`` is the derivative of the coefficients by the parameters, shape (n_columns, 3,
+        n_params).
+        """
+        information = np.zeros((slope.shape[2], slope.shape[2]))
+        for axis in range(3):
+            # The mean has an offset of the window besides its noise, the centred rows have none.
+            rows = self.means @ slope[:, axis]
+            variance = noise.low_variance[axis]
+            of_mean = variance / self.counts + noise.offset_sd**2 + noise.bias_variance
+            information += rows.T @ (rows / of_mean[:, None])
+            if self.within is not None:
+                information += slope[:, axis].T @ self.within @ slope[:, axis] / variance
+        return information
+
+
+# A session asks again and again for the same motions: 26 rests and some twenty others, two sensors.
+@lru_cache(maxsize=128)
+def _motion_columns(columns: _HashableLayout, motion: Motion, gravity: float) -> _MotionColumns:
+    """Return the columns of a motion."""
+    layout = columns.layout
+    means = []
+    counts = []
+    within = None
+    for piece in motion.make(gravity):
+        groups = [_columns(layout, name, rows, piece) for name, rows in layout.rows.items()]
+        design = np.concatenate(groups, axis=1)
+        means.append(design.mean(axis=0))
+        if len(piece) == 1:
+            counts.append(REST_SAMPLES)
+            continue
+        counts.append(SAMPLES_PER_POINT * len(piece))
+        centred = design - means[-1]
+        of_piece = SAMPLES_PER_POINT * centred.T @ centred
+        within = of_piece if within is None else within + of_piece
+    return _MotionColumns(np.array(means), np.array(counts), within)
 
 
 def _columns(layout: ColumnLayout, name: str, rows: slice, piece: Reference) -> np.ndarray:
@@ -166,10 +229,16 @@ def needed_motions(
     base = _information_of(solution, prior_sd)
     # The model error remains: a motion reduces the noise only.
     remaining = np.maximum(solution.sd / _sd_of(base), 1.0)
+    slopes = coefficient_slopes(solution.model, solution.values, solution.noise)
     predicted = {}
     for motion in MOTIONS if possible is None else possible:
         total = base + added_information(
-            solution.model, solution.values, solution.noise, motion=motion, gravity=gravity
+            solution.model,
+            solution.values,
+            solution.noise,
+            motion=motion,
+            gravity=gravity,
+            slopes=slopes,
         )
         predicted[motion] = _sd_of(total) * remaining
     return {

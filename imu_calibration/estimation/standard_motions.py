@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,7 +41,7 @@ class Motion:
     axis: Axis | None = None
     """The sensor axis of the turn; None: several axes, or several attitudes."""
 
-    @property
+    @cached_property
     def seconds(self) -> float:
         """Duration: rests with the move to the next one, and moving pieces."""
         seconds = 0.0
@@ -242,11 +243,6 @@ def _shaken(gravity: float) -> list[Reference]:
     return pieces
 
 
-def rest_with_up(up: np.ndarray) -> Motion:
-    """Return the motion of a rest with one direction of the sensor up."""
-    return Motion('rest', 'rest', _poses([up]))
-
-
 def _two_axis(gravity: float) -> list[Reference]:
     """
     Turn about an axis that itself turns.
@@ -376,7 +372,13 @@ def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
         return ()
     share = float(np.clip(np.dot(axis_s, up_s) * np.sign(np.dot(along[0], axis_s)), -1.0, 1.0))
     up = share * np.array(along[0], float) + np.sqrt(1.0 - share**2) * np.roll(along[0], 1)
-    return _spins_about(along[0], tuple(up)), _oscillates_about(along[0], tuple(up))
+    return _motions_about(along[0], tuple(up.tolist()))
+
+
+@lru_cache(maxsize=16)
+def _motions_about(axis: Axis, up: tuple[float, ...]) -> tuple[Motion, ...]:
+    """Return the same motions for the same axis: what is known of them is found again."""
+    return _spins_about(axis, up), _oscillates_about(axis, up)
 
 
 TABLE_MOTIONS = {
@@ -392,6 +394,8 @@ TABLE_MOTIONS = {
 """
 Motions that concern the table or the clock; their gain depends on the table and is not predicted.
 """
+REST_WITH_UP = tuple(Motion('rest', 'rest', _poses([up])) for up in DIRECTIONS)
+"""A rest with each of `DIRECTIONS` up."""
 ALL_MOTIONS = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
 """Name -> instruction."""
 ONE_JOINT = {

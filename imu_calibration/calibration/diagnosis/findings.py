@@ -25,7 +25,7 @@ from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.base import SENSORS, Effect, Role
-from imu_calibration.estimation.observability import added_information
+from imu_calibration.estimation.observability import added_information, coefficient_slopes
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS, MOTIONS, ONE_JOINT, OTHER_MOUNT
@@ -72,9 +72,10 @@ def separating_motion(
     values = np.where(np.isfinite(values), values, 0.0)
     prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
     own = model.slices[question.sensor, question.name]
+    slopes = coefficient_slopes(model, values, solution.noise)
     for motion in MOTIONS:
         total = np.diag(1 / prior_sd**2) + added_information(
-            model, values, solution.noise, motion=motion, gravity=gravity
+            model, values, solution.noise, motion=motion, gravity=gravity, slopes=slopes
         )
         left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
         if left > best[0]:
