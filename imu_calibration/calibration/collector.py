@@ -35,6 +35,7 @@ from imu_calibration.references.turntable.session_data import (
     DecimatedWindows,
     HeldOut,
     HeldOutBlock,
+    KeptWindows,
     SessionData,
     WindowStore,
     naming,
@@ -299,7 +300,7 @@ class Collector:
         nominal: RawReadings | None = None,
         session: int = 0,
         watchers: Sequence[Watcher] = (),
-        windows: list | StoredWindows | None = None,
+        windows: StoredWindows | KeptWindows | list | None = None,
         spread: bool = False,
         judged_from: float = 0.0,
         without: np.ndarray = NO_RANGES,
@@ -427,7 +428,7 @@ class GatherStep:
         session: int,
         preflight: Preflight,
         *,
-        windows: list | StoredWindows | None = None,
+        windows: StoredWindows | KeptWindows | list | None = None,
     ) -> SessionData:
         """
         Return the SessionData of a recording, which is read once for its windows and the checks.
@@ -464,7 +465,7 @@ class GatherStep:
         session: int,
         watchers: Sequence[Watcher],
         *,
-        windows: list | StoredWindows | None,
+        windows: StoredWindows | KeptWindows | list | None,
         without: np.ndarray = NO_RANGES,
         unusable: Sequence[str] = (),
     ) -> SessionData:

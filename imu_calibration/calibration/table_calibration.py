@@ -1,6 +1,6 @@
 """Calibration on a table."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -26,10 +26,10 @@ from imu_calibration.estimation.solution import Solution, shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.window import StoredWindows
+from imu_calibration.preprocessing.window import StoredWindows, Window
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.references.turntable.accumulator import restrict
-from imu_calibration.references.turntable.session_data import SessionData, join
+from imu_calibration.references.turntable.session_data import KeptWindows, SessionData, join
 from imu_calibration.references.turntable.window_statistics import reduce_window
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
 
@@ -74,7 +74,7 @@ def calibrate_on_table(
         several.
 
     """
-    recordings = TableRecordings.of(sources, table, jobs=jobs, names=names)
+    recordings = recordings_on_table(sources, table, jobs=jobs, names=names)
     return conclude(recordings.solved(options), options, provenance=provenance)
 
 
@@ -176,21 +176,6 @@ class TableRecordings:
 
 
 @dataclass(frozen=True, eq=False)
-class WatchedRecording(TableRecordings):
-    """A recording that is shown to the checks when it is read for the first time."""
-
-    preflight: Preflight = field(default_factory=Preflight)
-    """The checks."""
-
-    def reduced(self, step: GatherStep) -> list[SessionData]:
-        """Return the windows of the recording, reduced with the columns of a model."""
-        if self.preflight.streams:
-            return super().reduced(step)
-        (source,) = self.sources
-        return [step.read(source, 0, self.preflight)]
-
-
-@dataclass(frozen=True, eq=False)
 class StoredRecording(TableRecordings):
     """A recording that is read once: later linearisations reduce its stored windows."""
 
@@ -207,12 +192,65 @@ class StoredRecording(TableRecordings):
             self.first_pass.append(step.read(source, 0, preflight, windows=self.windows))
             return [*self.first_pass]
         windows = (self.windows[number] for number in range(len(self.windows)))
-        reduced = (
-            reduce_window(window, step.model, step.table)
-            for window in windows
-            if window.kind != 'unused'
-        )
-        return [self.first_pass[0].anew(reduced, step.judged_from)]
+        used = (window for window in windows if window.kind != 'unused')
+        return [_reduced_again(self.first_pass[0], used, step)]
+
+
+@dataclass(frozen=True, eq=False)
+class KeptRecording(TableRecordings):
+    """A recording that is read once, unless it is long: then each pass reads it."""
+
+    windows: KeptWindows = field(default_factory=KeptWindows)
+    """Its used windows; empty before the first pass."""
+    first_pass: list[SessionData] = field(default_factory=list)
+    """The data of the first pass; empty before it."""
+
+    def reduced(self, step: GatherStep) -> list[SessionData]:
+        """Return the windows of the recording, reduced with the columns of a model."""
+        if self.first_pass and self.windows.is_complete:
+            return [_reduced_again(self.first_pass[0], self.windows.windows, step)]
+        self.windows.clear()
+        self.first_pass.clear()
+        (source,) = self.sources
+        self.first_pass.append(step.read(source, 0, self.checks(step), windows=self.windows))
+        return [*self.first_pass]
+
+    def checks(self, step: GatherStep) -> Preflight:
+        """Return the checks to which the recording is shown while it is read."""
+        return Preflight(step.table.gravity_value, one_sensor=True)
+
+
+@dataclass(frozen=True, eq=False)
+class WatchedRecording(KeptRecording):
+    """A recording that is shown to given checks when it is read for the first time."""
+
+    preflight: Preflight = field(default_factory=Preflight)
+    """The checks."""
+
+    def checks(self, step: GatherStep) -> Preflight:
+        """Return the given checks, of the first pass only."""
+        return super().checks(step) if self.preflight.streams else self.preflight
+
+
+def recordings_on_table(
+    sources: Sequence[BlockSource],
+    table: Table,
+    *,
+    jobs: int = 1,
+    names: Sequence[str] | None = None,
+    keep_windows: bool = False,
+) -> TableRecordings:
+    """Return recordings of one IMU; a single one is read once if it is not long."""
+    kind = KeptRecording if len(sources) == 1 else TableRecordings
+    return kind.of(sources, table, jobs=jobs, names=names, keep_windows=keep_windows)
+
+
+def _reduced_again(
+    first_pass: SessionData, windows: Iterable[Window], step: GatherStep
+) -> SessionData:
+    """Return the data of a recording with its used windows reduced with the columns of a model."""
+    reduced = (reduce_window(window, step.model, step.table) for window in windows)
+    return first_pass.anew(reduced, step.judged_from)
 
 
 def solve_in_passes(

@@ -22,6 +22,7 @@ from imu_calibration.calibration.table_calibration import (
     StoredRecording,
     TableRecordings,
     WatchedRecording,
+    recordings_on_table,
 )
 from imu_calibration.calibration.table_errors import calibrate_with_table_errors
 from imu_calibration.calibration.window_observations import TableResult
@@ -67,8 +68,8 @@ class TableReference:
         names: Sequence[str] | None = None,
         jobs: int = 1,
     ) -> TableRecordings:
-        """Return the recordings, which each pass reads."""
-        return TableRecordings.of(sources, self.table, jobs=jobs, names=names, keep_windows=True)
+        """Return the recordings: several, or a long one, are read by each pass."""
+        return recordings_on_table(sources, self.table, jobs=jobs, names=names, keep_windows=True)
 
     def errors(
         self,

@@ -22,7 +22,7 @@ from imu_calibration.calibration.diagnosis.diagnose import (
 )
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.calibration.held_out_data import PlainFit
-from imu_calibration.calibration.table_calibration import TableRecordings
+from imu_calibration.calibration.table_calibration import recordings_on_table
 from imu_calibration.calibration.window_readings import errors_on_table
 from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, Role
@@ -117,7 +117,7 @@ def world(kind, seed, gyroscope_model='bias+matrix'):
         gyroscope_model=gyroscope_model,
         reference_model='none',
     )
-    solved = TableRecordings.of([source(pair.first)], table).solved(options)
+    solved = recordings_on_table([source(pair.first)], table).solved(options)
     return pair, table, solved, options
 
 
@@ -279,7 +279,7 @@ def test_a_formula_is_applied_where_a_second_session_confirms_it(kind, seed, col
     pair, table, solved, options = world(kind, seed)
     effect = formula('bend', column, unit)
     result = conclude(with_changes(solved, unexplained=UNEXPLAINED), options)
-    recordings = TableRecordings.of([source(pair.first)], table)
+    recordings = recordings_on_table([source(pair.first)], table)
     extension = ProposedExtension(result, SimpleNamespace(unexplained={}), options)
     extended = _with_proposals(recordings, extension, [effect])
     applied = helpful_formulas([effect], extended, result.calibration)

@@ -166,11 +166,7 @@ def terminals(home):
 
 STARTING = [command for command in commands() if starts(command)]
 THREE = STARTING[:3]
-LESS = (
-    '-p imu_rate:=50.0 -p joint_rate:=50.0',
-    '-p diagnosis_period:=0.0 -p model_as_asked:=true',
-    '',
-)
+LESS = ('-p imu_rate:=50.0 -p joint_rate:=50.0', '-p diagnosis_period:=0.0', '')
 """Added to the three commands, so that a busy machine keeps up with four times real time."""
 
 

@@ -138,6 +138,40 @@ def owned_window(window: Window) -> Window:
     )
 
 
+KEPT_IN_MEMORY = 250_000
+"""Samples of `KeptWindows` at most, some 50 MB: 40 minutes at 100 Hz."""
+
+
+@dataclass(eq=False)
+class KeptWindows:
+    """The used windows of a recording; of a long recording none."""
+
+    windows: list[Window] = field(default_factory=list)
+    """In the order of time; none where there were too many."""
+    n_samples: int = 0
+    """Samples of all used windows so far."""
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all used windows are kept."""
+        return self.n_samples <= KEPT_IN_MEMORY
+
+    def clear(self) -> None:
+        """Remove all windows."""
+        self.windows, self.n_samples = [], 0
+
+    def extend(self, windows: Iterable[Window]) -> None:
+        """Append the used ones of some windows."""
+        for window in windows:
+            if window.kind == 'unused':
+                continue
+            self.n_samples += len(window.time)
+            if self.is_complete:
+                self.windows.append(owned_window(window))
+            else:
+                self.windows = []
+
+
 TABLE_FOLDS = 8
 """Folds of the cross-validation."""
 BLOCKS = 3 * TABLE_FOLDS
