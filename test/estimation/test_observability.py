@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from imu_calibration.core.units import DEG
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation import observability
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.observability import (
     added_information,
@@ -176,3 +178,44 @@ def test_standard_motions_are_what_they_say():
         np.linalg.norm(piece.force_s[0]) == pytest.approx(GRAVITY)
         for piece in BY_NAME['static_dense'].make(GRAVITY)
     )
+
+
+def _own_effect(column):
+    """Return a model with an effect `mine` of one column."""
+    definition = {
+        'sensor': 'accelerometer',
+        'column': column,
+        'unit': 's^2/m',
+        'tolerance': 1e-3,
+        'text': 'mine',
+        'tolerance_reason': 'a guess',
+        'prior_sd': 1.0,
+        'largest': 2.0,
+    }
+    catalogue = CATALOGUE.with_definitions({'mine': definition})
+    return SensorModel(accelerometer=('bias', 'matrix', 'mine'), catalogue=catalogue)
+
+
+def _at_time_constant(constant):
+    """Return a model whose columns of a drift have this time constant."""
+    model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_bias_drift'))
+    values = model.effects[-1].at_time_constant(constant)
+    return replace(model, point={'gyro_bias_drift': values})
+
+
+@pytest.mark.parametrize(
+    ('first', 'second'),
+    [
+        (_own_effect('f_x * abs(f_x)'), _own_effect('f_y * abs(f_y)')),
+        (_at_time_constant(30.0), _at_time_constant(300.0)),
+    ],
+)
+def test_columns_of_a_motion_are_known_from_models_with_the_same_columns(first, second):
+    known = [added('static_poses', model) for model in (first, second)]
+    observability._motion_columns.cache_clear()
+    fresh = [added('static_poses', model) for model in (second, first)]
+    np.testing.assert_array_equal(known, fresh[::-1])
+    assert not np.allclose(*known)
+    n_computed = observability._motion_columns.cache_info().misses
+    added('static_poses', replace(second))
+    assert observability._motion_columns.cache_info().misses == n_computed
