@@ -124,7 +124,7 @@ class _MotionColumns:
         return information
 
 
-# A session asks again and again for the same motions: 26 rests and some twenty others, two sensors.
+# A live session uses 26 rests and some twenty motions, for two sensors.
 @lru_cache(maxsize=128)
 def _motion_columns(columns: _HashableLayout, motion: Motion, gravity: float) -> _MotionColumns:
     """Return the columns of a motion."""

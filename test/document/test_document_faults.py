@@ -376,7 +376,7 @@ def test_damaged_documents_are_refused_in_one_line_or_can_be_used(good, read):
         good = documents.from_text(noise_seeds(None)[0].decode())
     refused = 0
     for path in list(places(good))[1:]:
-        # The sensors of a document of noise have one declaration: below its fields one is enough.
+        # The sensors of a document of noise have one declaration, checked below its fields once.
         if path[0] == 'gyroscope' and len(path) > 2:
             continue
         for value in WRONG:
