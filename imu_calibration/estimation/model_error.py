@@ -13,14 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
-from imu_calibration.estimation.row_estimate import RowEstimate, RowSet
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DRIFT, MODEL_ERROR
 from imu_calibration.estimation.weighted_system import WeightedSystem
@@ -88,7 +86,7 @@ def model_error(
     """
     if len(system.accumulator.blocks) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
-    waves = _waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free)
+    waves = waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free)
     found, misfits = errors_of_waves(waves, system.model)
     if 'accelerometer' in misfits:
         # An error that depends on the attitude has a mean as large as its scatter, absorbed by the
@@ -185,52 +183,7 @@ def _block_scores(
     return information, gradient
 
 
-def model_error_of_rows(
-    rows: RowSet, found: RowEstimate, model: SensorModel, *, block: np.ndarray
-) -> ModelError:
-    """
-    Return the model error from the scatter of parameters between blocks of rows.
-
-    It is the scatter beyond noise and known scatter.
-
-    Nuisances are estimated too, so that the expected covariance of the shifts is the one of rows
-    from which these, and the parameters, have been fitted.
-
-    Parameters
-    ----------
-    rows : RowSet
-        At the estimate.
-    found : RowEstimate
-    model : SensorModel
-        Its parameters are those of the rows.
-    block : array of int, shape (m,)
-        Number of each row's block.
-
-    """
-    # Rows of unit variance, the design without its part along the nuisances (F F' A).
-    root = np.sqrt(found.scatter.total(rows.noise, rows.component))[:, None]
-    rest = rows.residual / root[:, 0]
-    fitted = scipy.linalg.qr(rows.nuisance / root, mode='economic')[0]
-    main = rows.main / root
-    main -= fitted @ (fitted.T @ main)
-
-    information, gradient, shared = [], [], []
-    for number in range(block.max() + 1):
-        own = block == number
-        information.append(main[own].T @ main[own])
-        gradient.append(main[own].T @ rest[own])
-        shared.append(fitted[own].T @ main[own])
-    waves = _waves_of_blocks(
-        np.array(information),
-        np.array(gradient),
-        np.zeros((0, len(found.free))),
-        found.free,
-        shared=np.array(shared),
-    )
-    return errors_of_waves(waves, model)[0]
-
-
-def _waves_of_blocks(
+def waves_of_blocks(
     information: np.ndarray,
     gradient: np.ndarray,
     prior_root: np.ndarray,

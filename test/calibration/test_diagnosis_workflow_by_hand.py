@@ -25,9 +25,9 @@ from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.references.gravity.model_selection import investigate_by_hand
 from imu_calibration.references.gravity.pose_residual import regimes_by_hand
 from imu_calibration.references.gravity.pose_rows import build_rows
+from imu_calibration.references.rows.row_search import RowTests
 from imu_calibration.selection import regimes
 from imu_calibration.selection.gain import APPLIED, OF_MODEL
-from imu_calibration.selection.row_search import RowTests
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values
 from imu_calibration.simulation.session import simulate_session as simulate_session

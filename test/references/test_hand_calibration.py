@@ -16,7 +16,6 @@ from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.group_variances import estimate_group_variances, student_factor
 from imu_calibration.kinematics.rotations import normal_gravity
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.preprocessing.rest_detection import find_still
@@ -30,6 +29,7 @@ from imu_calibration.references.gravity.hand_parameters import (
     hand_options,
 )
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.rows.group_variances import estimate_group_variances, student_factor
 from imu_calibration.use_cases.choices import calibration_options
 
 from worlds.hand_scatter import differences, errors_by_hand, hand_scatter

@@ -29,15 +29,15 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import output_of_effects
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.row_estimate import RowSet, estimate_rows
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.rows.row_estimate import RowSet, estimate_rows
+from imu_calibration.references.rows.row_evidence import RowBlock, RowSpace
+from imu_calibration.references.rows.row_search import RowProblem, choose_effects
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.row_evidence import RowBlock, RowSpace
-from imu_calibration.selection.row_search import RowProblem, choose_effects
 
 BLOCK = 1.0
 """Length of a block, s."""

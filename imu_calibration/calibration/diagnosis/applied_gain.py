@@ -34,6 +34,8 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.model_selection import (
     HandInvestigation,
 )
+from imu_calibration.references.rows.row_evidence import RowBlock
+from imu_calibration.references.rows.row_search import RowProblem, gain_of_groups
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 from imu_calibration.selection.gain import (
@@ -49,8 +51,6 @@ from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
-from imu_calibration.selection.row_evidence import RowBlock
-from imu_calibration.selection.row_search import RowProblem, gain_of_groups
 from imu_calibration.selection.saturation import measured
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import zero_sum_rows
-from imu_calibration.estimation.row_estimate import RowSet
 from imu_calibration.kinematics.rotations import cross, skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.rows.row_estimate import RowSet
 
 COMPONENTS = ('pose', 'drift', 'turn')
 """

@@ -15,7 +15,6 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
-from imu_calibration.estimation.row_estimate import RowEstimate
 from imu_calibration.estimation.solution import (
     DRIFT,
     GRAVITY,
@@ -83,6 +82,7 @@ from imu_calibration.references.gravity.tested_directions import (
     placements_demand,
     turns_between,
 )
+from imu_calibration.references.rows.row_estimate import RowEstimate
 from imu_calibration.selection.questions import at_time_constants
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}

@@ -28,6 +28,8 @@ from imu_calibration.references.gravity.hand_parameters import (
 )
 from imu_calibration.references.gravity.pose_residual import unexplained_by_hand
 from imu_calibration.references.gravity.pose_rows import build_rows, gravity_turns
+from imu_calibration.references.rows.row_evidence import RowBlock, RowEvidence, RowSpace
+from imu_calibration.references.rows.row_search import ChoiceWithout, RowProblem, choose_effects
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.questions import (
     Question,
@@ -35,8 +37,6 @@ from imu_calibration.selection.questions import (
     sort_effects,
     time_constants,
 )
-from imu_calibration.selection.row_evidence import RowBlock, RowEvidence, RowSpace
-from imu_calibration.selection.row_search import ChoiceWithout, RowProblem, choose_effects
 from imu_calibration.selection.search import SelectedEffects, SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained
 

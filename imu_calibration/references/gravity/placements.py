@@ -8,9 +8,9 @@ the face, of the table or of the sensor is the same in all of them.
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.estimation.group_variances import GroupVariances, estimate_group_variances
-from imu_calibration.estimation.row_estimate import RowEstimate, RowSet, gain_of_rows
 from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD
+from imu_calibration.references.rows.group_variances import GroupVariances, estimate_group_variances
+from imu_calibration.references.rows.row_estimate import RowEstimate, RowSet, gain_of_rows
 
 PLACED_AGAIN = 0.0125
 """Consecutive rests within this angle are one placement, rad: they have the same error."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from imu_calibration.effects.base import AXES
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.rows.row_evidence import RowBlock, RowEvidence
 from imu_calibration.selection.regime_variables import Variable, ranged
 from imu_calibration.selection.regimes import (
     REGIME_LEVEL,
@@ -17,7 +18,6 @@ from imu_calibration.selection.regimes import (
     exchanges,
 )
 from imu_calibration.selection.residual_blocks import largest_axes
-from imu_calibration.selection.row_evidence import RowBlock, RowEvidence
 from imu_calibration.selection.unexplained import (
     MIN_EXPLAINED_WINDOWS,
     SIGNIFICANT_SDS,

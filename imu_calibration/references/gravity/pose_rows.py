@@ -14,7 +14,7 @@ from imu_calibration.references.gravity.equations import Poses, TurnData, betwee
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.selection.row_evidence import RowBlock, RowSpace
+from imu_calibration.references.rows.row_evidence import RowBlock, RowSpace
 
 
 def build_rows(

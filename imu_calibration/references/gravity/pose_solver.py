@@ -14,17 +14,7 @@ from scipy.linalg import solve_triangular
 from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.gauss_newton import gauss_newton
-from imu_calibration.estimation.model_error import (
-    MIN_SCATTER_BLOCKS,
-    ModelError,
-    model_error_of_rows,
-)
-from imu_calibration.estimation.row_estimate import (
-    MAX_NEWTON_STEPS,
-    RowEstimate,
-    RowSet,
-    estimate_rows,
-)
+from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelError
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import (
     GRAVITY,
@@ -46,6 +36,13 @@ from imu_calibration.references.gravity.equations import (
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import missed_angle
+from imu_calibration.references.rows.row_estimate import (
+    MAX_NEWTON_STEPS,
+    RowEstimate,
+    RowSet,
+    estimate_rows,
+)
+from imu_calibration.references.rows.row_model_error import model_error_of_rows
 
 LEAST_SPREAD = 0.02
 """Spread of the directions (1/3 when they are even) from which on a sphere is a starting point."""

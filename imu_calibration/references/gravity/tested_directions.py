@@ -14,12 +14,12 @@ import numpy as np
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.gauss_newton import gauss_newton, halved
-from imu_calibration.estimation.group_variances import student_factor
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
 from imu_calibration.references.gravity.placements import placements
 from imu_calibration.references.gravity.pose_solver import NormSquares, first_state
 from imu_calibration.references.gravity.poses import ATTITUDES_APART
+from imu_calibration.references.rows.group_variances import student_factor
 
 OFF_AXIS = 0.15
 """

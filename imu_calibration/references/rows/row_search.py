@@ -6,6 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.core.progress import reported
+from imu_calibration.references.rows.row_evidence import (
+    RowBlock,
+    RowEvidence,
+    RowSpace,
+    without_groups,
+)
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
 from imu_calibration.selection.order_of_tests import (
@@ -14,12 +20,6 @@ from imu_calibration.selection.order_of_tests import (
     without_weakest,
 )
 from imu_calibration.selection.questions import Question, smooth_parameters
-from imu_calibration.selection.row_evidence import (
-    RowBlock,
-    RowEvidence,
-    RowSpace,
-    without_groups,
-)
 from imu_calibration.selection.search import Search
 
 OUTER = 12

@@ -16,13 +16,13 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.gauss_newton import gauss_newton
-from imu_calibration.estimation.group_variances import GroupVariances, estimate_group_variances
 from imu_calibration.estimation.held_parameters import undetermined_parameters
 from imu_calibration.estimation.scaled_solve import (
     covariance_with_held,
     triangular_of_band,
 )
 from imu_calibration.estimation.solution import terms_of_fit
+from imu_calibration.references.rows.group_variances import GroupVariances, estimate_group_variances
 
 MAX_NEWTON_STEPS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""
