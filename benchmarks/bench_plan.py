@@ -27,6 +27,7 @@ import numpy as np  # noqa: E402
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]  # simulated worlds of the tests
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.effects.sensor_model import (
@@ -43,7 +44,7 @@ from imu_calibration.planning.planning_problem import (
     noise_of_grade,  # noqa: E402
 )
 from imu_calibration.planning.posterior import exact_information  # noqa: E402
-from imu_calibration.references.options import CalibrationOptions, choose_model  # noqa: E402
+from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.simulation.motion_builder import Profile  # noqa: E402
 from imu_calibration.simulation.profiles import make_profile  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402

@@ -12,11 +12,11 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from visualization_msgs.msg import Marker
 
-from imu_calibration.calibration.advice import HandStep, foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
-from imu_calibration.calibration.live_poses import EMPTY_SCAN, knowledge_of
 from imu_calibration.nodes.calibration_status import markers_of
+from imu_calibration.references.gravity.advice import HandStep, foretold
 from imu_calibration.references.gravity.hand_parameters import HandOptions
+from imu_calibration.references.gravity.live_poses import EMPTY_SCAN, knowledge_of
 
 PICTURE = Path(__file__).resolve().parents[1] / 'docs' / 'coverage.png'
 MINIMUM = 8.0

@@ -56,16 +56,17 @@ explains the terms.
 `effects`         the catalogue of physical effects, and the sensor model made of it
 `preprocessing`   a stream becomes windows: static poses, spins, dynamic stretches; checks of a
                   recording
-`estimation`      windows become a solution: noise, likelihood, least squares, observability
+`estimation`      what solutions have in common: noise, likelihood, least squares, observability
 `simulation`      the model run: profiles of motion, noise, sessions
 `compensation`    the model inverted: corrected samples with their covariance
-`selection`       choice of the effects that the data support, tested on held-out windows; analysis
-                  of the residual
+`selection`       choice of the effects that the data support, by evidence on held-out data
 `allan`           the noise of an IMU at rest: Allan curves, their fit with intervals, noise.yaml
 `document`        the calibration file, its verdict, comparison, and conversion to formats of other
                   programs
-`references`      turntable and gravity: gathered data and the equations of calibration by hand
-`calibration`     from recordings to a judged document; live sessions, fleets, diagnosis
+`calibration`     from observations of any reference to a judged document; options, live sessions,
+                  diagnosis
+`references`      turntable and gravity: what each gathers, its rows, solution and search, held-out
+                  data, live sessions; fleets on tables
 `between_imus`    the arm between two IMUs
 `planning`        choice of motions, a lower bound on the time of all plans, execution with stops
                   and their reason

@@ -18,7 +18,7 @@ from unittest.mock import patch
 def candidates_in_scripts(candidates: str) -> Iterator[None]:
     """Test only these effects of the catalogue, and those of users, in each search on a table."""
     from imu_calibration.effects.catalogue import CATALOGUE
-    from imu_calibration.selection import investigation
+    from imu_calibration.references.turntable.selection import investigation
 
     every = investigation.testable_effects
     chosen = CATALOGUE.with_candidates(candidates).candidates

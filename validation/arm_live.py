@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from examples.processes import NodeProcesses, local_environment
 from imu_calibration.between_imus.arm import RelativeArm, estimate_arm
 from imu_calibration.between_imus.pair import clipped
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.compensation.compensate import Transfer, compensated_samples
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS
 from msg_adapters.write import encode_imu

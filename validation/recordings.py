@@ -5,9 +5,9 @@ from pathlib import Path
 
 import yaml
 
-from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.units import STANDARD_GRAVITY
+from imu_calibration.references.gravity.hand_recording import read_by_hand
 from msg_adapters.bag import open_recording
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,12 +1,12 @@
 """One joint is a table too: a motor shaft with a coarse encoder."""
 
-from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from msg_adapters.bag import open_recording
 from validation.recordings import SHAFT
 from validation.section import Section, text

@@ -13,10 +13,10 @@ from unittest import mock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 from validation.figures import new_figure

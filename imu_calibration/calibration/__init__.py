@@ -1,6 +1,6 @@
 """
-The use case: from recordings to a judged calibration document.
+The use case: from observations of a reference to a judged calibration document.
 
-In: blocks of samples, a table, options. Out: a `CalibrationResult`, live sessions, fleets,
-diagnoses. Read `calibrate` first, then `table_calibration` and `hand_workflow`.
+In: a `ModelSource` and options. Out: a `CalibrationResult`, or a diagnosis. Read `calibrate` first,
+then `result` and `reference`: the protocols that each reference of `references` implements.
 """

@@ -12,6 +12,7 @@ from typing import Any
 from imu_calibration.calibration.by_evidence import solve_by_evidence
 from imu_calibration.calibration.from_solution import Estimate, document
 from imu_calibration.calibration.held_out_data import PlainFit
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.plain_fit import (
     better_plain_fits,
     changes_with,
@@ -25,7 +26,6 @@ from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.solved import ModelSource, Solved
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.estimation.solution import tolerances_of, with_weak_replaced
-from imu_calibration.references.options import CalibrationOptions
 
 
 def calibrate_by_evidence(

@@ -8,10 +8,11 @@ from imu_calibration.calibration.check import ReadingErrors
 from imu_calibration.calibration.coverage import Coverage
 from imu_calibration.calibration.live import (
     LiveByHandSettings,
+    LiveSession,
     LiveSettings,
     Place,
 )
-from imu_calibration.calibration.live_poses import LiveSession
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.solved import ModelSource
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError
@@ -22,7 +23,6 @@ from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
-from imu_calibration.references.options import CalibrationOptions
 
 if TYPE_CHECKING:
     from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis

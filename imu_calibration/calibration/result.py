@@ -12,7 +12,9 @@ from typing import Any, ClassVar, Generic, Protocol
 import numpy as np
 
 from imu_calibration.calibration.from_solution import Estimate
+from imu_calibration.calibration.gathered_data import GatheredData
 from imu_calibration.calibration.held_out_data import HeldOutData, PlainFit
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.statistics import RecordingStatistics
@@ -20,8 +22,6 @@ from imu_calibration.document.trust import Uncorrected, usage
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.selection.search import SelectedEffects
 
 GRAVITY_SD = 5e-4
@@ -91,7 +91,7 @@ class Observations(Protocol[Estimate]):
     """Unit of the data: 'windows' or 'poses'."""
 
     @property
-    def gathered(self) -> SessionData:
+    def gathered(self) -> GatheredData:
         """Counts, conditions and stored windows of the recordings."""
 
     @property
@@ -185,7 +185,7 @@ class CalibrationResult(Generic[Estimate]):
     """The document's content."""
     data: Observations[Estimate]
     """What the reference gathered."""
-    gathered: SessionData
+    gathered: GatheredData
     """Counts, conditions and stored windows of the recordings, with all findings."""
     tolerances: np.ndarray
     """Tolerance of each parameter."""

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol
 
 from imu_calibration.calibration.from_solution import Estimate, ModelExtension
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import Observations
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.references.options import CalibrationOptions
 
 
 @dataclass(frozen=True, eq=False)

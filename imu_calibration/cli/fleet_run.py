@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResult, summarise
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.parser import Options, VerbResult
 from imu_calibration.cli.show import show_table, warn
 from imu_calibration.cli.terminal import Terminal
@@ -25,7 +25,13 @@ from imu_calibration.preprocessing.exclusion import (
     exclusions_of_units,
     parse_exclusions,
 )
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.fleet import (
+    FleetStep,
+    Spread,
+    Unit,
+    UnitResult,
+    summarise,
+)
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.use_cases.choices import provenance_with, require_same_inputs, topics_of

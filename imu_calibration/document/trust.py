@@ -21,7 +21,6 @@ from imu_calibration.effects.base import INPUT_OF, SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulated_rows import AccumulatedRows
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.rotations import Reference
 
@@ -41,11 +40,6 @@ SETTLED = 0.1
 """
 An effect in time has settled if a recording of twice the length would change it by at most this
 share more: 2.3 time constants.
-"""
-LEAST_INPUT = {'accelerometer': 1.0, 'gyroscope': 0.1}
-"""
-Sensor -> rms of its true input in a direction, m/s^2 or rad/s, from which bias and matrix take the
-place of an effect that compensation cannot undo: 0.1 g, and 6 deg/s.
 """
 PROBABLE = 2.0
 """Standard deviations above a time constant with which an effect has to have settled."""
@@ -68,148 +62,9 @@ class Uncorrected:
         return {'uncorrected': [dict(entry) for entry in self.sizes]} if self.sizes else {}
 
 
-def uncorrected_on_table(
-    model: SensorModel,
-    values: np.ndarray,
-    accumulator: AccumulatedRows,
-    *,
-    gathered: SensorModel,
-    latest: SensorModel | None = None,
-) -> Uncorrected:
-    """
-    Return the errors that remain uncorrected by a calibration on a table.
-
-    Parameters
-    ----------
-    model : SensorModel
-        At the point of its `values`.
-    values : array, shape (n_params,)
-    accumulator : AccumulatedRows
-        Windows with the columns of `gathered`.
-    gathered : SensorModel
-    latest : SensorModel, optional
-        `latest_settling`; default: `model`.
-
-    """
-    latest = latest or model
-    end = end_of(accumulator)
-    # A time constant changes the columns, which were gathered at another one.
-    gathered_at = {e.name: gathered.point_of(e) for e in model.effects if e.time_constant}
-    at_columns = replace(model, point=model.point | gathered_at)
-    centre: dict[str, ColumnCentre] = {}
-    sizes = []
-    for effect in not_applied(model):
-        at_end = has_settled(latest, effect, end)
-        true_input = gathered.columns_of(effect.sensor, Role.LINEAR)
-        samples = _Samples.of(accumulator, effect.sensor, true_input)
-        squares = np.zeros(3)
-        for group in effect.groups:
-            columns = gathered.layout(effect.sensor).rows[group.name]
-
-            # The constant part: the value at the end, or the part that bias and matrix describe.
-            if at_end:
-                at_last = columns_at(model, effect, [end])[group.name][0]
-                of_group = _constant(effect, at_last)
-            else:
-                change = values[model.slices[effect.key]] - gathered.point_of(effect)
-                of_group = _moved(effect, _projection(effect, columns, samples), change)
-            centre[group.name] = of_group
-
-            # The output of the effect less that of this part.
-            own = model.layout(effect.sensor).rows[group.name]
-            applied = coefficients(model, effect.sensor, values)[own]
-            value = coefficients(at_columns, effect.sensor, values)[own]
-            squares += samples.squares_without(columns, value, of_group, applied)
-        sizes.append(_size(effect, np.sqrt(squares / samples.counts.sum()), at_end))
-    return Uncorrected(centre, tuple(sizes))
-
-
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """The columns of one sensor in all windows: means, and factors of the rows about them."""
-
-    counts: np.ndarray
-    """Samples of each window, shape (n_windows,)."""
-    means: np.ndarray
-    """Mean rows of the windows, shape (n_windows, n_columns + 3)."""
-    within: list[np.ndarray]
-    """Factors of the rows about these means, each shape (k, n_columns + 3)."""
-    true_input: slice
-    """Columns of the true input."""
-
-    @classmethod
-    def of(cls, accumulator: AccumulatedRows, sensor: str, true_input: slice) -> '_Samples':
-        """Return the columns of a sensor in the windows of an accumulator."""
-        counts = np.array([row.count for row in accumulator.rows], float)
-        means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
-        within = []
-        for (owner, _), factor in accumulator.within.items():
-            if owner == sensor:
-                within.append(factor)
-        return cls(counts, means, within, true_input)
-
-    def squares_without(
-        self, columns: slice, value: np.ndarray, part: ColumnCentre, applied: np.ndarray
-    ) -> np.ndarray:
-        """
-        Return the sums of squares of the output of an effect less that of the constant part.
-
-        Shape (3,). Coefficients of each axis: `value` of the columns, `applied` of the part, both
-        shape (width, 3).
-        """
-        constant = part.constant @ applied
-        slope = part.slope.T @ applied
-        rest = self.means[:, columns] @ value - constant - self.means[:, self.true_input] @ slope
-        squares = self.counts @ rest**2
-        for factor in self.within:
-            rest = factor[:, columns] @ value - factor[:, self.true_input] @ slope
-            squares += (rest**2).sum(axis=0)
-        return squares
-
-
-def _constant(effect: Effect, columns: np.ndarray) -> ColumnCentre:
+def constant_part(effect: Effect, columns: np.ndarray) -> ColumnCentre:
     """Return the part of columns, shape (width,), that are constant."""
     return ColumnCentre(columns, np.zeros((len(columns), 3)), INPUT_OF[effect.sensor])
-
-
-def _projection(effect: Effect, columns: slice, samples: _Samples) -> ColumnCentre:
-    """
-    Return the part of the columns of an effect that bias and matrix describe.
-
-    It minimises the squares of ``column - constant - slope @ true`` over all samples. An effect in
-    time only is no function of the motion: its mean is the value in another session.
-    """
-    counts, true_input = samples.counts, samples.true_input
-    mean = counts @ samples.means / counts.sum()
-    slope = np.zeros((columns.stop - columns.start, 3))
-    if not in_time(effect):
-        about_mean = np.sqrt(counts)[:, None] * (samples.means - mean)
-        stacked = np.concatenate([about_mean, *samples.within])
-        inputs = stacked[:, true_input]
-        # Directions in which the sensor had no input have no slope.
-        power, directions = np.linalg.eigh(inputs.T @ inputs / counts.sum())
-        directions = directions[:, power > LEAST_INPUT[effect.sensor] ** 2]
-        along = inputs @ directions
-        slope = (directions @ np.linalg.lstsq(along, stacked[:, columns], rcond=None)[0]).T
-    constant = mean[columns] - slope @ mean[true_input]
-    return ColumnCentre(constant, slope, INPUT_OF[effect.sensor])
-
-
-def _moved(effect: Effect, part: ColumnCentre, change: np.ndarray) -> ColumnCentre:
-    """
-    Return the part at parameters that differ by `change` from the point of the columns.
-
-    Of a time constant, to first order: the second half of its columns are the derivatives.
-    """
-    if not effect.time_constant:
-        return part
-    constant, constant_by_tau = np.split(part.constant, 2)
-    slope, slope_by_tau = np.split(part.slope, 2)
-    return replace(
-        part,
-        constant=np.concatenate([constant + change[-1] * constant_by_tau, constant_by_tau]),
-        slope=np.concatenate([slope + change[-1] * slope_by_tau, slope_by_tau]),
-    )
 
 
 def uncorrected_in_time(
@@ -232,20 +87,15 @@ def uncorrected_in_time(
         at_end, at_times = has_settled(latest, effect, end), columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
         for name, columns in applied.items():
-            centre[name] = _constant(effect, columns.mean(axis=0))
+            centre[name] = constant_part(effect, columns.mean(axis=0))
         rows = model.layout(effect.sensor).rows
         rest = sum(
             (at_times[name] - centre[name].constant)
             @ coefficients(model, effect.sensor, values)[rows[name]]
             for name in at_times
         )
-        sizes.append(_size(effect, np.sqrt(np.mean(np.square(rest), axis=0)), at_end))
+        sizes.append(uncorrected_size(effect, np.sqrt(np.mean(np.square(rest), axis=0)), at_end))
     return Uncorrected(centre, tuple(sizes))
-
-
-def end_of(accumulator: AccumulatedRows) -> float:
-    """Return the end of the longest recording, s since its start."""
-    return max(row.time + row.duration / 2 for row in accumulator.rows)
 
 
 def latest_settling(model: SensorModel, values: np.ndarray, sd: np.ndarray) -> SensorModel:
@@ -308,7 +158,8 @@ def columns_at(
     return {group.name: group.columns(ref, model.full_point()) for group in effect.groups}
 
 
-def _size(effect: Effect, rms: np.ndarray, at_end: bool) -> dict[str, Any]:
+def uncorrected_size(effect: Effect, rms: np.ndarray, at_end: bool) -> dict[str, Any]:
+    """Return an entry of `Uncorrected.sizes`; `at_end`: the value at the end is applied."""
     return {
         'effect': effect.name,
         'sensor': effect.sensor,

@@ -1,8 +1,8 @@
 """
-Rows become a solution.
+What estimates of any reference have in common.
 
-In: rows (`accumulated_rows`) and a sensor model. Out: parameters with their covariance, the noise,
-the observable effects. Read `solver` first, `references.rows` for other references than a table;
-the noise is described in `noise_model` and found in `noise_search`. No window, no pose and no table
-is known here.
+In: a sensor model, rows or normal matrices. Out: a `Solution` with its covariance terms, the noise
+model, the observable effects. Read `solution` first, then `noise_model`. The solvers are those of
+the references: `references.turntable.estimation` and `references.rows`. No window, no pose and no
+table is known here.
 """

@@ -15,13 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.distributions import chi2_sf, f_sf
-from imu_calibration.effects.base import Role
-from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
+from imu_calibration.estimation.noise_model import dof_factor
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DRIFT, MODEL_ERROR
-from imu_calibration.estimation.weighted_system import WeightedSystem
 
 MIN_SCATTER_BLOCKS = 8
 """Fewest blocks for an estimate of the scatter."""
@@ -36,13 +33,6 @@ COMMON_ERROR_FACTOR = 1.5
 Factor on the excess variance of a group over noise: model error that is equal in every block causes
 no scatter between blocks.
 """
-COMMON_MEAN_FACTOR = 1.5
-"""
-Factor on the scatter of means in the variance of an accelerometer's bias, which absorbs an error
-with a mean as large as its scatter.
-"""
-NO_BIAS = 30.0
-"""Biases wander with longer correlation times than this, s."""
 LEAST_SHARE_OF_DATA = 1e-6
 """Share of a parameter's variance that must come from the recording."""
 
@@ -65,48 +55,6 @@ class ModelError:
             MODEL_ERROR: scaled + np.diag(self.scatter_variance),
             DRIFT: np.diag(self.drift_variance),
         }
-
-
-def model_error(
-    system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray
-) -> ModelError:
-    """
-    Return the model error from the scatter of parameters between blocks, beyond noise.
-
-    Parameters
-    ----------
-    system : WeightedSystem
-    values : ndarray, shape (n_params,)
-        The estimate.
-    noises : dict
-        Sensor -> NoiseModel of the estimate.
-    free : ndarray of bool, shape (n_params,)
-        Parameters that were estimated.
-
-    """
-    if len(system.accumulator.blocks) < MIN_SCATTER_BLOCKS or not free.any():
-        return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
-    waves = waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free)
-    found, misfits = errors_of_waves(waves, system.model)
-    if 'accelerometer' in misfits:
-        # An error that depends on the attitude has a mean as large as its scatter, absorbed by the
-        # bias
-        offset = system.model.part('accelerometer', Role.OFFSET)
-        found.scatter_variance[offset] += COMMON_MEAN_FACTOR * _scatter_of_means(
-            noises['accelerometer']
-        )
-    return found
-
-
-def _scatter_of_means(noise: NoiseModel) -> float:
-    """
-    Return the variance of the means between windows.
-
-    From offsets and from bias processes too fast for a bias.
-    """
-    return noise.offset_sd**2 + sum(
-        process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS
-    )
 
 
 def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelError, set[str]]:
@@ -151,44 +99,12 @@ def _fisher(p_values: Sequence[float]) -> float:
     return float(chi2_sf(-2 * np.log(np.maximum(p_values, 1e-300)).sum(), 2 * len(p_values)))
 
 
-def _block_scores(
-    system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
-) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the information of each block of windows.
-
-    Shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params).
-    """
-    blocks = system.accumulator.blocks
-    information = np.zeros((len(blocks), len(values), len(values)))
-    gradient = np.zeros((len(blocks), len(values)))
-    block = system.accumulator.block_of(
-        np.array([row.session for row in system.accumulator.rows]), system.times
-    )
-    for sensor in system.sensors:
-        own = coefficients(system.model, sensor, values)
-        slope = coefficient_jacobian(system.model, sensor, values)
-        noise = noises[sensor]
-        white = system.whitened_means(sensor, noise)
-        for number, part in enumerate(blocks):
-            weighed = list(system.weighed_rows(sensor, noise, part))
-            for axis in range(3):
-                # The means of the block's windows, and their centred rows.
-                at = system.columns_and(sensor, axis)
-                centred = [rows[:, at] * weight[axis] for rows, weight in weighed]
-                rows = np.concatenate([white[block == number, axis], *centred])
-                design = rows[:, :-1] @ slope[:, axis]
-                information[number] += design.T @ design
-                gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ own[:, axis])
-    return information, gradient
-
-
 def waves_of_blocks(
     information: np.ndarray,
     gradient: np.ndarray,
     prior_root: np.ndarray,
-    free: np.ndarray,
     *,
+    free: np.ndarray,
     shared: np.ndarray | None = None,
 ) -> 'CosineScores':
     """

@@ -11,6 +11,11 @@ import numpy as np
 
 from imu_calibration.core.units import STANDARD_GRAVITY
 
+NATURAL = 0.5
+"""
+Least sd of every bias process over the white noise of one second, with the first of these
+correlation times.
+"""
 HOUR = 3600.0
 """s; sessions are hardly longer, and changes of a bias over days are constant within a session."""
 SAME_VARIANCE = 0.05

@@ -24,7 +24,6 @@ from imu_calibration.calibration.coverage import (
     seen_of,
     sphere_cells,
 )
-from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
 from imu_calibration.core.progress import LiveState
 from imu_calibration.document.decision import HARMS
 from imu_calibration.nodes.diagnostics import (
@@ -39,6 +38,7 @@ from imu_calibration.nodes.diagnostics import (
 from imu_calibration.nodes.inputs import MatchedInput
 from imu_calibration.preprocessing.stamping import COUNTED, REGULAR
 from imu_calibration.preprocessing.stream_watch import StreamState
+from imu_calibration.references.turntable import live_diagnosis as diagnosis
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,12 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import (
     LiveByHandSettings,
+    LiveSession,
     LiveSettings,
     SolvePacer,
 )
-from imu_calibration.calibration.live_poses import LiveSession
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.document import files
@@ -33,6 +32,7 @@ from imu_calibration.nodes.calibration_status import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, return_freed_memory
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.references.turntable.live_diagnosis import question_about
 from msg_adapters.live import LiveGatherer
 
 DEFAULT_FILE = 'calibration.yaml'

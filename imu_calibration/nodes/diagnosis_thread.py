@@ -7,17 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import (
+from imu_calibration.calibration.from_solution import ModelExtension
+from imu_calibration.calibration.live import SolvePacer
+from imu_calibration.core.progress import LiveState, listening
+from imu_calibration.references.turntable.live_diagnosis import (
     FAILED,
     NOT_YET,
     OFF,
     Answer,
     DiagnosisQuestion,
 )
-from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.live import SolvePacer
-from imu_calibration.core.progress import LiveState, listening
-from imu_calibration.selection.reduced_recording import REDUCING
+from imu_calibration.references.turntable.selection.reduced_recording import REDUCING
 
 THRESHOLD = 256 * 1024
 """

@@ -12,12 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, MATES_KEY, SIZE_KEY
 from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.nodes.diagnostics import LOG_ERROR, LOG_INFO
 from imu_calibration.planning.campaign import Campaign, Suspect
 from imu_calibration.planning.driver import Driver, DriveState
+from imu_calibration.references.turntable.live_diagnosis import FOUND, MATES_KEY, SIZE_KEY
 
 DRIVER_CHECK_SECONDS = 0.05
 """Seconds between two checks of the driver."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document.calibration import Calibration
@@ -21,7 +22,6 @@ from imu_calibration.planning.motion_library import MotionLibrary
 from imu_calibration.planning.planner import Decision, Planner
 from imu_calibration.planning.planning_problem import PlanningProblem
 from imu_calibration.planning.posterior import exact_information
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.questions import special
 from imu_calibration.simulation.profiles import make_profile
 

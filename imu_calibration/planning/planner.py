@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.advice import HOLD_TIME, TURN_RATE, foretold, knowledge_at_first
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.progress import report
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import SensorModel
@@ -27,8 +27,14 @@ from imu_calibration.planning.motion_library import (
 )
 from imu_calibration.planning.planning_problem import PROBABILITY, PlanningProblem
 from imu_calibration.planning.posterior import Posterior
+from imu_calibration.references.gravity.advice import (
+    HOLD_TIME,
+    TURN_RATE,
+    foretold,
+    knowledge_at_first,
+)
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 MAX_PLAN_MOTIONS = 400

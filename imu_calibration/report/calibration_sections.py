@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.installation_angles import AXIS_PAIRS, derive, in_paper_units
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.core.settings import describe
 from imu_calibration.core.units import for_people
@@ -18,7 +19,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import harmed
 from imu_calibration.document.trust import usage
 from imu_calibration.effects.base import PREFIXES, UNITS
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.figures import (
     AFTER,
     AXIS_COLOURS,

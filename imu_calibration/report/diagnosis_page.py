@@ -21,10 +21,10 @@ from imu_calibration.core.units import STANDARD_GRAVITY, for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.verdict import judge, unexplained_text
 from imu_calibration.effects.base import AXES, UNITS
+from imu_calibration.references.turntable.residuals.proposals import Proposal
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
 from imu_calibration.report.observation_texts import OBSERVATION_TEXTS
 from imu_calibration.report.page import render
-from imu_calibration.selection.proposals import Proposal
 
 BINS = 16
 FEW = 200

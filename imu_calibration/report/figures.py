@@ -16,8 +16,8 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
+from imu_calibration.references.turntable.residuals.spectrum import MIN_LINE_POWER
 from imu_calibration.report.page import raised
-from imu_calibration.selection.spectrum import MIN_LINE_POWER
 from imu_calibration.selection.unexplained import Unexplained
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.advice import HandStep, direction_words
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import align
 from imu_calibration.planning.motion_library import MotionKind
 from imu_calibration.planning.planner import Plan
+from imu_calibration.references.gravity.advice import HandStep, direction_words
 from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, INK, Drawn, draw, log_axis
 from imu_calibration.report.page import render
 

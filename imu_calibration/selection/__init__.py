@@ -1,9 +1,7 @@
 """
-Selection of the effects that a recording supports, and analysis of the residual.
+Selection of the effects that the data of any reference support.
 
-The effects are proven on held-out windows.
-
-In: windows, a table and a sensor model. Out: an `Investigation`: the effects named, with their
-evidence, the extended model, and for the unexplained excess its regimes and a proposed formula.
-Read `investigation` first, then `unexplained`.
+In: an `Evidence` and `Question` objects. Out: the effects named, with their scores. Read `search`
+first, then `order_of_tests`. The evidence and its data are those of the references:
+`references.turntable.selection` and `references.rows`.
 """

@@ -8,10 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from imu_calibration.selection.evidence import WindowEvidence
-from imu_calibration.selection.noise_beside_effects import plausible_processes
 from imu_calibration.selection.order_of_tests import without_weakest
-from imu_calibration.selection.parameter_space import scatter_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 
@@ -158,42 +155,6 @@ class Explained:
             remaining = self._rest(sensor, excess_with[sensor])
             shows.append((float(removed[in_part].sum()), float(remaining[in_part].sum())))
         return shows
-
-
-class ExplainedWindows(Explained):
-    """
-    The same on the windows of a table.
-
-    The noise here has no window offsets, and the estimated bias process up to a plausible size. A
-    window that scatters more within than its kind has a less certain mean: one turn about two fast
-    axes among many slow ones.
-
-    Parameters
-    ----------
-    evidence : WindowEvidence
-    search : Search
-
-    """
-
-    def __init__(self, evidence: WindowEvidence, search: Search):
-        recording = evidence.space.recording
-        duration = float(np.ptp(recording.time))
-        noise = {}
-        for sensor, of_sensor in evidence.noise.items():
-            processes = plausible_processes(
-                of_sensor, recording.period, sensor=sensor, duration=duration
-            )
-            noise[sensor] = of_sensor.at_rest_only(*processes)
-        values, _ = evidence.fit(range(evidence.space.size))
-        scatter = scatter_of_each(evidence.space, evidence.noise, values)
-        self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
-        self.n_means = 3.0 * len(recording.windows)
-        self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
-        super().__init__(
-            search,
-            self.floor.unpredicted,
-            dict.fromkeys(evidence.space.sensors, np.array([self.n_means, self.n_within])),
-        )
 
 
 def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:

@@ -14,6 +14,7 @@ from imu_calibration.core.progress import reported
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.evidence import Evidence, agree
 from imu_calibration.selection.questions import Question
 
@@ -516,6 +517,14 @@ class SelectedEffects:
         point = self.point_of_named
         adopted = [question.name for question in self.adopted]
         return {name: point[name] for name in adopted if name in point}
+
+    def clipped_solution(self) -> Solution | None:
+        """
+        Return the solution of a search that found a limit of a sensor, without saturated samples.
+
+        None where it found no limit.
+        """
+        return None
 
     def unexplained_rests(self) -> Mapping[str, Any]:
         """Return sensor -> its residual that no finding explains, and free what it needed."""

@@ -4,24 +4,8 @@ Independent errors of the time stamps, from the scatter of the residual in motio
 The scatter without them.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
-
-JITTER_STEPS = 6
-"""Steps in which the noise at rest and the variance of the stamps are estimated in turn."""
-BOUND_SDS = 3.0
-"""
-Standard deviations above its own estimate to which a sensor limits the variance of the stamps.
-"""
-CLEAR_SDS = 5.0
-"""Standard deviations from which the scatter of a sensor shows errors of the stamps."""
-ALIKE_VARIANCES = 0.3
-"""Largest relative difference of the variances that the two sensors show."""
-MEDIAN_SD = np.sqrt(np.pi / 2)
-"""Standard deviation of a median over that of a mean, Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -58,75 +42,3 @@ def jitter_text(sd: float) -> str:
         f'the stamps have independent errors of {1e6 * sd:.0f} us (1 sd), which explain scatter of'
         ' both sensors in motion'
     )
-
-
-def stamp_jitter(
-    rough: Sequence[np.ndarray], slope: Sequence[np.ndarray], freedom: np.ndarray
-) -> StampJitter:
-    """
-    Return the errors of the stamps from the scatter in motion.
-
-    The sample of a stamp with the error d has the residual ``d dy/dt``. Errors of variance v add
-    ``v mean((dy/dt)^2)`` to the variance within a block, with the same v on all axes of both
-    sensors. Each sensor estimates v as the weighted median of ``(variance - noise) /
-    mean((dy/dt)^2)``; a sensor whose slopes show a smaller v limits that of the other one, because
-    scatter that only one sensor has is not an error of the stamps.
-
-    Parameters
-    ----------
-    rough : sequence of ndarray, shape (b, 3)
-        Per sensor the variance within the blocks by second differences, SI.
-    slope : sequence of ndarray, shape (b, 3)
-        Per sensor the mean square of the predicted output's rate of change, SI.
-    freedom : ndarray, shape (b,)
-        Degrees of freedom of the variances.
-
-    """
-    value, sd = np.array(
-        [_variance(own, steep, freedom) for own, steep in zip(rough, slope, strict=True)]
-    ).T
-    variance = max(min(np.average(value, weights=1 / sd**2), *(value + BOUND_SDS * sd)), 0.0)
-    apart = np.abs(value - variance)
-    alike = (apart < BOUND_SDS * sd) | (apart < ALIKE_VARIANCES * variance)
-    return StampJitter(
-        float(np.sqrt(variance)), bool(np.all(value > CLEAR_SDS * sd) and alike.all())
-    )
-
-
-def jitter_ratio(rough: np.ndarray, slope: np.ndarray, jitter: float) -> np.ndarray:
-    """
-    Return the variance of noise and stamp errors over that of the noise, shape (b, 3).
-
-    The errors of the stamps have the sd `jitter` in s, and the numerator is the variance of noise
-    and errors together.
-    """
-    return 1.0 + jitter**2 * slope / _noise(rough, slope, jitter**2)
-
-
-def _noise(rough: np.ndarray, slope: np.ndarray, variance: float) -> np.ndarray:
-    """
-    Return the variance of the noise of each axis, from its blocks with the smaller slopes.
-
-    Shape (3,).
-    """
-    quiet = slope <= np.median(slope, axis=0)
-    left = np.where(quiet, np.maximum(rough - variance * slope, 0.0), np.nan)
-    return np.maximum(np.nanmedian(left, axis=0), 1e-3 * np.median(rough, axis=0))
-
-
-def _variance(rough: np.ndarray, slope: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
-    """
-    Return (variance of the stamps by one sensor, its standard deviation), s^2.
-
-    The median of chi-square over its degrees of freedom f is ``(1 - 2 / (9 f))^3`` (Wilson and
-    Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
-    """
-    variance, rough = 0.0, rough / (1.0 - 2.0 / (9.0 * np.maximum(freedom, 1.0)))[:, None] ** 3
-    for _ in range(JITTER_STEPS):
-        noise = _noise(rough, slope, variance)
-        ratio = ((rough - noise) / np.maximum(slope, np.finfo(float).tiny)).ravel()
-        weight = (np.sqrt(freedom / 2)[:, None] * slope / (noise + variance * slope)).ravel()
-        order = np.argsort(ratio)
-        share = np.cumsum(weight[order])
-        variance = max(float(ratio[order][np.searchsorted(share, share[-1] / 2)]), 0.0)
-    return variance, MEDIAN_SD / np.sqrt((weight**2).sum() + np.finfo(float).tiny)

@@ -5,7 +5,7 @@ Its size, its correlation, and its regimes in the session.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,35 +14,19 @@ from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.bias_courses import LEAST_WARMING, temperature_courses
-from imu_calibration.selection.explained_share import ExplainedWindows
-from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.questions import Question
-from imu_calibration.selection.reduced_recording import ReducedRecording
-from imu_calibration.selection.residual_blocks import largest_axes
 
+LEAST_OF_AXIS = 0.1
+"""Share of the strongest axis' squares from which another axis has an excess too."""
 SIGNIFICANT_SDS = 5.0
 """Standard deviations above noise from which a rest is significant."""
 MIN_EXPLAINED_WINDOWS = 12
 """Least number of windows; with fewer the model hardly predicts held-out windows."""
-WITHIN_SHARE = 0.02
-"""Least excess of the variance within windows that counts."""
 ALPHA = 1e-4
 """Significance that a correlation must have."""
 IN_MOTION = 'motion (moving windows against windows at rest)'
 """Name of the variable that separates moving windows from windows at rest."""
 CURVES_IN_TIME = 'time'
 """Name of the variable for a polynomial of the time and for steps."""
-MUCH_SCATTER = 10.0
-"""
-Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of
-an axis with a cause of its own.
-"""
-
-LOUD = 0.5
-"""
-Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained
-residual.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,62 +77,6 @@ class Unexplained:
         )
 
 
-def unexplained(
-    problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]
-) -> dict[str, Unexplained]:
-    """Return sensor -> Unexplained for a choice of effects."""
-    excess, used = explained.excess(chosen), problem.search.indices(chosen)
-    values = problem.space.reduced(used, problem.evidence.fit(used)[0])
-    return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in excess}
-
-
-def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> Unexplained:
-    """
-    Return the residual of a sensor.
-
-    As significant if loud tones or the scatter in motion of one axis exceed the noise at rest.
-    """
-    scatter, noise = _scatter_of_one_axis(problem, sensor), problem.noise[sensor].white_variance
-    squares = np.array(scatter)
-    for tone in rest.tones:
-        axis, mean_square = AXES.index(tone.axis), 0.5 * tone.amplitude**2
-        if mean_square > LOUD * noise[axis]:
-            squares[axis] += mean_square
-    if not squares.any():
-        return rest
-    return replace(
-        rest,
-        significant=True,
-        rms=float(np.sqrt(squares.mean())),
-        axes=largest_axes(squares, 0.0),
-        correlates_with=IN_MOTION if scatter.any() else None,
-    )
-
-
-def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
-    """
-    Return the excess variance of moving samples over the noise at rest, shape (3,).
-
-    It is given for an axis that exceeds the remaining axes, otherwise 0.
-
-    Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a
-    cause in the sensor its own axis.
-    """
-    excess = scatter_in_motion(problem, sensor)
-    least = np.maximum(np.median(excess), problem.noise[sensor].at_rest_only().low_variance)
-    return np.where(excess > MUCH_SCATTER * least, excess, 0.0)
-
-
-def scatter_in_motion(problem: LinearisedProblem, sensor: str) -> np.ndarray:
-    """Return the excess variance of moving samples over the noise at rest, shape (3,)."""
-    noise, recording = problem.noise[sensor].at_rest_only(), problem.recording
-    kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
-    if not len(kinds):
-        return np.zeros(3)
-    in_motion = np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts)
-    return np.maximum(in_motion - noise.low_variance, 0.0)
-
-
 def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
     """
     Return bias -> its possible error, for each axis with a significant residual.
@@ -163,51 +91,6 @@ def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dic
             scatter = np.sqrt(np.maximum(np.mean(rest.residual**2 - rest.noise_sd**2, axis=0), 0.0))
             found += [{names[k]: float(scatter[k])} for k in map(AXES.index, rest.axes)]
     return found
-
-
-def _rest(
-    problem: LinearisedProblem,
-    explained: ExplainedWindows,
-    sensor: str,
-    excess: np.ndarray,
-    values: np.ndarray,
-) -> Unexplained:
-    space, recording = problem.space, problem.recording
-    residual = np.stack(
-        [space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1
-    )
-    floor = explained.floor.noise[sensor]
-    white = floor.variance_beside_bias(
-        recording.kind, recording.count, recording.duration, keys=recording.keys
-    )
-    noise_sd = np.sqrt(white + floor.bias_variance)
-    sigma_means, sigma_within = explained.sigma(sensor, excess)
-    # Quiet axes dilute the excess of one.
-    means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
-    sigma = (
-        max(sigma_means, sigma_within)
-        if within > WITHIN_SHARE * explained.n_within
-        else sigma_means
-    )
-    rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
-    significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
-    found = Unexplained(significant, rms, float(sigma), None, 0.0, residual, noise_sd)
-    if not significant:
-        return found
-    if sigma_means <= SIGNIFICANT_SDS:
-        inside = np.mean(
-            [floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])]
-        )
-        return replace(found, rms=float(np.sqrt(inside * within / explained.n_within)))
-    if rms == 0:  # less than biases may wander, and more than neighbours may differ
-        rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
-    # The fit has absorbed a part of the cause, as far as the columns of the model resemble it.
-    fitted = []
-    for axis in range(3):
-        used = np.flatnonzero(values[space.places(sensor, axis)[:-1]])
-        fitted.append(space.mean[sensor][axis][:, used])
-    name, share = correlate(_explanations(recording), residual, noise_sd, fitted=fitted)
-    return replace(found, rms=rms, correlates_with=name, share=share)
 
 
 def correlate(
@@ -269,27 +152,6 @@ def _misfit(design: np.ndarray, values: np.ndarray) -> tuple[float, int]:
     return float(((values - design @ solution) ** 2).sum()), len(values) - int(rank)
 
 
-def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield (name, columns (k, m), windows where they are known)."""
-    describe, every = recording.describe, np.ones(len(recording.kind), bool)
-    yield from slow_explanations(describe['time'], describe['temperature'])
-    yield 'rate', np.stack([describe['rate'], describe['rate'] ** 2], axis=1), every
-    yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
-    for name in describe:
-        if name.startswith('angle'):
-            number = name[len('angle') :]
-            angle, known = describe[name], describe['span' + number] < 0.7
-            turns = []
-            for multiple in (1, 2, 3):
-                turns += [np.cos(multiple * angle), np.sin(multiple * angle)]
-            yield (
-                f'angle of {recording.model.joint_names[int(number)]}',
-                np.stack(turns, axis=1),
-                known,
-            )
-    yield IN_MOTION, recording.moving[:, None].astype(float), every
-
-
 def curves_in_time(time: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the columns of a polynomial of the time and of steps, each shape (k, m)."""
     share = (time - time.mean()) / max(np.ptp(time), 1e-9)
@@ -322,3 +184,12 @@ def slow_explanations(
     yield 'temperature', np.stack([warm, warm**2], axis=1), every
     for course in temperature_courses(time, temperature):
         yield course.name, course.values[:, None], course.known
+
+
+def largest_axes(squares: np.ndarray, least: float = LEAST_OF_AXIS) -> tuple[str, ...]:
+    """
+    Return the axes whose squares exceed the share `least` of the largest, the largest first.
+
+    The squares have the shape (3,).
+    """
+    return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > least * squares.max())

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from imu_calibration.allan.figures import NoiseFigures
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.readings import (
@@ -30,7 +31,6 @@ from imu_calibration.estimation.standard_motions import MOTIONS
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.recordings import (
     Stand,
     Topics,

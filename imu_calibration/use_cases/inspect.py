@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
-from imu_calibration.calibration.gravity_reference import GravityReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
@@ -23,7 +23,7 @@ from imu_calibration.document.outcome import shortcomings
 from imu_calibration.preprocessing.checks import unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.use_cases.choices import calibration_options, topics_of
 from imu_calibration.use_cases.recordings import (
     Stand,

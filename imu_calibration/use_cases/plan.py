@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.table_calibration import calibration_of_saved
 from imu_calibration.core import documents
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.exit_codes import exit_code_of
@@ -41,6 +40,7 @@ from imu_calibration.planning.planner import (
 )
 from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.turntable.table_calibration import calibration_of_saved
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.recordings import Stand

@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any, NamedTuple
 
-from imu_calibration.calibration.gravity_reference import GravityReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import BlockSource, SampleBlock
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
 from imu_calibration.use_cases.recordings import (
     RecordingFile,
@@ -35,7 +35,7 @@ def reference_of(
     if stand is None:
         return GravityReference()
     # Here, because by hand its import is not needed.
-    from imu_calibration.calibration.table_reference import TableReference
+    from imu_calibration.references.turntable.table_reference import TableReference
 
     gravity, spread = options.gravity, options.gravity_sd
     return TableReference(table_of(stand, recordings, topics, gravity=gravity, gravity_sd=spread))

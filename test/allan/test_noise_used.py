@@ -18,9 +18,8 @@ from imu_calibration.allan.document import noise_to_text, position_budget
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, bias_processes
 from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, allan_variance, gauss_markov
 from imu_calibration.allan.terms import TIME_KEY, Term
-from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
-from imu_calibration.calibration.live import LiveCalibration, LiveSettings
-from imu_calibration.calibration.live_poses import LiveByHand
+from imu_calibration.calibration.live import LiveSettings
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.stream import CompensationStream, SampleCompensation
 from imu_calibration.core.errors import InputError
@@ -29,10 +28,12 @@ from imu_calibration.document import files
 from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
-from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.solution import DETERMINED, HELD
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.live_poses import LiveByHand
+from imu_calibration.references.turntable.estimation.noise_search import estimate_offsets
+from imu_calibration.references.turntable.live_diagnosis import question_about
+from imu_calibration.references.turntable.live_windows import LiveCalibration
 from msg_adapters.imu import FIELDS
 from validation.imu_messages import parse_imu
 

@@ -11,9 +11,6 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.hand_recording import read_by_hand
-from imu_calibration.calibration.held_out_windows import HeldOutWindows
-from imu_calibration.calibration.pose_readings import prove_hand_readings
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
@@ -24,6 +21,9 @@ from imu_calibration.effects.forward_equations import centred, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
+from imu_calibration.references.gravity.hand_recording import read_by_hand
+from imu_calibration.references.gravity.pose_readings import prove_hand_readings
+from imu_calibration.references.turntable.held_out_windows import HeldOutWindows
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.write import write_session
 

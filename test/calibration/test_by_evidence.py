@@ -13,29 +13,32 @@ import pytest
 
 import imu_calibration as imu
 from imu_calibration.calibration import by_evidence
-from imu_calibration.calibration.by_evidence import (
-    _moves,
-    _solved_with,
-    extended_solution,
-    stands_out,
-)
+from imu_calibration.calibration.by_evidence import _moves, _solved_with, stands_out
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.table_reference import TableReference
-from imu_calibration.calibration.window_search import baseline_model
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
+from imu_calibration.references.turntable.requested_model import choose_model
+from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
+from imu_calibration.references.turntable.selection import investigation
+from imu_calibration.references.turntable.selection.extended_solution import extended_solution
+from imu_calibration.references.turntable.selection.investigation import investigate
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.rivals import (
+    Rival,
+    same_questions,
+    settle_rivals,
+)
+from imu_calibration.references.turntable.selection.testable_effects import testable_effects
 from imu_calibration.references.turntable.session_data import DecimatedWindows
+from imu_calibration.references.turntable.table_reference import TableReference
+from imu_calibration.references.turntable.window_search import baseline_model
 from imu_calibration.report.diagnosis_page import diagnosis_report
-from imu_calibration.selection import investigation, questions
-from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.residual_analysis import ResidualAnalysis
-from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
+from imu_calibration.selection import questions
 from imu_calibration.selection.search import SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
@@ -189,7 +192,7 @@ def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
     windows, table = calibrated(late[0]).windows, late[1]
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     used = [window for window in windows if window.kind != 'unused']
-    effects = questions.without_saturation(questions.testable_effects(model, table, used)[0])
+    effects = questions.without_saturation(testable_effects(model, table, used)[0])
     linearised_at = partial(
         LinearisedProblem, used, table, model, effects=effects, locked=np.zeros(len(used), bool)
     )

@@ -10,10 +10,10 @@ from test_diagnosis_workflow_by_hand import HIDDEN, NOTHING
 from test_live_by_hand import assert_same, make_live, run
 
 import imu_calibration as imu
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.references.options import CalibrationOptions
 
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES, simulate
 from worlds.physics_hand import hold_and_turn, warmed_up

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.live_windows import LiveCalibration
 
 from worlds.physics import make_session
 from worlds.physics_hand import hold_and_turn

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import yaml
 
-from imu_calibration.calibration import collector as gathering
-from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable import accumulator as least_squares
+from imu_calibration.references.turntable import collector as gathering
+from imu_calibration.references.turntable.collector import GatherStep
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from imu_calibration.use_cases.resources import config_file

@@ -11,29 +11,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.advice import (
-    WEIGHTS,
-    HandStep,
-    _rollout,
-    direction_words,
-    foretold,
-    shortest_turn,
-)
 from imu_calibration.calibration.coverage import (
     DIRECTIONS,
     MIN_CELL_WORTH,
     Coverage,
     Step,
     label_of,
-    table_coverage,
 )
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
-from imu_calibration.calibration.live_poses import (
-    EMPTY_SCAN,
-    LiveByHand,
-    hand_coverage,
-    knowledge_of,
-)
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.outcome import parameter_count
@@ -45,8 +31,22 @@ from imu_calibration.estimation.solution import (
     REMEDIES,
 )
 from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
+from imu_calibration.references.gravity.advice import (
+    WEIGHTS,
+    HandStep,
+    _rollout,
+    direction_words,
+    foretold,
+    shortest_turn,
+)
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.live_poses import (
+    EMPTY_SCAN,
+    LiveByHand,
+    hand_coverage,
+    knowledge_of,
+)
+from imu_calibration.references.turntable.table_coverage import table_coverage
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY
@@ -169,7 +169,7 @@ def test_on_a_table_the_picture_shows_what_the_motion_did():
 @pytest.fixture(scope='module')
 def begun():
     """A table after twenty seconds: (session, result)."""
-    from imu_calibration.calibration.live import LiveCalibration
+    from imu_calibration.references.turntable.live_windows import LiveCalibration
 
     from worlds.live_sessions import OPTIONS as TABLE_OPTIONS
     from worlds.live_sessions import TABLE, make_session
@@ -223,7 +223,7 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
 def test_a_table_with_one_joint_is_told_no_seconds_of_motions_that_it_cannot_do(begun, monkeypatch):
     live, result = begun
     monkeypatch.setattr(
-        'imu_calibration.calibration.coverage.possible_motions',
+        'imu_calibration.references.turntable.table_coverage.possible_motions',
         lambda table: motions_about([0.6, 0.0, 0.8], [0.0, 0.0, 1.0]),
     )
     shown = table_coverage(result)

@@ -15,11 +15,11 @@ from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand, traces_of_poses
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.gravity.diagnosis_of_poses import diagnosis_by_hand, traces_of_poses
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.references.gravity.model_selection import investigate_by_hand
@@ -352,9 +352,9 @@ def test_xsens_counts_tells_no_stories(recordings):
     The gyroscope's answer to gravity is found and predicts.
     """
     from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-    from imu_calibration.calibration.gravity_reference import GravityReference
+    from imu_calibration.calibration.options import CalibrationOptions
     from imu_calibration.core.readings import RawReadings
-    from imu_calibration.references.options import CalibrationOptions
+    from imu_calibration.references.gravity.gravity_reference import GravityReference
     from msg_adapters.bag import open_recording
 
     options = CalibrationOptions(

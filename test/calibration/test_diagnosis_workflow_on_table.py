@@ -18,11 +18,12 @@ from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.selection import questions
-from imu_calibration.selection.evidence import locked_windows
-from imu_calibration.selection.gain import APPLIED, OF_MODEL, heldout_gain
-from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.residual_analysis import inquire
+from imu_calibration.references.turntable.residuals.residual_analysis import inquire
+from imu_calibration.references.turntable.selection.investigation import investigate
+from imu_calibration.references.turntable.selection.testable_effects import testable_effects
+from imu_calibration.references.turntable.selection.window_evidence import locked_windows
+from imu_calibration.references.turntable.selection.window_gain import heldout_gain
+from imu_calibration.selection.gain import APPLIED, OF_MODEL
 
 from worlds.candidates import FEW, with_candidates
 from worlds.diagnosing import diagnose
@@ -144,7 +145,7 @@ def test_document_holds_what_the_contract_asks_for(sizes):
     assert set(finding['gain']) >= {'heldout_rms_before', 'heldout_rms_after', 'reduction', 'ci95'}
     assert document['baseline']['accelerometer']['effects'] == ['bias', 'matrix']
     used = [window for window in recording.windows if window.kind != 'unused']
-    _, not_testable = questions.testable_effects(recording.model, recording.table, used)
+    _, not_testable = testable_effects(recording.model, recording.table, used)
     assert {entry['effect'] for entry in not_testable} == {'earth_rate'} | {
         f'{short}_{what}'
         for short in ('accel', 'gyro')

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.table_calibration import KeptRecording, recordings_on_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable import session_data
+from imu_calibration.references.turntable.table_calibration import (
+    KeptRecording,
+    recordings_on_table,
+)
 
 from worlds.misfit_coverage import COARSE
 from worlds.misfit_worlds import make_pair

@@ -9,8 +9,6 @@ import pytest
 from refusal import refused
 
 from imu_calibration import calibrate
-from imu_calibration.calibration.from_solution import motions_needed
-from imu_calibration.calibration.latitude_check import WindowRates, latitude_findings
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -18,6 +16,8 @@ from imu_calibration.estimation.solution import AZIMUTH_REMEDY, PLACE_REMEDY
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import NOTE
+from imu_calibration.references.turntable.latitude_check import WindowRates, latitude_findings
+from imu_calibration.references.turntable.needs import motions_needed
 from imu_calibration.simulation.session import turning_world
 
 from worlds.candidates import FEW

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration import collector
 from imu_calibration.calibration.calibrate import conclude
-from imu_calibration.calibration.live import LiveCalibration, LiveSettings, SolvePacer
-from imu_calibration.calibration.table_calibration import (
-    calibrate_on_table,
-    solved_windows,
-)
-from imu_calibration.calibration.window_observations import WindowObservations
+from imu_calibration.calibration.live import LiveSettings, SolvePacer
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.preprocessing.stream_watch import StreamWatch
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable import collector
+from imu_calibration.references.turntable.live_windows import LiveCalibration
+from imu_calibration.references.turntable.table_calibration import (
+    calibrate_on_table,
+    solved_windows,
+)
+from imu_calibration.references.turntable.window_observations import WindowObservations
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 

@@ -14,22 +14,23 @@ from test_live_calibration import assert_same, blocks
 
 from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-from imu_calibration.calibration.diagnosis.live_diagnosis import (
-    Answer,
-    live_state_of,
-    question_about,
-)
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.live import LiveCalibration, LiveSettings
-from imu_calibration.calibration.table_calibration import TableRecordings
-from imu_calibration.calibration.table_reference import TableReference
+from imu_calibration.calibration.live import LiveSettings
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.progress import LiveState, report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.live_diagnosis import (
+    Answer,
+    live_state_of,
+    question_about,
+)
+from imu_calibration.references.turntable.live_windows import LiveCalibration
+from imu_calibration.references.turntable.table_calibration import TableRecordings
+from imu_calibration.references.turntable.table_reference import TableReference
 
 from ros.threads import until
 from worlds import physics

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, question_about
-from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.live_diagnosis import FOUND, question_about
+from imu_calibration.references.turntable.live_windows import LiveCalibration
 from imu_calibration.references.turntable.session_data import MAX_LIVE_SAMPLES
 
 from worlds.live_sessions import TABLE, TOLERANCES, make_session

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.mount_check import common_turn_deg, mount_findings
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.rotations import nearest_rotation, rotation, rotation_vector
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING
+from imu_calibration.references.turntable.mount_check import common_turn_deg, mount_findings
 
 
 def table(mount_rpy_deg=(0.0, 0.0, 0.0)):

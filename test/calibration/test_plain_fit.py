@@ -22,15 +22,15 @@ from imu_calibration.calibration.diagnosis.diagnose import (
 )
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.calibration.held_out_data import PlainFit
-from imu_calibration.calibration.table_calibration import recordings_on_table
-from imu_calibration.calibration.window_readings import errors_on_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.table_calibration import recordings_on_table
+from imu_calibration.references.turntable.window_readings import errors_on_table
 from imu_calibration.references.turntable.window_statistics import reduce_window
 
 from worlds import misfit_worlds

@@ -9,14 +9,14 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.held_out_data import PlainFit
-from imu_calibration.calibration.pose_readings import errors_by_hand
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
+from imu_calibration.references.gravity.pose_readings import errors_by_hand
 
 from worlds.compensation_cases import with_values
 from worlds.hand_sessions import GRAVITY, simulate

@@ -11,9 +11,9 @@ from imu_calibration.document.proof_entry import RegimeErrors
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldOut
 from imu_calibration.references.turntable.window_statistics import Regime, moving_pieces
 from imu_calibration.use_cases.calibrate import calibrate_recordings

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.held_out_poses import (
-    HAND_PROOF_FOLDS,
-    HeldOutPoses,
-    folds_by_hand,
-    values_without,
-)
 from imu_calibration.calibration.proof import prove
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS, decide
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
+from imu_calibration.references.gravity.held_out_poses import (
+    HAND_PROOF_FOLDS,
+    HeldOutPoses,
+    folds_by_hand,
+    values_without,
+)
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.candidates import FEW

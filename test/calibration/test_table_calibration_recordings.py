@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.table_reference import TableReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import from_text
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 from msg_adapters.bag import open_recording
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]

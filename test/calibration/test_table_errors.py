@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.table_reference import TableReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.show import warn
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
@@ -15,7 +14,8 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import NOTE
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import (
     SimulationOptions,

@@ -8,8 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import imu_calibration as imu
-from imu_calibration.calibration.advice import _Excesses, _without_motion
-from imu_calibration.calibration.live_poses import _needs
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import MILLI_G
 from imu_calibration.document.calibration import surpassed_limit
@@ -25,6 +23,8 @@ from imu_calibration.estimation.solution import (
     TURNS_REMEDY,
 )
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS
+from imu_calibration.references.gravity.advice import _Excesses, _without_motion
+from imu_calibration.references.gravity.live_poses import _needs
 
 from worlds.compensation_cases import random_calibration
 from worlds.hand_sessions import GRAVITY, simulate

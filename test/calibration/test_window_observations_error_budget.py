@@ -10,9 +10,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.window_observations import (
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.chain import tilt
+from imu_calibration.references.turntable.collector import GatherStep
+from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.window_observations import (
     JOINT_POSITION_SD,
     _faster,
     _heavier,
@@ -21,11 +26,6 @@ from imu_calibration.calibration.window_observations import (
     error_budget,
     parameter_shifts,
 )
-from imu_calibration.core.samples import SampleBlock
-from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solver import solve
-from imu_calibration.kinematics.chain import tilt
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
@@ -137,7 +137,8 @@ def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):
 def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result, monkeypatch):
     small = result.error_budget()
     monkeypatch.setattr(
-        'imu_calibration.calibration.window_observations.JOINT_POSITION_SD', 10 * JOINT_POSITION_SD
+        'imu_calibration.references.turntable.window_observations.JOINT_POSITION_SD',
+        10 * JOINT_POSITION_SD,
     )
     large = result.error_budget()
     assert small.total**2 == pytest.approx(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.from_solution import motions_needed
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
@@ -27,6 +26,7 @@ from imu_calibration.estimation.solution import (
 )
 from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.needs import motions_needed
 from imu_calibration.references.turntable.window_statistics import Regime
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.compensate import compensate_recording

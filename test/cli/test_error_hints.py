@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.live_poses import PoseScan, hand_status
 from imu_calibration.cli.main import main
 from imu_calibration.cli.parser import VERBS, make_parser
 from imu_calibration.core.errors import ERROR_KEYS, InputError, with_hint
@@ -25,6 +24,7 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.estimation.solution import COMMON_SCALE, GRAVITY, REMEDIES
 from imu_calibration.nodes.lifecycle import HINTS
 from imu_calibration.preprocessing.joint_checks import check_force
+from imu_calibration.references.gravity.live_poses import PoseScan, hand_status
 from msg_adapters.write import write_session
 
 ROOT = Path(__file__).resolve().parents[2]

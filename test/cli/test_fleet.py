@@ -13,7 +13,6 @@ import pytest
 import yaml
 from refusal import refused
 
-from imu_calibration.calibration.fleet import UnitResult, summarise
 from imu_calibration.cli.fleet_run import fleet_unit_rows, summary_html
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
@@ -21,6 +20,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.files import read_calibration
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.fleet import UnitResult, summarise
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from imu_calibration.use_cases.resources import config_file

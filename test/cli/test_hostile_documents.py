@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from refusal import refused as expected
 
-from imu_calibration.calibration.collector import from_bytes
 from imu_calibration.cli.fleet_run import csv_text, fleet_unit_rows
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import DocumentError, InputError
@@ -22,6 +21,7 @@ from imu_calibration.document.exports.export import export, find_target
 from imu_calibration.document.files import make_folder, write_text
 from imu_calibration.kinematics.urdf import root_of
 from imu_calibration.references.gravity.sample_store import HandStore
+from imu_calibration.references.turntable.collector import from_bytes
 from imu_calibration.report.figures import draw
 from msg_adapters.imu import IMU_TYPE
 

@@ -11,13 +11,13 @@ from fuzz import readers
 from refusal import refused
 
 from imu_calibration.allan.document import noise_from_text
-from imu_calibration.calibration.collector import _SavedNumbers, _unpacked
 from imu_calibration.cli.fleet_run import csv_text
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.document.exports.affine import undone
 from imu_calibration.document.exports.export import find_target
 from imu_calibration.document.exports.loss import import_file
 from imu_calibration.effects.expressions import as_text
+from imu_calibration.references.turntable.collector import _SavedNumbers, _unpacked
 from imu_calibration.report.page import render
 from msg_adapters.decode import OTHER_FRAME, FrameChoice
 

@@ -7,8 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.gravity_reference import GravityReference
-from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT, dropped_text
@@ -28,6 +26,8 @@ from imu_calibration.document.trust import caveats, refused_sensors
 from imu_calibration.document.verdict import judge
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding
+from imu_calibration.references.gravity.gravity_reference import GravityReference
+from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.use_cases.inspect import RecordingSummary
 
 PROOF = {

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -32,6 +31,7 @@ from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.reference_texts import ACCELEROMETER_AXES
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration

@@ -18,7 +18,6 @@ import pytest
 from refusal import refused
 
 import imu_calibration as imu
-from imu_calibration.calibration.collector import from_bytes, require_columns, to_bytes
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
@@ -33,6 +32,7 @@ from imu_calibration.effects.forward_equations import (
     sensor_output,
 )
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.references.turntable.collector import from_bytes, require_columns, to_bytes
 from tools.tolerance_file import rendered
 
 from worlds.candidates import FEW

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.diagnosis.live_diagnosis import live_state_of
 from imu_calibration.core.units import STANDARD_GRAVITY as G
 from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.live_diagnosis import live_state_of
 
 from worlds import physics
 from worlds.candidates import FEW

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.window_statistics import reduce_window
 
 GRAVITY, NOISE, LENGTH = 9.81, 1e-3, 200

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel, parse_reference
 from imu_calibration.estimation.solution import shrunk
-from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 
 from worlds.misfit_coverage import calibrated, clean
@@ -136,7 +136,7 @@ def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
 
 def test_options_know_what_is_there_unasked():
     """A size effect that was asked for does not shrink."""
-    from imu_calibration.calibration.table_calibration import _by_default
+    from imu_calibration.references.turntable.table_calibration import _by_default
 
     model = SensorModel(
         accelerometer=('bias', 'matrix', 'accel_size_effect'),

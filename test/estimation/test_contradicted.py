@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.document.verdict import _left_out
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowKind
 from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.collector import from_bytes, to_bytes
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 
@@ -128,7 +128,7 @@ def test_what_is_frequent_is_how_the_recording_is(session):
 def test_a_session_that_goes_on_leaves_out_the_same(session):
     """Nothing but the accumulator is needed: live, after a restart, with any number of windows."""
     total = accumulated(leaned(session.windows, numbers(session.windows, WindowKind.STATIC)[5:6]))
-    again = from_bytes(to_bytes(SessionData(total), MODEL))[0].accumulator
+    again = from_bytes(to_bytes(SessionData(accumulator=total), MODEL))[0].accumulator
     first, second = solve(total, MODEL), solve(again, MODEL)
     assert first.noise['accelerometer'].left_out == second.noise['accelerometer'].left_out
     np.testing.assert_array_equal(first.values, second.values)

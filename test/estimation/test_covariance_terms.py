@@ -141,7 +141,7 @@ def test_offsets_of_windows_are_a_term_apart_from_white_noise(by_table):
     """
     Without bias processes, offsets and differences between recordings the second term vanishes.
     """
-    from imu_calibration.estimation.solver import solve
+    from imu_calibration.references.turntable.estimation.solver import solve
 
     solution, accumulator = by_table.solution, by_table.gathered.accumulator
     white = {

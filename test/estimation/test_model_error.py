@@ -9,19 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.model_error import (
-    MIN_SCATTER_BLOCKS,
-    NO_BIAS,
-    CosineScores,
-    errors_of_waves,
-)
-from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, CosineScores, errors_of_waves
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable import accumulator as accumulator_module
 from imu_calibration.references.turntable.accumulator import Accumulator, restrict
+from imu_calibration.references.turntable.collector import from_bytes, to_bytes
+from imu_calibration.references.turntable.estimation.model_error_of_windows import NO_BIAS
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 
@@ -189,7 +185,7 @@ def test_copies_and_merged_systems_go_their_own_way(windows):
 def test_blocks_survive_a_restart(windows):
     """A session that goes on where it was saved has the same standard deviations."""
     total = accumulated(measured(windows, lambda share: 5e-3 * share, 1))
-    again = from_bytes(to_bytes(SessionData(total), MODEL))[0].accumulator
+    again = from_bytes(to_bytes(SessionData(accumulator=total), MODEL))[0].accumulator
     first, second = solve(total, MODEL), solve(again, MODEL)
     assert np.any(grown(first) > 1.0)
     np.testing.assert_array_equal(first.sd, second.sd)

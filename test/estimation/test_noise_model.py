@@ -17,8 +17,12 @@ from imu_calibration.estimation.noise_model import (
     ReferenceNoise,
     dof_factor,
 )
-from imu_calibration.estimation.session_noise import least_misfit, misfit_along, white_noise
-from imu_calibration.selection.saturation import sample_sd_at_rest
+from imu_calibration.references.turntable.estimation.session_noise import (
+    least_misfit,
+    misfit_along,
+    white_noise,
+)
+from imu_calibration.references.turntable.selection.saturation import sample_sd_at_rest
 from imu_calibration.simulation.sensor_noise import gauss_markov_samples
 
 

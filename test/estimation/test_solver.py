@@ -12,9 +12,9 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.forward_equations import References, coefficients, columns, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import make_prior
-from imu_calibration.estimation.solver import solve
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.accumulator import Accumulator, restrict
+from imu_calibration.references.turntable.estimation.solver import solve
 
 from worlds.scatter import (
     FULL,

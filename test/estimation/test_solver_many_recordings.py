@@ -12,11 +12,11 @@ from imu_calibration.calibration.by_evidence import _findings_of_others_only
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.forward_equations import References, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise

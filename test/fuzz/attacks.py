@@ -13,9 +13,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from fuzz.mutation import mutated
 
-from imu_calibration.calibration.collector import SAVED_FORMAT
 from imu_calibration.cli.fleet_run import csv_text
 from imu_calibration.effects.expressions import FUNCTIONS, PLACES
+from imu_calibration.references.turntable.collector import SAVED_FORMAT
 from msg_adapters.definitions import standard_definition
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.mcap_file import MAGIC

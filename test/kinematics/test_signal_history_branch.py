@@ -13,7 +13,9 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.signal_history import HALF_WIDTH, ThermalBranch
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.selection.questions import testable_effects as asked_of
+from imu_calibration.references.turntable.selection.testable_effects import (
+    testable_effects as asked_of,
+)
 
 from worlds.compensation_cases import random_calibration
 from worlds.diagnosing import diagnose

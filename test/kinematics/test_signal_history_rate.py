@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.table_reference import TableReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.trust import MEAN
 from imu_calibration.effects.catalogue import CATALOGUE, term
@@ -15,8 +14,9 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.signal_history import TemperatureSlope
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.selection.formulas import grammar
+from imu_calibration.references.turntable.residuals.formulas import grammar
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 
 from worlds.candidates import FEW
 from worlds.physics import make_session

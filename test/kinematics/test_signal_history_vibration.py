@@ -11,12 +11,14 @@ import pytest
 from imu_calibration.compensation.stream import CompensationStream, SampleCompensation
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.session_noise import white_noise
 from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.turntable.estimation.session_noise import white_noise
+from imu_calibration.references.turntable.selection.testable_effects import (
+    testable_effects as asked_of,
+)
 from imu_calibration.references.turntable.window_statistics import reduce_windows
-from imu_calibration.selection.questions import testable_effects as asked_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, answered, simulate_session

@@ -13,12 +13,12 @@ import yaml
 from test_hand_calibration import GRAVITY, simulate
 
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.table_reference import TableReference
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SESSION_START_NS
 from msg_adapters.bag import open_recording
@@ -28,7 +28,7 @@ from worlds import physics
 from worlds.live_sessions import OPTIONS, TABLE, assert_same, make_session
 
 pytest.importorskip('rclpy')
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
+from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 
 from ros.live_station import Station, taken
 

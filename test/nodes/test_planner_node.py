@@ -10,7 +10,6 @@ import pytest
 import yaml
 from refusal import refused
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import override
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
@@ -24,6 +23,7 @@ from imu_calibration.nodes.planner_worker import (
 )
 from imu_calibration.planning.campaign import Suspect
 from imu_calibration.planning.driver import DriverSettings, DriveState
+from imu_calibration.references.turntable.live_diagnosis import FOUND
 
 from ros.live_station import ROOT, TABLE, Station
 from ros.one_process import OneProcess

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refusal import refused
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.solution import DETERMINED
@@ -32,7 +33,7 @@ from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.path_watch import PathWatch
 from imu_calibration.planning.planner import Decision
 from imu_calibration.planning.planning_problem import noise_of_grade
-from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import (

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from refusal import refused
 
-from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
@@ -27,7 +27,8 @@ from imu_calibration.planning.motion_library import MotionKind, MotionLibrary
 from imu_calibration.planning.planner import GOAL_REACHED, make_planner
 from imu_calibration.planning.planning_problem import LEAST_RESTS, PlanningProblem, noise_of_grade
 from imu_calibration.planning.posterior import SAMPLING, WindowPredictor, exact_information
-from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.live_windows import LiveCalibration
+from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.references.turntable.window_statistics import batch_statistics
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.profiles import make_profile

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.preprocessing.checks import Preflight
@@ -14,6 +13,7 @@ from imu_calibration.preprocessing.counter_overflow import (
     longer_gaps,
     without_overflows,
 )
+from imu_calibration.references.gravity.hand_recording import read_by_hand
 from msg_adapters.csv_log import read_csv
 
 from worlds.calibrated_by_hand import calibrated

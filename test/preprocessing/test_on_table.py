@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
@@ -22,6 +21,7 @@ from imu_calibration.preprocessing.on_table import (
     signs_or_delay,
 )
 from imu_calibration.preprocessing.window import Window, WindowKind
+from imu_calibration.references.turntable.live_windows import LiveCalibration
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.diagnose import diagnose
 

@@ -8,9 +8,6 @@ from refusal import refused
 
 from imu_calibration.allan.identify import figures_of, identify_noise
 from imu_calibration.calibration.check import check_errors
-from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.hand_recording import read_by_hand
-from imu_calibration.calibration.pose_readings import errors_by_hand
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.outcome import exit_code, shortcomings
@@ -18,6 +15,9 @@ from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
+from imu_calibration.references.gravity.hand_recording import read_by_hand
+from imu_calibration.references.gravity.pose_readings import errors_by_hand
+from imu_calibration.references.turntable.collector import GatherStep
 from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.calibrated_by_hand import OPTIONS, calibrated

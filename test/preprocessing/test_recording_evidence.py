@@ -495,10 +495,10 @@ def test_a_joint_that_counts_backwards_is_named(capsys, tmp_path, session):
 
 def test_counts_against_the_joints(capsys, tmp_path, session, table):
     """Seven times too fast is neither deg/s nor rad/s; the joints know."""
-    from imu_calibration.calibration.collector import Collector
     from imu_calibration.effects.sensor_model import SensorModel
     from imu_calibration.kinematics.table import Table
     from imu_calibration.preprocessing.joint_checks import against_joints
+    from imu_calibration.references.turntable.collector import Collector
 
     model, description = (
         SensorModel(joint_names=session.joints.names),

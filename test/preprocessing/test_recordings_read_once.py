@@ -12,16 +12,16 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-from imu_calibration.calibration.gravity_reference import GravityReference
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
-from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.table_reference import TableReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files, verdict
 from imu_calibration.estimation import observability
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.gravity_reference import GravityReference
+from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.bag import Recording
@@ -82,7 +82,7 @@ def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, 
         assert len(windows) >= 10
         raise ImuCalibrationError(code='enough')
 
-    monkeypatch.setattr('imu_calibration.calibration.window_search.inquire', enough)
+    monkeypatch.setattr('imu_calibration.references.turntable.window_search.inquire', enough)
     with refused(ImuCalibrationError, 'enough'):
         diagnose_recording(source_of(BAG, Topics(), table.joint_names), TableReference(table))
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0

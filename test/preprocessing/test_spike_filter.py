@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.hand_recording import read_by_hand
-from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.hand_recording import read_by_hand
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 
 from worlds.candidates import FEW
 from worlds.cleaning import clean_samples

@@ -7,9 +7,9 @@ What of it can be known, and that the rest of the calibration does not suffer.
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.estimation.solution import HELD, WEAK
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 
 from worlds.arm_worlds import calibrated, deviations, in_our_axes, make_arm_world, truth
 from worlds.arms import SEVEN_AXES, SIX_AXES

@@ -10,8 +10,8 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.live import LiveByHandSettings
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples
@@ -19,6 +19,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import normal_gravity
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.preprocessing.rest_detection import find_still
+from imu_calibration.references.gravity.advice import missing_motion
 from imu_calibration.references.gravity.equations import GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.references.gravity.hand_calibration import GAUGE, calibrate_by_hand
@@ -28,7 +29,6 @@ from imu_calibration.references.gravity.hand_parameters import (
     KnownTurn,
     hand_options,
 )
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.rows.group_variances import estimate_group_variances, student_factor
 from imu_calibration.use_cases.choices import calibration_options
 
@@ -527,7 +527,7 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
 
 
 def load(recordings, name, topic=None):
-    from imu_calibration.calibration.hand_recording import read_by_hand
+    from imu_calibration.references.gravity.hand_recording import read_by_hand
     from msg_adapters.bag import open_recording
 
     return read_by_hand(open_recording(recordings / name, topic, want_joints=False).blocks()).imu

@@ -13,14 +13,14 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 from test_hand_calibration import GRAVITY, load, simulate
 
-from imu_calibration.calibration.advice import missing_motion
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
-from imu_calibration.calibration.live_poses import FACE_DIRECTIONS, LiveByHand, unseen
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.advice import missing_motion
+from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
+from imu_calibration.references.gravity.live_poses import FACE_DIRECTIONS, LiveByHand, unseen
 
 from worlds.candidates import FEW
 from worlds.physics_table import stand_up

@@ -7,7 +7,7 @@ import pytest
 from refusal import refused
 from scipy.ndimage import gaussian_filter1d
 
-from imu_calibration.calibration.gravity_reference import GravityReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.rest_noise import (
@@ -19,9 +19,9 @@ from imu_calibration.document.rest_noise import (
 )
 from imu_calibration.document.verdict import _step_of, judge
 from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY
+from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.references.gravity.sway import sway_at_rest
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.advice import missing_motion
-from imu_calibration.calibration.hand_recording import HandRecording, read_by_hand
-from imu_calibration.calibration.hand_workflow import calibrate_poses
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
@@ -23,6 +21,7 @@ from imu_calibration.estimation.solution import of_fit, reasons_held, with_weak_
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import find_still
+from imu_calibration.references.gravity.advice import missing_motion
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
@@ -32,13 +31,14 @@ from imu_calibration.references.gravity.hand_parameters import (
     HandOptions,
     hand_options,
 )
+from imu_calibration.references.gravity.hand_recording import HandRecording, read_by_hand
+from imu_calibration.references.gravity.hand_workflow import calibrate_poses
 from imu_calibration.references.gravity.poses import (
     at_range_end,
     average_poses,
     rising,
     sample_times,
 )
-from imu_calibration.references.options import CalibrationOptions
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth, unpack
 from worlds.hand_trials import clean, jitter

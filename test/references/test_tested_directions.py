@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.held_out_poses import HeldOutPoses, folds_by_hand
 from imu_calibration.calibration.proof import prove
 from imu_calibration.document.decision import HELPS, UNPROVEN, decide
 from imu_calibration.effects.sensor_model import BASE, SensorModel
@@ -20,6 +19,7 @@ from imu_calibration.references.gravity.hand_parameters import (
     HandModel,
     HandOptions,
 )
+from imu_calibration.references.gravity.held_out_poses import HeldOutPoses, folds_by_hand
 from imu_calibration.references.gravity.tested_directions import fit_placements, placements_demand
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from blank_canvas import BlankCanvas
 
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
-from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import with_sd
 from imu_calibration.effects.base import Role
@@ -23,8 +22,9 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics import strapdown
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 from imu_calibration.references.turntable.accumulator import restrict
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.report import figures
 from imu_calibration.report.calibration_sections import (
     autocorrelation,

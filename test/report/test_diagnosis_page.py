@@ -15,14 +15,15 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
-from imu_calibration.calibration.table_reference import TableReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.residuals.proposals import Proposal
+from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.report.diagnosis_page import (
     cause_of,
     diagnosis_report,
@@ -32,7 +33,6 @@ from imu_calibration.report.diagnosis_page import (
 )
 from imu_calibration.report.page import chance
 from imu_calibration.selection.gain import APPLIED, Gain
-from imu_calibration.selection.proposals import Proposal
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session

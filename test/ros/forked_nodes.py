@@ -15,9 +15,9 @@ import sys
 from examples.processes import NodeProcesses, node_command
 
 PRELOADED = (
-    'imu_calibration.calibration.diagnosis.live_diagnosis',
+    'imu_calibration.references.turntable.live_diagnosis',
     'imu_calibration.calibration.live',
-    'imu_calibration.calibration.live_poses',
+    'imu_calibration.references.gravity.live_poses',
     'imu_calibration.compensation.health',
     'imu_calibration.compensation.stream',
     'imu_calibration.compensation.unit_gate',

@@ -12,21 +12,28 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.applied_gain import gains_of_formulas
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.cli.main import main
 from imu_calibration.document import files
 from imu_calibration.effects.expressions import ColumnGroup
-from imu_calibration.selection import proposals
-from imu_calibration.selection.formulas import grammar
+from imu_calibration.references.turntable.applied_gain_of_windows import gains_of_formulas
+from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
+from imu_calibration.references.turntable.residuals import proposals
+from imu_calibration.references.turntable.residuals.formulas import grammar
+from imu_calibration.references.turntable.residuals.proposals import find_formulas, propose
+from imu_calibration.references.turntable.residuals.residual_analysis import (
+    ResidualAnalysis,
+    without_superseded,
+)
+from imu_calibration.references.turntable.residuals.residual_blocks import (
+    BlockFits,
+    share_interval,
+    share_removed,
+)
+from imu_calibration.references.turntable.residuals.window_regimes import find_regimes
+from imu_calibration.references.turntable.residuals.window_variables import variables_of
+from imu_calibration.references.turntable.selection.investigation import investigate
 from imu_calibration.selection.gain import APPLIED, SAMPLES
-from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.proposals import find_formulas, propose
-from imu_calibration.selection.regime_variables import variables_of
-from imu_calibration.selection.regimes import find_regimes
-from imu_calibration.selection.residual_analysis import ResidualAnalysis, without_superseded
-from imu_calibration.selection.residual_blocks import BlockFits, share_interval, share_removed
 
 from worlds import physics
 from worlds.beyond_catalogue import row_of

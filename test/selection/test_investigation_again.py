@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from imu_calibration.selection import investigation
-from imu_calibration.selection.investigation import LEFT, LEFT_BEFORE
+from imu_calibration.references.turntable.selection import investigation
+from imu_calibration.references.turntable.selection.investigation import LEFT, LEFT_BEFORE
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.reference_effects import total_lags
-from imu_calibration.selection import lag_explanations
-from imu_calibration.selection.lag_explanations import (
+from imu_calibration.references.turntable.selection import lag_explanations
+from imu_calibration.references.turntable.selection.lag_explanations import (
     MAX_CLOCK_LOSS,
     Explanation,
     LagExplanations,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.effects.base import Role
-from imu_calibration.selection.investigation import investigate
+from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
+from imu_calibration.references.turntable.selection.investigation import investigate
 
 from worlds.candidates import with_candidates
 from worlds.hiding import record

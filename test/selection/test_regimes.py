@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.references.turntable.residuals import window_regimes
+from imu_calibration.references.turntable.residuals.residual_blocks import BlockFits, RestBlocks
 from imu_calibration.selection import regimes
 from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.residual_blocks import BlockFits, RestBlocks
 from imu_calibration.selection.stamp_jitter import StampJitter
 
 WINDOWS, EACH = 60, 4
@@ -54,13 +55,15 @@ def found_in(monkeypatch, rest_of_x, rough_of_x=1.0):
     rough[:, 0] *= rough_of_x
     blocks = blocks_of(rest, rough)
     monkeypatch.setattr(
-        regimes, 'variables_of', lambda blocks, names: ranged('time', TIME, 's', starts=STARTS)
+        window_regimes,
+        'variables_of',
+        lambda blocks, names: ranged('time', TIME, 's', starts=STARTS),
     )
     problem = SimpleNamespace(
         space=SimpleNamespace(prior_sd=np.array([100.0]), prior_mean=np.zeros(1)),
         recording=SimpleNamespace(kind=np.array(['swing'] * WINDOWS)),
     )
-    return regimes.find_regimes(blocks, problem, [0], joint_names=())
+    return window_regimes.find_regimes(blocks, problem, [0], joint_names=())
 
 
 @pytest.mark.parametrize('first', [122, 127])

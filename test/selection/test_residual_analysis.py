@@ -5,7 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.selection.residual_analysis import ResidualAnalysis, superseded
+from imu_calibration.references.turntable.residuals.residual_analysis import (
+    ResidualAnalysis,
+    superseded,
+)
 
 PLACE = np.arange(8) < 3
 """Blocks of the regime, shape (b,)."""

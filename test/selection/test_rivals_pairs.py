@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.selection import investigation
+from imu_calibration.references.turntable.selection import investigation
+from imu_calibration.references.turntable.selection.rivals import _Blocks, best_pairs
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.rivals import _Blocks, best_pairs
 from imu_calibration.selection.search import PENALTY, Search
 
 NAMES = ('accel_quadratic', 'accel_cubic', 'accel_cross_product', 'accel_scale_asymmetry')

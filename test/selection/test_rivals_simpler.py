@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.selection import rivals as module
+from imu_calibration.references.turntable.selection import rivals as module
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Score
 

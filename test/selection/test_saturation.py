@@ -11,8 +11,12 @@ from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.selection import investigation, saturation
-from imu_calibration.selection.saturation import find_saturation, may_be_clipped, without_clipped
+from imu_calibration.references.turntable.selection import investigation, saturation
+from imu_calibration.references.turntable.selection.saturation import (
+    find_saturation,
+    may_be_clipped,
+    without_clipped,
+)
 from msg_adapters.bag import open_recording
 
 from worlds.misfit_worlds import make_pair

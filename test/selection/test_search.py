@@ -16,32 +16,33 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.noise_likelihood import FLICKER_MARK, NoiseLikelihood
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
-from imu_calibration.estimation.noise_search import BiasProcessSearch
-from imu_calibration.selection import gain, investigation
-from imu_calibration.selection import unexplained as rests
-from imu_calibration.selection.evidence import (
-    MOST_FITS,
-    Evidence,
-    WindowEvidence,
-    folds_of,
-    locked_windows,
-)
-from imu_calibration.selection.explained_share import SHOWS, Explained, ExplainedWindows, pruned
-from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.noise_beside_effects import (
+from imu_calibration.references.turntable.estimation.noise_search import BiasProcessSearch
+from imu_calibration.references.turntable.residuals import unexplained_windows as rests
+from imu_calibration.references.turntable.residuals.find_onset import _passed_once
+from imu_calibration.references.turntable.selection import investigation, window_gain
+from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.noise_beside_effects import (
     _needed_smooth,
     drift_prior,
     natural_processes,
     plausible_processes,
 )
-from imu_calibration.selection.onset import _passed_once
-from imu_calibration.selection.order_of_tests import select_findings
-from imu_calibration.selection.parameter_space import (
+from imu_calibration.references.turntable.selection.parameter_space import (
     ParameterSpace,
     parameter_space,
     scatter_of_each,
     white_means,
 )
+from imu_calibration.references.turntable.selection.window_evidence import (
+    WindowEvidence,
+    folds_of,
+    locked_windows,
+)
+from imu_calibration.selection import gain
+from imu_calibration.selection.evidence import MOST_FITS, Evidence
+from imu_calibration.selection.explained_share import SHOWS, Explained, pruned
+from imu_calibration.selection.order_of_tests import select_findings
 from imu_calibration.selection.questions import Question, linearise_again
 from imu_calibration.selection.search import MIN_GAIN_NATS, Search
 
@@ -261,11 +262,11 @@ def test_the_gain_is_that_of_locked_windows_by_the_measure_of_the_others(monkeyp
     """
     In the windows that choose the samples about the means fall most, in the locked ones the means.
     """
-    monkeypatch.setattr(gain, '_squares', Squares.of)
-    found = gain.heldout_gain(Squares(means=0.5), [], [QUADRATIC], sensors=['accelerometer'])
+    monkeypatch.setattr(window_gain, '_squares', Squares.of)
+    found = window_gain.heldout_gain(Squares(means=0.5), [], [QUADRATIC], sensors=['accelerometer'])
     assert (found.measure, found.windows) == ('samples about the mean of their window', 10)
     assert found.heldout_rms_after**2 == pytest.approx(0.9)
-    assert gain.gain_in_turn(
+    assert window_gain.gain_in_turn(
         Squares(means=0.5), [], [QUADRATIC], sensors=['accelerometer']
     ).heldout_rms_after ** 2 == pytest.approx(0.4)
 
@@ -279,17 +280,19 @@ def test_a_large_fall_of_a_few_means_may_be_chance(monkeypatch, risen, measure):
 
     Where they rise so far that a fall of all is not sure the samples are told, by a little.
     """
-    monkeypatch.setattr(gain, '_squares', Squares.of)
+    monkeypatch.setattr(window_gain, '_squares', Squares.of)
     means = np.where(np.arange(30) % 3, 0.001, risen)
     assert (
-        gain.gain_in_turn(Squares(0.99, means), [], [QUADRATIC], sensors=['accelerometer']).measure
+        window_gain.gain_in_turn(
+            Squares(0.99, means), [], [QUADRATIC], sensors=['accelerometer']
+        ).measure
         == measure
     )
 
 
 def test_rests_are_told_of_where_no_other_measure_falls_for_sure(monkeypatch):
     """Moving windows of a quiet sensor show the encoder."""
-    monkeypatch.setattr(gain, '_squares', Squares.of)
+    monkeypatch.setattr(window_gain, '_squares', Squares.of)
     unsure = np.where(np.arange(30) % 3, 0.001, 3.0)
     for within, measure in (
         (1.0, gain.REST_MEASURE),
@@ -298,18 +301,19 @@ def test_rests_are_told_of_where_no_other_measure_falls_for_sure(monkeypatch):
         some = Squares(within, unsure)
         some.all_samples = (*some.all_samples, 0.02 if within == 1.0 else 0.001)
         assert (
-            gain.gain_in_turn(some, [], [QUADRATIC], sensors=['accelerometer']).measure == measure
+            window_gain.gain_in_turn(some, [], [QUADRATIC], sensors=['accelerometer']).measure
+            == measure
         )
 
 
 def test_a_recording_without_rests_says_nothing_of_them(monkeypatch):
     """All measures rise; that of no windows at all does not, and must not stand for a fall."""
     monkeypatch.setattr(
-        gain,
+        window_gain,
         '_squares',
         lambda *args: Squares.of(*args) | {gain.REST_MEASURE: (np.zeros(0), np.zeros(0))},
     )
-    found = gain.gain_in_turn(Squares(1.2, 1.2), [], [QUADRATIC], sensors=['accelerometer'])
+    found = window_gain.gain_in_turn(Squares(1.2, 1.2), [], [QUADRATIC], sensors=['accelerometer'])
     assert found.measure != gain.REST_MEASURE and found.ci95[0] < 0
 
 

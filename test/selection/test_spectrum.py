@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.catalogue import term
 from imu_calibration.kinematics.table import Table
-from imu_calibration.report.figures import draw_tones
-from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.residual_analysis import ResidualAnalysis
-from imu_calibration.selection.spectrum import (
+from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
+from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
+from imu_calibration.references.turntable.residuals.spectrum import (
     _stretches,
     _without,
     find_tones,
     of_stretches,
 )
+from imu_calibration.references.turntable.selection.investigation import investigate
+from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.unexplained import IN_MOTION
 
 from worlds.candidates import FEW, with_candidates

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.selection.spectrum import MIN_ORDER_SHARE, OUT, orders_of
+from imu_calibration.references.turntable.residuals.spectrum import MIN_ORDER_SHARE, OUT, orders_of
 
 TIME = 0.01 * np.arange(1200)
 

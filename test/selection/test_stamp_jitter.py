@@ -16,7 +16,10 @@ from imu_calibration.document.decision import WARNING
 from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios, motion_misfits
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.table import Table
-from imu_calibration.selection.stamp_jitter import jitter_ratio, stamp_jitter
+from imu_calibration.references.turntable.residuals.jitter_of_blocks import (
+    jitter_ratio,
+    stamp_jitter,
+)
 
 from worlds.candidates import FEW
 from worlds.diagnosing import diagnose

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from imu_calibration.selection import unexplained
+from imu_calibration.references.turntable.residuals import unexplained_windows
 
 
 def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monkeypatch):
@@ -17,8 +17,8 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
 
     Whitened ones are not: "0 deg/s, significant" was told.
     """
-    monkeypatch.setattr(unexplained, 'correlate', lambda *_, fitted: ('time', 0.5))
-    monkeypatch.setattr(unexplained, '_explanations', lambda recording: {})
+    monkeypatch.setattr(unexplained_windows, 'correlate', lambda *_, fitted: ('time', 0.5))
+    monkeypatch.setattr(unexplained_windows, '_explanations', lambda recording: {})
     n = 40
     noise = SimpleNamespace(
         variance_beside_bias=lambda kind, count, duration, keys: np.full((n, 3), 4e-6),
@@ -36,7 +36,7 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
         n_within=1,
         sigma=lambda sensor, excess: (20.0, 0.0),
     )
-    rest = unexplained._rest(
+    rest = unexplained_windows._rest(
         problem, explained, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1)
     )
     assert rest.significant
@@ -63,6 +63,8 @@ def test_a_joint_goes_by_its_name():
     )
     rest = np.random.default_rng(3).normal(size=(n, 3)) + 4 * np.cos(describe['angle1'])[:, None]
     assert (
-        unexplained.correlate(unexplained._explanations(recording), rest, np.ones(rest.shape))[0]
+        unexplained_windows.correlate(
+            unexplained_windows._explanations(recording), rest, np.ones(rest.shape)
+        )[0]
         == 'angle of tilt'
     )

@@ -5,13 +5,13 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
-from imu_calibration.calibration.live_poses import LiveByHand
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.trust import usable
 from imu_calibration.preprocessing.absent_sensor import MIN_ABSENT_SAMPLES, SensorPresence
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.live_poses import LiveByHand
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from imu_calibration.use_cases.compensate import compensate_recording
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.table_reference import TableReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.exports.export import export, find_target
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.live_windows import LiveCalibration
+from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from imu_calibration.use_cases.compensate import compensate_recording

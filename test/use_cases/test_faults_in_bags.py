@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.gravity_reference import GravityReference
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.compensate import compensate_recording
 from imu_calibration.use_cases.inspect import inspect_recording

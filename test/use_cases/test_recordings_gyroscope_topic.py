@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.gravity_reference import GravityReference
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
+from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.compensate import compensate_recording

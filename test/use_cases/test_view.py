@@ -14,12 +14,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.coverage import label_of, table_coverage
+from imu_calibration.calibration.coverage import label_of
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import UNKNOWN_SD
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.references.turntable.table_coverage import table_coverage
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.view import (

@@ -264,7 +264,7 @@ def truth(world):
 @lru_cache(maxsize=1)
 def calibrated(world):
     """Return the calibration of a world, which several tests judge."""
-    from imu_calibration.calibration.table_calibration import calibrate_on_table
+    from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 
     return calibrate_on_table([[world.block]], world.table).calibration
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.calibration.by_evidence import extended_solution
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.extended_solution import extended_solution
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.unexplained import biases_off
 
 from worlds.diagnosing import diagnose

@@ -1,8 +1,8 @@
 """Calibration of readings by hand with the requested model, without a search for effects."""
 
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 
 from worlds.hand_sessions import GRAVITY
 

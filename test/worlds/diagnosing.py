@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from imu_calibration.calibration.diagnosis.findings import build_diagnosis
-from imu_calibration.calibration.diagnosis.traces import residual_traces
-from imu_calibration.selection.residual_analysis import inquire
+from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
+from imu_calibration.references.turntable.residuals.residual_analysis import inquire
+from imu_calibration.references.turntable.window_traces import residual_traces
 
 from worlds.candidates import with_candidates
 

@@ -17,8 +17,8 @@ from scipy.stats import chi2
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.selection.evidence import EVIDENCE_FOLDS
-from imu_calibration.selection.investigation import investigate
+from imu_calibration.references.turntable.selection.investigation import investigate
+from imu_calibration.references.turntable.selection.window_evidence import EVIDENCE_FOLDS
 from imu_calibration.selection.search import FAMILY_WISE, MIN_GAIN_NATS, PENALTY, least_angle
 
 from worlds import physics

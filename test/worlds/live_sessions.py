@@ -6,12 +6,12 @@ Enough motion for an answer in a few seconds of processing.
 
 import numpy as np
 
-from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core import documents
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 

@@ -15,12 +15,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.estimation.solution import HELD_PRIORS, Solution, of_fit
-from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, linearise_again
 

@@ -15,12 +15,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
+from imu_calibration.calibration.gathered_data import GatheredData
 from imu_calibration.calibration.held_out_data import (
     HeldOutData,
     JudgedData,
     errors_of_rows,
     masks_in_turn,
 )
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import Needs
 from imu_calibration.calibration.solved import Solved
 from imu_calibration.document.statistics import RecordingStatistics, SensorEntry
@@ -32,11 +34,9 @@ from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.rows.row_estimate import RowSet, estimate_rows
 from imu_calibration.references.rows.row_evidence import RowBlock, RowSpace
 from imu_calibration.references.rows.row_search import RowProblem, choose_effects
-from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.selection.questions import Question
 
 BLOCK = 1.0
@@ -97,7 +97,7 @@ class PoseBlocks:
     def gathered(self):
         end = int(1e9 * self.time[-1])
         largest = float(np.linalg.norm(self.rate, axis=1).max())
-        return SessionData(first_stamp_ns=0, last_stamp_ns=end, largest_rate=largest)
+        return GatheredData(first_stamp_ns=0, last_stamp_ns=end, largest_rate=largest)
 
     def gauge(self, solution):
         return {'origin': 'sensor', 'axes': 'body of the poses'}

@@ -3,11 +3,11 @@
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import solve_by_evidence
-from imu_calibration.calibration.hand_recording import HandRecording
-from imu_calibration.calibration.hand_workflow import PoseRecording
-from imu_calibration.calibration.pose_observations import PoseObservations
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.gravity.hand_recording import HandRecording
+from imu_calibration.references.gravity.hand_workflow import PoseRecording
+from imu_calibration.references.gravity.pose_observations import PoseObservations
 
 from worlds.hand_sessions import GRAVITY
 

@@ -6,9 +6,10 @@ Two tables, a table with ends, a gantry, arms with six and seven joints.
 
 import numpy as np
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
-from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.requested_model import choose_model
 
 from worlds.arms import GANTRY, SEVEN_AXES, SIX_AXES
 from worlds.random_tables import random_table

@@ -1,204 +1,17 @@
 """Gain of an extension of the model: errors of the corrected readings of held-out windows."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.diagnosis.traces import DistanceSums
-from imu_calibration.calibration.held_out_poses import corrected_with, end_by_hand, turn_errors
-from imu_calibration.calibration.held_out_windows import nominal_values, with_reference
-from imu_calibration.compensation.compensate import compensated_samples
-from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.trust import (
-    judged_from_of,
-    latest_settling,
-    uncorrected_in_time,
-    uncorrected_on_table,
-)
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import (
-    Centre,
-    References,
-    applied_values,
-    not_applied,
-    sensor_output,
-)
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import HELD
-from imu_calibration.estimation.solver import solve
-from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, all_samples, chunks
-from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.gravity.model_selection import (
-    HandInvestigation,
-)
-from imu_calibration.references.rows.row_evidence import RowBlock
-from imu_calibration.references.rows.row_search import RowProblem, gain_of_groups
-from imu_calibration.references.turntable.accumulator import Accumulator
-from imu_calibration.references.turntable.window_statistics import reduce_windows
-from imu_calibration.selection.gain import (
-    APPLIED,
-    OF_MODEL,
-    SAMPLES,
-    Gain,
-    gain_in_turn,
-    heldout_gain,
-)
-from imu_calibration.selection.investigation import Investigation
-from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.proposals import Proposal
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.residual_blocks import residuals
-from imu_calibration.selection.saturation import measured
-
-
-@dataclass(frozen=True, eq=False)
-class _Side:
-    """A model with its parameters, as estimated and as compensation applies them."""
-
-    model: SensorModel
-    """At the point of `values`."""
-    values: np.ndarray
-    """Shape (n_params,)."""
-    applied: np.ndarray
-    """Effects that compensation cannot undo are at their centre, shape (n_params,)."""
-    latest: SensorModel
-    """At the largest probable time constants: what has settled (`trust.latest_settling`)."""
-
-
-def gain_of_findings(
-    found: Investigation,
-    table: Table,
-    before: Sequence[Question],
-    *,
-    after: Sequence[Question],
-    sensors: Sequence[str],
-) -> Gain:
-    """
-    Return the Gain of the findings `after` over the findings `before` on the locked windows.
-
-    The residual is the error of the readings that compensation returns, relative to the reference
-    that each side estimates; both sides are estimated from the other windows. If no additional
-    finding can be compensated, the residual is that of the model (`gain.heldout_gain`). Sensor and
-    measure are chosen on the other windows.
-
-    Parameters
-    ----------
-    found : Investigation
-    table : Table
-    before, after : sequence of Question
-    sensors : sequence of str
-        Sensors that the difference acts on.
-
-    """
-    compensated = _compensated(found, before, after)
-    if compensated is None:
-        return heldout_gain(found.problem, before, after, sensors=sensors)
-
-    # Sensor and measure from the windows that choose, then the errors in the locked windows.
-    chosen = gain_in_turn(found.problem, compensated.before, compensated.after, sensors=sensors)
-    sides = [
-        _applied_parameters(found, compensated.before),
-        _applied_parameters(found, compensated.after),
-    ]
-    sums = _locked_errors(found, table, sides)
-    return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
-
-
-def gains_of_formulas(
-    found: Investigation, table: Table, proposals: Sequence[Proposal]
-) -> dict[str, Gain]:
-    """
-    Return sensor -> Gain of the proposed formulas over the findings on the locked windows.
-
-    The residual is the error of corrected readings, sample by sample, as for findings; that of the
-    model where compensation cannot undo the formula. Model and formulas are estimated together from
-    the other windows.
-
-    Parameters
-    ----------
-    found : Investigation
-    table : Table
-    proposals : sequence of Proposal
-        At most one for each sensor.
-
-    """
-    if not proposals:
-        return {}
-    problem = found.problem
-    before = _applied_parameters(found, found.adopted)
-
-    # The model with the formulas, linearised at their amplitudes.
-    model = before.model
-    values = before.values
-    for proposal in proposals:
-        for effect, size in zip(proposal.effects, proposal.values):
-            known = replace(model, catalogue=model.catalogue.with_effects(effect))
-            model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
-    model = model.at(values)
-
-    # Estimated from the windows that are not locked.
-    accumulator = Accumulator()
-    unlocked = [window for window, locked in zip(found.used, problem.locked) if not locked]
-    for group in chunks(unlocked):
-        for window in reduce_windows(group, model, table):
-            accumulator.add(window)
-    solution = solve(accumulator, model, noise=problem.noise)
-    estimated = solution.values
-
-    # Compensation fixes the effects of the model that it does not undo as on the first side.
-    applied = applied_values(model, estimated)
-    for effect in not_applied(before.model):
-        applied[model.slices[effect.key]] = before.applied[before.model.slices[effect.key]]
-    latest = latest_settling(model, estimated, solution.sd)
-    after = _Side(model.at(estimated), estimated, applied, latest)
-
-    # A formula that compensation cannot undo has a gain in the residual of the model only.
-    sums_of = {}
-    gains = {}
-    for proposal in proposals:
-        undone = any(effect.compensation == 'exact' for effect in proposal.effects)
-        error_kind = APPLIED if undone else OF_MODEL
-        if error_kind not in sums_of:
-            sums_of[error_kind] = _locked_errors(found, table, [before, after], of=error_kind)
-        gain = sums_of[error_kind].gains(proposal.sensor, error_kind)[SAMPLES]
-        white_variance = problem.noise[proposal.sensor].white_variance
-        gains[proposal.sensor] = replace(gain, noise_rms=float(np.sqrt(np.mean(white_variance))))
-    return gains
-
-
-def _locked_errors(
-    found: Investigation,
-    table: Table,
-    sides: Sequence[_Side],
-    *,
-    of: str = APPLIED,
-) -> DistanceSums:
-    """
-    Return the sums over the locked windows of the errors of corrected readings, or of the model.
-
-    The windows are those of `HeldOutData` and the documents: after effects have settled.
-    """
-    problem = found.problem
-    start = max(judged_from_of(side.latest, problem.duration) for side in sides)
-    held_out = []
-    for window, locked in zip(found.used, problem.locked):
-        if locked and window.time[0] >= start:
-            held_out.append(window)
-
-    errors_of = _errors if of == APPLIED else _model_errors
-    sums = DistanceSums()
-    for group in chunks(held_out):
-        errors_of_sides = [errors_of(group, table, side) for side in sides]
-        for window, *errors in zip(group, *errors_of_sides):
-            sums.add(window, errors, problem.noise)
-    return sums
+from imu_calibration.selection.search import Search, SelectedEffects
 
 
 @dataclass(frozen=True)
-class _CompensatedFindings:
+class CompensatedFindings:
     """Two choices of effects, without implausible findings, which are not in the model."""
 
     before: list[Question]
@@ -207,9 +20,9 @@ class _CompensatedFindings:
     """The larger choice: with at least one more effect that compensation can undo."""
 
 
-def _compensated(
-    found: Investigation | HandInvestigation, before: Sequence[Question], after: Sequence[Question]
-) -> _CompensatedFindings | None:
+def compensated_findings(
+    found: SelectedEffects, before: Sequence[Question], after: Sequence[Question]
+) -> CompensatedFindings | None:
     """
     Return the findings of two choices that belong into the model.
 
@@ -219,44 +32,18 @@ def _compensated(
     adopted_after = [question for question in after if question in found.adopted]
     for question in adopted_after:
         if question not in adopted_before and question.effect.compensation == 'exact':
-            return _CompensatedFindings(adopted_before, adopted_after)
+            return CompensatedFindings(adopted_before, adopted_after)
     return None
 
 
-def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Side:
-    """
-    Return a choice of effects as compensation applies it.
-
-    It is estimated without the locked windows.
-    """
-    problem = found.problem
-    gathered = problem.recording.model  # with all effects under test
-    model = replace(problem.baseline, temperature_ref_c=gathered.temperature_ref_c)
-    for question in chosen:
-        model = model.with_effect(question.sensor, question.name)
-    values = model.start_from(gathered, problem.values(chosen))
-    model = model.at(values)
-    latest = latest_settling(model, values, _sd_of(problem, model, chosen))
-    centre: Centre = {}
-    if not_applied(model):
-        accumulator = problem.recording.accumulated(gathered)
-        uncorrected = uncorrected_on_table(
-            model, values, accumulator, gathered=gathered, latest=latest
-        )
-        centre = uncorrected.centre
-    return _Side(model, values, applied_values(model, values, centre), latest)
-
-
-def _sd_of(
-    problem: LinearisedProblem | RowProblem, model: SensorModel, chosen: Sequence[Question]
-) -> np.ndarray:
+def sd_of_chosen(search: Search, model: SensorModel, chosen: Sequence[Question]) -> np.ndarray:
     """
     Return the standard deviations of the parameters of some effects; of other ones zero.
 
     A warm-up that was only tried at a bank of time constants has none for its own.
     """
-    used = problem.search.indices(chosen)
-    _, covariance = problem.evidence.fit(used)
+    used = search.indices(chosen)
+    _, covariance = search.evidence.fit(used)
     sd_of_index = dict(zip(used, np.sqrt(np.diag(covariance)), strict=True))
     sd = np.zeros(len(model.param_names))
     for question in chosen:
@@ -264,129 +51,3 @@ def _sd_of(
         for place, index in enumerate(question.parameters):
             sd[start + place] = sd_of_index[index]
     return sd
-
-
-def gain_by_hand(
-    found: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str
-) -> Gain:
-    """
-    Return the Gain of the findings `after` over the findings `before`.
-
-    The gain is that on the held-out poses and turns.
-
-    The errors are those of `HeldOutPoses` and, at rest, the corrected rate less that of
-    the Earth about the vertical. Choice and estimate of each side exclude the poses; if no
-    additional finding can be compensated, the residual is that of the model.
-    """
-    compensated = _compensated(found, before, after)
-    if compensated is None:
-        return found.problem.gain(found.held_out, before, after, sensor=sensor)
-
-    # The rows in which the difference of the two choices is clearest.
-    block = found.problem.clearest(compensated.before, compensated.after, sensor)
-    poses = found.baseline.poses
-    end = end_by_hand(poses)
-    n_columns = 1 if block.duration is not None else block.known.shape[1]
-    errors_before = np.zeros((len(block.group), n_columns))
-    errors_after = np.zeros((len(block.group), n_columns))
-
-    # Each part of the recording is predicted by a fit to the other parts.
-    start = 0.0
-    for part in found.held_out:
-        rows = np.isin(block.group, part.groups)
-        for errors, chosen in (
-            (errors_before, compensated.before),
-            (errors_after, compensated.after),
-        ):
-            additional = part.named_in(chosen)
-            model, values, earth = found.extended(part.problem, additional)
-            moved = model.model.at(values)
-            latest = latest_settling(moved, values, _sd_of(part.problem, moved, additional))
-            start = max(start, judged_from_of(latest, end))
-            uncorrected = uncorrected_in_time(moved, values, poses.time, end=end, latest=latest)
-            applied = applied_values(moved, values, uncorrected.centre)
-            errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, applied, earth)
-
-    # Only rows after the effects of both choices have settled.
-    settled = block.time >= start
-    pair = [errors_before[settled], errors_after[settled]]
-    return gain_of_groups(block.select(settled), pair, APPLIED)
-
-
-def _pose_errors(
-    found: HandInvestigation,
-    block: RowBlock,
-    rows: np.ndarray,
-    model: HandModel,
-    values: np.ndarray,
-    earth: float,
-) -> np.ndarray:
-    """
-    Return the errors of some rows of a block after correction.
-
-    Of poses m/s^2 or rad/s, of turns the angle over the duration, rad/s.
-    """
-    poses = found.baseline.poses
-    if block.duration is not None:
-        missed = turn_errors(model, values, poses, turns=[found.turns[row] for row in rows])
-        return (missed / block.duration[rows])[:, None]
-    warm = None if poses.temperature_c is None else poses.temperature_c[rows]
-    corrected = corrected_with(
-        model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=warm
-    )
-    # At rest the force is gravity, and points up: the vertical Earth's rate is along it.
-    norm = np.linalg.norm(corrected.force, axis=1, keepdims=True)
-    if block.sensor == 'accelerometer':
-        return norm - found.baseline.gravity
-    return corrected.rate - earth * corrected.force / norm
-
-
-def _errors(
-    windows: Sequence[Window], table: Table, side: _Side
-) -> Iterator[dict[str, np.ndarray]]:
-    """
-    Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3).
-
-    The true readings are those of an ideal sensor on the table as this side estimates it.
-    """
-    # Ideal sensors at the estimated reference (angles, places, delays of the table).
-    motion, temperature, rows = all_samples(windows)
-    ideal = with_reference(side.model, nominal_values(side.model), side.values)
-    ideal_model = side.model.at(ideal)
-    references = References(ideal_model, table, motion, temperature_c=temperature)
-    reference_of = {sensor: references.at(sensor) for sensor in SENSORS}
-
-    # Readings as compensation corrects them, with the motion at the gyroscope.
-    ref = reference_of['gyroscope'].select(rows)
-    raw = []
-    for sensor in SENSORS:
-        raw.append(np.concatenate([measured(window, sensor) for window in windows]))
-    count = len(side.values)
-    known = Calibration(side.model, side.applied, np.zeros((count, count)), (HELD,) * count)
-    corrected = compensated_samples(
-        known,
-        *raw,
-        alpha_s=ref.alpha_s,
-        temperature_c=ref.temperature_c,
-        thermal_branch=ref.thermal_branch,
-        vibration=ref.vibration,
-    )
-
-    corrected_of = {'accelerometer': corrected.force, 'gyroscope': corrected.rate}
-    errors = {}
-    for sensor in SENSORS:
-        true = sensor_output(ideal_model, sensor, ideal, ref=reference_of[sensor])
-        errors[sensor] = corrected_of[sensor] - true[rows]
-    for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
-        yield {sensor: error[start:stop] for sensor, error in errors.items()}
-
-
-def _model_errors(
-    windows: Sequence[Window], table: Table, side: _Side
-) -> Iterator[dict[str, np.ndarray]]:
-    """
-    Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3).
-    """
-    residual_of = residuals(windows, table, side.model, values=side.values)
-    for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
-        yield {sensor: residual[start:stop] for sensor, residual in residual_of.items()}

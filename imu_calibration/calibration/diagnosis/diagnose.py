@@ -12,6 +12,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
     proposed_effects,
 )
 from imu_calibration.calibration.from_solution import ModelExtension
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
 from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.calibration.result import CalibrationResult
@@ -20,7 +21,6 @@ from imu_calibration.core.samples import BlockSource
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HARM
 from imu_calibration.effects.base import SECTIONS, Effect, Role
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.unexplained import biases_off
 
 

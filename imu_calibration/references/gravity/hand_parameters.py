@@ -10,6 +10,7 @@ from itertools import product
 
 import numpy as np
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS, Effect, Role
@@ -17,7 +18,6 @@ from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.forward_equations import output_of_effects
 from imu_calibration.effects.sensor_model import SensorModel, linear_names, parse_effects
 from imu_calibration.kinematics.rotations import Reference
-from imu_calibration.references.options import CalibrationOptions
 
 UPPER_TERMS = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
 """Zero by the choice of axes."""

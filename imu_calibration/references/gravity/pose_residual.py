@@ -17,12 +17,12 @@ from imu_calibration.selection.regimes import (
     RestRegime,
     exchanges,
 )
-from imu_calibration.selection.residual_blocks import largest_axes
 from imu_calibration.selection.unexplained import (
     MIN_EXPLAINED_WINDOWS,
     SIGNIFICANT_SDS,
     Unexplained,
     correlate,
+    largest_axes,
     slow_explanations,
 )
 

@@ -15,6 +15,7 @@ from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.gauss_newton import gauss_newton
 from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelError
+from imu_calibration.estimation.outliers import find_outliers
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import (
     GRAVITY,
@@ -22,7 +23,6 @@ from imu_calibration.estimation.solution import (
     common_scale,
     total,
 )
-from imu_calibration.estimation.window_outliers import find_outliers
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.sphere import fit_sphere
 from imu_calibration.references.gravity.equations import (

@@ -47,7 +47,7 @@ def model_error_of_rows(
         np.array(information),
         np.array(gradient),
         np.zeros((0, len(found.free))),
-        found.free,
+        free=found.free,
         shared=np.array(shared),
     )
     return errors_of_waves(waves, model)[0]

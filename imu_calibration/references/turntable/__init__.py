@@ -1,6 +1,8 @@
 """
 Reference by a turntable or an arm.
 
-Windows reduced to statistics (`window_statistics`) and accumulated as rows (`accumulator`),
-gathered windows, held-out windows, the model extended by selected effects.
+In: recordings with joints. Out: a calibration, its proof, a diagnosis. Read `table_reference`
+first, then `table_calibration`: windows become statistics (`window_statistics`) and rows
+(`accumulator`); `estimation` solves them, `selection` chooses effects, `residuals` analyses the
+unexplained.
 """

@@ -8,6 +8,7 @@ from itertools import chain
 
 import numpy as np
 
+from imu_calibration.calibration.gathered_data import GatheredData
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, columns
@@ -16,7 +17,6 @@ from imu_calibration.estimation.gauss_newton import after_one_step
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import check_units
@@ -28,6 +28,7 @@ from imu_calibration.references.turntable.accumulator import (
     selected_columns,
     stack,
 )
+from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
 from imu_calibration.references.turntable.window_statistics import (
     N_AXES,
     WindowStatistics,
@@ -90,7 +91,7 @@ class WindowStore:
         """
         Yield all windows in order with the columns of `model`.
 
-        As `calibration.collector` reduces them.
+        As `references.turntable.collector` reduces them.
         """
         for entry in self._entries:
             if isinstance(entry, Window):
@@ -394,15 +395,13 @@ KEPT_POSES = 2000
 
 
 @dataclass(eq=False)
-class SessionData:
-    """Reduced data of a recording."""
+class SessionData(GatheredData):
+    """Reduced data of a recording on a table."""
 
     accumulator: Accumulator = field(default_factory=Accumulator)
     """The least-squares system."""
     held_out: HeldOut = field(default_factory=HeldOut)
     """The same windows in folds for cross-validation."""
-    kept: list = field(default_factory=list)
-    """Windows with all samples, up to KEPT_SAMPLES."""
     spreads: list[DecimatedWindows] = field(default_factory=lambda: [DecimatedWindows()])
     """
     Windows for the search of effects, of each of the recordings with most samples, the largest
@@ -410,24 +409,6 @@ class SessionData:
     """
     poses: list = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
-    counts: dict = field(default_factory=dict)
-    """Samples used and dropped, gaps, by reason."""
-    frame_id: str = ''
-    """Frame of the first IMU message."""
-    first_stamp_ns: int | None = None
-    """First IMU stamp."""
-    last_stamp_ns: int | None = None
-    """Last IMU stamp."""
-    largest_rate: float = 0.0
-    """Largest rate of the reference, rad/s."""
-    largest_force: float = 0.0
-    """Largest measured component of specific force, m/s^2."""
-    temperature_c: tuple | None = None
-    """Lowest and highest temperature."""
-    findings: tuple = ()
-    """Findings of the checks of the recording before the estimate (`CheckFinding`)."""
-    unusable: dict[str, str] = field(default_factory=dict)
-    """Absent sensors with readings -> why these cannot be used."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
@@ -458,15 +439,6 @@ class SessionData:
         """
         windows = chain.from_iterable(spread.windows for spread in self.spreads)
         return self.kept or [window for window in windows if window.kind != 'static']
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last IMU stamp, recordings added."""
-        return (
-            0.0
-            if self.first_stamp_ns is None or self.last_stamp_ns is None
-            else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
-        )
 
 
 def merge(parts: Iterable[SessionData]) -> SessionData:

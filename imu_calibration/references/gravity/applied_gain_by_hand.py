@@ -1,0 +1,97 @@
+"""Gain of findings by hand: errors of the corrected readings of held-out poses and turns."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from imu_calibration.calibration.diagnosis.applied_gain import compensated_findings, sd_of_chosen
+from imu_calibration.document.trust import judged_from_of, latest_settling, uncorrected_in_time
+from imu_calibration.effects.forward_equations import applied_values
+from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.gravity.held_out_poses import (
+    corrected_with,
+    end_by_hand,
+    turn_errors,
+)
+from imu_calibration.references.gravity.model_selection import HandInvestigation
+from imu_calibration.references.rows.row_evidence import RowBlock
+from imu_calibration.references.rows.row_search import gain_of_groups
+from imu_calibration.selection.gain import APPLIED, Gain
+from imu_calibration.selection.questions import Question
+
+
+def gain_by_hand(
+    found: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str
+) -> Gain:
+    """
+    Return the Gain of the findings `after` over the findings `before`.
+
+    The gain is that on the held-out poses and turns.
+
+    The errors are those of `HeldOutPoses` and, at rest, the corrected rate less that of
+    the Earth about the vertical. Choice and estimate of each side exclude the poses; if no
+    additional finding can be compensated, the residual is that of the model.
+    """
+    compensated = compensated_findings(found, before, after)
+    if compensated is None:
+        return found.problem.gain(found.held_out, before, after, sensor=sensor)
+
+    # The rows in which the difference of the two choices is clearest.
+    block = found.problem.clearest(compensated.before, compensated.after, sensor)
+    poses = found.baseline.poses
+    end = end_by_hand(poses)
+    n_columns = 1 if block.duration is not None else block.known.shape[1]
+    errors_before = np.zeros((len(block.group), n_columns))
+    errors_after = np.zeros((len(block.group), n_columns))
+
+    # Each part of the recording is predicted by a fit to the other parts.
+    start = 0.0
+    for part in found.held_out:
+        rows = np.isin(block.group, part.groups)
+        for errors, chosen in (
+            (errors_before, compensated.before),
+            (errors_after, compensated.after),
+        ):
+            additional = part.named_in(chosen)
+            model, values, earth = found.extended(part.problem, additional)
+            moved = model.model.at(values)
+            latest = latest_settling(
+                moved, values, sd_of_chosen(part.problem.search, moved, additional)
+            )
+            start = max(start, judged_from_of(latest, end))
+            uncorrected = uncorrected_in_time(moved, values, poses.time, end=end, latest=latest)
+            applied = applied_values(moved, values, uncorrected.centre)
+            errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, applied, earth)
+
+    # Only rows after the effects of both choices have settled.
+    settled = block.time >= start
+    pair = [errors_before[settled], errors_after[settled]]
+    return gain_of_groups(block.select(settled), pair, APPLIED)
+
+
+def _pose_errors(
+    found: HandInvestigation,
+    block: RowBlock,
+    rows: np.ndarray,
+    model: HandModel,
+    values: np.ndarray,
+    earth: float,
+) -> np.ndarray:
+    """
+    Return the errors of some rows of a block after correction.
+
+    Of poses m/s^2 or rad/s, of turns the angle over the duration, rad/s.
+    """
+    poses = found.baseline.poses
+    if block.duration is not None:
+        missed = turn_errors(model, values, poses, turns=[found.turns[row] for row in rows])
+        return (missed / block.duration[rows])[:, None]
+    warm = None if poses.temperature_c is None else poses.temperature_c[rows]
+    corrected = corrected_with(
+        model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=warm
+    )
+    # At rest the force is gravity, and points up: the vertical Earth's rate is along it.
+    norm = np.linalg.norm(corrected.force, axis=1, keepdims=True)
+    if block.sensor == 'accelerometer':
+        return norm - found.baseline.gravity
+    return corrected.rate - earth * corrected.force / norm

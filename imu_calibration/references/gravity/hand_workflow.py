@@ -1,0 +1,86 @@
+"""A calibration by hand: gravity is the reference."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.solved import Solved
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import BlockSource
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.references.gravity.hand_calibration import HandCalibration, solve_by_hand
+from imu_calibration.references.gravity.hand_parameters import hand_options
+from imu_calibration.references.gravity.hand_recording import HandRecording, read_by_hand
+from imu_calibration.references.gravity.pose_observations import HandResult, PoseObservations
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRecording:
+    """A recording by hand, of which each solution uses the same poses and turns."""
+
+    data: PoseObservations
+    """Poses and turns."""
+
+    def solved(self, options: CalibrationOptions) -> Solved[HandCalibration]:
+        """Return the solution of the model that options request (`solve_by_hand`)."""
+        return Solved(solve_by_hand(self.data.data, hand_options(options)), self.data)
+
+
+def calibrate_without_table(
+    sources: Sequence[BlockSource],
+    options: CalibrationOptions = CalibrationOptions(),
+    provenance: dict | None = None,
+) -> HandResult:
+    """
+    Calibrate by hand and return the HandResult: gravity is the reference (see `calibrate_by_hand`).
+
+    Parameters
+    ----------
+    sources : sequence of BlockSource
+        One recording.
+    options : CalibrationOptions
+    provenance : dict, optional
+        Bag names, hashes and options for the document.
+
+    Raises
+    ------
+    InputError
+        When more than one recording is given, or a requested effect needs a table.
+
+    """
+    return calibrate_by_evidence(gather_poses(sources, options), options, provenance=provenance)
+
+
+def gather_poses(
+    sources: Sequence[BlockSource], options: CalibrationOptions, *, one_sensor: bool = True
+) -> PoseRecording:
+    """
+    Return the poses and turns of one recording; raises as `calibrate_without_table`.
+
+    `one_sensor`: whether one usable sensor suffices.
+    """
+    if len(sources) != 1:
+        raise InputError(
+            f'calibration by hand needs one recording, got {len(sources)}; calibrate them'
+            ' separately and compare the results'
+        )
+    preflight = Preflight(options.gravity, one_sensor=one_sensor)
+    recording = read_by_hand(sources[0], options.nominal, preflight)
+    return PoseRecording(PoseObservations.of(recording, hand_options(options)))
+
+
+def calibrate_poses(
+    recording: HandRecording,
+    options: CalibrationOptions = CalibrationOptions(),
+    provenance: dict | None = None,
+    *,
+    stills: Sequence[slice] | None = None,
+) -> HandResult:
+    """
+    Return the HandResult of a recording that was read.
+
+    `stills` as in `calibrate_by_hand`, the other arguments as in `calibrate_without_table`.
+    """
+    observations = PoseObservations.of(recording, hand_options(options), stills)
+    return calibrate_by_evidence(PoseRecording(observations), options, provenance=provenance)

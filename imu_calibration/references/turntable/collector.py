@@ -1,0 +1,548 @@
+"""Collection of windows from blocks of samples, and the state of a session as a file."""
+
+import copy
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import chain, islice
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.core.documents import load_arrays
+from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import BlockSource, ImuSamples, SampleBlock
+from imu_calibration.effects.base import SECTIONS
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.stream_cleaning import NO_RANGES, Watcher
+from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
+from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.turntable.accumulator import Accumulator, WindowBlock
+from imu_calibration.references.turntable.session_data import (
+    KEPT_POSES,
+    KEPT_SAMPLES,
+    MAX_LIVE_SAMPLES,
+    DecimatedWindows,
+    HeldOut,
+    HeldOutBlock,
+    KeptWindows,
+    SessionData,
+    WindowStore,
+    naming,
+    owned_window,
+)
+from imu_calibration.references.turntable.window_statistics import (
+    SensorStatistics,
+    WindowStatistics,
+    reduce_window,
+)
+
+SAVED_FORMAT = 'imu_calibration/accumulator/4'
+SAVED_PARTS = (
+    'accumulator',
+    'held_out',
+    'poses',
+    'counts',
+    'frame_id',
+    'first_stamp_ns',
+    'last_stamp_ns',
+    'largest_rate',
+    'largest_force',
+    'temperature_c',
+    'judged_from',
+)
+"""Saved fields of a `SessionData`; windows with samples are not saved."""
+SAVED_PLAIN = (str, int, float, type(None))
+SAVED_TYPES: dict[str, Any] = {
+    kind.__name__: kind
+    for kind in (
+        dict,
+        tuple,
+        Counter,
+        Accumulator,
+        WindowBlock,
+        WindowStatistics,
+        SensorStatistics,
+        HeldOut,
+        HeldOutBlock,
+        JointNames,
+        ModelChanges,
+        ModelExtension,
+    )
+}
+"""Types that an archive may contain, in addition to arrays and plain values."""
+MOST_EMPTY = 10**4
+"""Values of an archive at most that need no byte of it: a damaged header may state any number."""
+SAVED_DEPTH = 16
+"""Containers around one number of an archive at most: each counts its values once more."""
+
+
+def to_bytes(
+    gathered: SessionData, model: SensorModel, extension: ModelExtension = ModelExtension()
+) -> bytes:
+    """
+    Return a `SessionData` as an npz archive: numbers to the last bit, no pickled objects.
+
+    Parameters
+    ----------
+    gathered : SessionData
+        Its least-squares system, the held-out blocks of the proof, poses and counts.
+    model : SensorModel
+        The model of its columns.
+    extension : ModelExtension
+        Effects added to the requested model; the solution of a search is computed again.
+
+    """
+    arrays: list[np.ndarray] = []
+    of_model = {f.name: getattr(model, f.name) for f in fields(model) if f.name != 'catalogue'}
+    content = (
+        {name: getattr(gathered, name) for name in SAVED_PARTS},
+        of_model,
+        model.definitions,
+        replace(extension, clipped=None),
+    )
+    header = json.dumps({'format': SAVED_FORMAT, 'content': _packed([content], arrays)})
+    target = io.BytesIO()
+    np.savez(
+        target,
+        header=np.frombuffer(header.encode(), np.uint8),
+        numbers=np.concatenate([np.zeros(0), *map(np.ravel, arrays)]),
+    )
+    return target.getvalue()
+
+
+def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
+    """
+    Return a column of values as plain lists, one column per part of values of equal type.
+
+    Arrays of one shape are appended as one.
+    """
+    if all(issubclass(kind, SAVED_PLAIN) for kind in set(map(type, values))):
+        return ['plain', values]
+    kinds = [_kind(value) for value in values]
+    if len(set(kinds)) > 1:
+        each: dict[Any, list] = {}  # kind -> its values
+        for value, kind in zip(values, kinds):
+            each.setdefault(kind, []).append(value)
+        order = list(each)
+        return [
+            'mixed',
+            [order.index(kind) for kind in kinds],
+            [_packed(own, arrays) for own in each.values()],
+        ]
+    first = values[0]
+    if isinstance(first, np.ndarray):
+        arrays.append(np.array(values))
+        return ['array', arrays[-1].shape]
+    if isinstance(first, list):
+        return [
+            'list',
+            [len(value) for value in values],
+            _packed(list(chain.from_iterable(values)), arrays),
+        ]
+    keys = tuple(first) if isinstance(first, dict) else ()
+    rows = (
+        values
+        if isinstance(first, tuple)
+        else [(value if isinstance(value, dict) else vars(value)).values() for value in values]
+    )
+    return [
+        type(first).__name__,
+        len(values),
+        [_packed(column, arrays) for column in zip(*rows)],
+        _packed(keys, arrays),
+    ]
+
+
+def _kind(value: Any) -> Any:
+    """
+    Return the shape, the keys, the length or the type, which values of one column have in common.
+    """
+    if isinstance(value, np.ndarray):
+        return value.shape
+    if isinstance(value, dict):
+        return type(value), *value
+    if isinstance(value, tuple):
+        return len(value)
+    return None if isinstance(value, SAVED_PLAIN) else type(value)
+
+
+class _SavedNumbers(io.BytesIO):
+    """The numbers of an archive, and how many more values its columns may have together."""
+
+    def __init__(self, data: bytes, most_values: int):
+        super().__init__(data)
+        self._most_values = self._remaining = most_values
+
+    def count(self, n_values: int) -> None:
+        """Count the values of a column; raises ValueError above the limit."""
+        self._remaining -= n_values
+        if n_values < 0 or self._remaining < 0:
+            raise ValueError(
+                f'an archive of its size must have at most {self._most_values} values, got more'
+            )
+
+
+def _unpacked(column: list, numbers: _SavedNumbers) -> list:
+    """
+    Return the values that `_packed` wrote.
+
+    Their arrays are read from the beginning of the file `numbers`.
+    """
+    name, size, *parts = column
+    if name == 'plain':
+        return size
+    if name == 'array':
+        numbers.count(size[0])
+        return list(np.frombuffer(numbers.read(8 * math.prod(size))).reshape(size))
+    if name == 'list':
+        items = iter(_unpacked(parts[0], numbers))
+        return [list(islice(items, length)) for length in size]
+    if name != 'mixed':
+        numbers.count(size)
+    columns = [_unpacked(part, numbers) for part in parts[0]]
+    if name == 'mixed':
+        each = [iter(values) for values in columns]
+        return [next(each[number]) for number in size]
+    kind: Any = SAVED_TYPES[name]
+    rows = list(zip(*columns, strict=True)) or [()] * size
+    # The test narrows the type to an instance or a class; only classes are saved.
+    construct: Any = kind
+    if is_dataclass(kind):
+        return [construct(*row) for row in rows]
+    keys = _unpacked(parts[1], numbers)
+    return [kind(dict(zip(keys, row)) if issubclass(kind, dict) else row) for row in rows]
+
+
+def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
+    """
+    Return (SessionData, SensorModel, added effects) in an archive.
+
+    The SensorModel is that of the columns of the data. The effects are the ones added to the
+    requested model.
+
+    Raises
+    ------
+    DocumentError
+        When the bytes are no such archive.
+
+    """
+    try:
+        with load_arrays(data) as arrays:
+            header = json.loads(bytes(arrays['header']).decode())
+            if header.get('format') != SAVED_FORMAT:
+                raise DocumentError(
+                    f"an accumulator must have the format '{SAVED_FORMAT}', got "
+                    f'{shortened(repr(header.get("format")))}; remove the file'
+                )
+            size = arrays['header'].nbytes + arrays['numbers'].nbytes
+            numbers = _SavedNumbers(arrays['numbers'].tobytes(), MOST_EMPTY + SAVED_DEPTH * size)
+            ((parts, of_model, definitions, extension),) = _unpacked(header['content'], numbers)
+            return (
+                SessionData(**parts),
+                SensorModel(**of_model, catalogue=CATALOGUE.with_definitions(definitions)),
+                extension,
+            )
+    except ImuCalibrationError:
+        raise
+    except Exception as error:  # damaged archives, arrays and headers raise many kinds
+        raise DocumentError(
+            f'a saved accumulator must be a whole file of {SAVED_FORMAT}, this file of {len(data)}'
+            f' bytes is damaged or has a different format ({shortened(str(error), 200)}); remove'
+            ' the file',
+            code='accumulator_damaged',
+        ) from error
+
+
+def require_columns(known: SensorModel, model: SensorModel) -> None:
+    """
+    Raise a DocumentError unless the columns of a saved accumulator match.
+
+    The columns of the accumulator, of the model `known`, must be the columns of `model`.
+    """
+    if not known.has_columns_of(model):
+        raise DocumentError(
+            'a saved accumulator must contain the columns of the requested model, it has'
+            f' {_text(known)}, requested is {_text(model)}; start without resume, or with the old'
+            ' model',
+            code='other_model',
+        )
+
+
+def _text(model: SensorModel) -> str:
+    effects = ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in SECTIONS)
+    return f'{effects} at {model.temperature_ref_c:g} C'
+
+
+class Collector:
+    """
+    Feeds blocks to the window finder and reduces its windows.
+
+    The same object serves bags and live topics.
+    """
+
+    def __init__(
+        self,
+        table: Table,
+        model: SensorModel,
+        settings: WindowSettings = WindowSettings(),
+        *,
+        nominal: RawReadings | None = None,
+        session: int = 0,
+        watchers: Sequence[Watcher] = (),
+        windows: StoredWindows | KeptWindows | list | None = None,
+        spread: bool = False,
+        judged_from: float = 0.0,
+        without: np.ndarray = NO_RANGES,
+        unusable: Sequence[str] = (),
+    ):
+        self.table, self.model, self.session, self.windows, self.spread = (
+            table,
+            model,
+            session,
+            windows,
+            spread,
+        )
+        self.gatherer = MotionGatherer(
+            table,
+            settings,
+            windows is not None,
+            nominal=nominal,
+            watchers=watchers,
+            without=without,
+            unusable=unusable,
+        )
+        self.gathered = SessionData(judged_from=judged_from)
+
+    def push(self, block: SampleBlock) -> list[Window]:
+        """Process a block and return the windows that it completed."""
+        if block.imu is not None and len(block.imu):
+            self._note_imu(block.imu)
+        if block.temperature is not None and len(block.temperature):
+            self._note_temperature(block.temperature.temperature_c)
+        return self._take(self.gatherer.push(block))
+
+    def finish(self) -> SessionData:
+        """Close the last window and return the gathered data."""
+        self._take(self.gatherer.finish())
+        self.update_counts()
+        return self.gathered
+
+    def update_counts(self) -> None:
+        """Bring the counts up to date."""
+        counts = Counter(self.gatherer.counts)
+        counts.update(self.gatherer.cleaner.lost)
+        self.gathered.counts = dict(counts)
+
+    def _note_imu(self, imu: ImuSamples) -> None:
+        found = self.gathered
+        if found.first_stamp_ns is None:
+            found.first_stamp_ns, found.frame_id = int(imu.stamp_ns[0]), imu.frame_id
+        found.last_stamp_ns = max(int(imu.stamp_ns[-1]), found.last_stamp_ns or 0)
+
+    def _note_temperature(self, temperature_c: np.ndarray) -> None:
+        finite = temperature_c[np.isfinite(temperature_c)]
+        if len(finite):
+            low, high = self.gathered.temperature_c or (np.inf, -np.inf)
+            self.gathered.temperature_c = (
+                float(min(low, finite.min())),
+                float(max(high, finite.max())),
+            )
+
+    def _take(self, windows: Sequence[Window]) -> list[Window]:
+        if self.windows is not None:
+            self.windows.extend(windows)
+        used = [window for window in windows if window.kind != 'unused']
+        for window in used:
+            self._add(window)
+        return used
+
+    def _add(self, window: Window) -> None:
+        reduced = reduce_window(window, self.model, self.table, session=self.session)
+        found = self.gathered
+        found.take(reduced)
+        found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
+        if window.kind == 'static':
+            found.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
+            del found.poses[:-KEPT_POSES]
+        else:
+            found.largest_rate = max(
+                found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max()))
+            )
+        self._store(window, reduced)
+
+    def _store(self, window: Window, _reduced: WindowStatistics) -> None:
+        kept = self.gathered.kept
+        if (
+            window.kind != 'static'
+            and sum(len(w.time) for w in kept) + len(window.time) <= KEPT_SAMPLES
+        ):
+            kept.append(window)
+        if self.spread:
+            self.gathered.spreads[0].add(owned_window(window))
+
+
+@dataclass(frozen=True)
+class GatherStep:
+    """How recordings are read and reduced; it can be sent to another process or machine."""
+
+    table: Table
+    """The reference."""
+    model: SensorModel
+    """Defines the columns."""
+    windows: WindowSettings = WindowSettings()
+    """How windows are found."""
+    nominal: RawReadings | None = None
+    """For recordings in volts or counts."""
+    names: tuple = ()
+    """
+    Names of the recordings for messages; with several of them an error names the one at fault.
+    """
+    spread: bool = False
+    """Whether windows are kept for the search of effects."""
+    judged_from: float = 0.0
+    """Windows from this time on are judged by a proof, s."""
+
+    def gather(self, source: BlockSource, session: int) -> SessionData:
+        """Return the SessionData of a recording and its number."""
+        with naming(self.names, session):
+            return self.read(source, session, Preflight(self.table.gravity_value, one_sensor=True))
+
+    def blocks(self, source: BlockSource) -> Iterable[SampleBlock]:
+        """Return the blocks of a recording as they are gathered."""
+        return source
+
+    def read(
+        self,
+        source: BlockSource,
+        session: int,
+        preflight: Preflight,
+        *,
+        windows: StoredWindows | KeptWindows | list | None = None,
+    ) -> SessionData:
+        """
+        Return the SessionData of a recording, which is read once for its windows and the checks.
+
+        Where the checks find parts without readings, or a sensor that cannot be used, it is read
+        again without them. All windows,
+        unused ones too, are appended to `windows`, which is empty before.
+
+        Raises
+        ------
+        InputError
+            At the end of the recording, when it cannot give a right result (`preflight`).
+
+        """
+        gathered = self._gather(self.blocks(source), session, (preflight,), windows=windows)
+        if len(preflight.without_readings) or preflight.unusable:
+            if windows is not None:
+                windows.clear()
+            gathered = self._gather(
+                self.blocks(source),
+                session,
+                (),
+                windows=windows,
+                without=preflight.without_readings,
+                unusable=tuple(preflight.unusable),
+            )
+        gathered.findings = preflight.findings
+        gathered.unusable = preflight.unusable
+        return gathered
+
+    def _gather(
+        self,
+        blocks: Iterable[SampleBlock],
+        session: int,
+        watchers: Sequence[Watcher],
+        *,
+        windows: StoredWindows | KeptWindows | list | None,
+        without: np.ndarray = NO_RANGES,
+        unusable: Sequence[str] = (),
+    ) -> SessionData:
+        collector = Collector(
+            self.table,
+            self.model,
+            self.windows,
+            nominal=self.nominal,
+            session=session,
+            watchers=watchers,
+            windows=windows,
+            spread=self.spread,
+            judged_from=self.judged_from,
+            without=without,
+            unusable=unusable,
+        )
+        for block in blocks:
+            collector.push(block)
+        return collector.finish()
+
+
+class LiveCollector(Collector):
+    """A Collector that keeps a bounded number of windows."""
+
+    def __init__(
+        self,
+        table: Table,
+        model: SensorModel,
+        options: CalibrationOptions,
+        *,
+        session: int,
+        store: WindowStore,
+    ):
+        super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
+        self.store = store
+        self.gathered.spreads = [DecimatedWindows(MAX_LIVE_SAMPLES)]
+
+    def _store(self, window: Window, reduced: WindowStatistics) -> None:
+        kept = owned_window(window)
+        self.store.add(kept, reduced)
+        self.gathered.spreads[0].add(kept)
+
+    def take_model(self, model: SensorModel) -> None:
+        """
+        Gather the columns of another model from now on.
+
+        Those of all kept windows are computed again.
+        """
+        self.model, self.gathered = (
+            model,
+            self.gathered.anew(self.store.reduced(model, self.table, self.session)),
+        )
+
+    def snapshot(self, pending: bool) -> tuple[SessionData, WindowStore]:
+        """
+        Return copies of the gathered data and of the store.
+
+        With `pending`, open windows are closed in the copies.
+        """
+        twin = copy.copy(self)
+        twin.gathered, twin.store = copied(self.gathered), self.store.copy()
+        if pending:
+            twin.gatherer = copy.deepcopy(self.gatherer)
+            twin.finish()
+        else:
+            twin.update_counts()
+        return twin.gathered, twin.store
+
+
+def copied(gathered: SessionData) -> SessionData:
+    """Return a copy that shares only objects that are never changed in place."""
+    return replace(
+        gathered,
+        accumulator=gathered.accumulator.copy(),
+        held_out=gathered.held_out.copy(),
+        poses=list(gathered.poses),
+        kept=[],
+        counts=dict(gathered.counts),
+        spreads=[spread.copy() for spread in gathered.spreads],
+    )

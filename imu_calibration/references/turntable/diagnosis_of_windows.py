@@ -1,0 +1,189 @@
+"""Diagnosis of a recording on a table: findings, their gains, and the unexplained residual."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
+from imu_calibration.calibration.diagnosis.findings import (
+    candidates_of,
+    finding,
+    motions_of_one_joint,
+    sentence,
+    separating_motion,
+)
+from imu_calibration.effects.base import Role
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.applied_gain_of_windows import (
+    gain_of_findings,
+    gains_of_formulas,
+)
+from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
+from imu_calibration.references.turntable.selection.extended_solution import extended_solution
+from imu_calibration.references.turntable.selection.investigation import Investigation
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.saturation import Saturation
+from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
+from imu_calibration.selection.gain import Gain
+from imu_calibration.selection.questions import Question
+
+MATE = 0.5
+"""
+Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's
+reduction.
+"""
+
+
+HALF = 0.5
+"""
+Share of a finding that an unnamed effect would replace, from which it is reported with the finding.
+"""
+
+
+def build_diagnosis(
+    table: Table, found: Investigation, *, calibrated: Solution | None = None
+) -> Diagnosis:
+    """
+    Return the result of an investigation as a Diagnosis, without traces.
+
+    Parameters
+    ----------
+    table : Table
+        The reference.
+    found : Investigation
+    calibrated : Solution, optional
+        Solution of a model with all findings, with the reported parameters; default: the solution
+        of the investigation.
+
+    """
+    problem = found.problem
+    named = found.named
+    analysis = ResidualAnalysis.of(found, table)
+    unexplained = analysis.unexplained
+    baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
+    solution = baseline
+    if named or found.limits:
+        solution = extended_solution(
+            problem.space, problem.noise, problem.baseline, chosen=named, saturations=found.limits
+        )
+
+    def gain_of(place: int) -> Gain:
+        return gain_of_findings(
+            found,
+            table,
+            named[:place],
+            after=named[: place + 1],
+            sensors=named[place].effect.sensors,
+        )
+
+    def shows(place: int, mate: Question, gain: Gain) -> bool:
+        if gain.sensor not in mate.effect.sensors:
+            return False
+        before = named[:place]
+        by_finding = gain_in_turn(problem, before, [*before, named[place]], sensors=[gain.sensor])
+        by_mate = gain_in_turn(problem, before, [*before, mate], sensors=[gain.sensor])
+        return MATE * by_finding.reduction <= by_mate.reduction
+
+    def motion_of(question: Question, mate: Question) -> str:
+        if len(table.joint_names) == 1:
+            return motions_of_one_joint(question, mate)
+        return separating_motion(solution, question, mate, gravity=table.gravity_value)
+
+    # Implausible findings are not in the calibration.
+    reported = calibrated or solution
+    implausible = found.implausible
+    findings = [_clipping(limit, reported) for limit in found.limits]
+    affected: set[str] = set()
+    for place, question in enumerate(named):
+        affected |= set(question.effect.sensors)
+        findings.append(
+            finding(
+                problem.search,
+                named,
+                place,
+                solution=solution if question in implausible else reported,
+                share=found.explained.share,
+                gain_of=gain_of,
+                motion_of=motion_of,
+                shows=shows,
+                rivals=_rivals(found, question),
+            )
+        )
+    sensors = sorted(affected) or list(unexplained)
+    proposals = [rest.proposal for rest in unexplained.values() if rest.proposal is not None]
+    return Diagnosis(
+        tuple(findings),
+        unexplained,
+        candidates_of(
+            problem.search,
+            named,
+            agree=_agreement(problem),
+            withdrawn=found.unstable,
+            replaced=analysis.replaced,
+        ),
+        tuple(found.not_testable),
+        baseline,
+        solution,
+        gain_of_findings(found, table, [], after=named, sensors=sensors),
+        len(found.used),
+        int(np.sum(problem.locked)),
+        onset=found.onset,
+        stamp_jitter=analysis.stamp_jitter,
+        formula_gains=gains_of_formulas(found, table, proposals),
+    )
+
+
+def _agreement(problem: LinearisedProblem) -> Callable:
+    """Return whether windows and both halves of the recording agree on a chosen effect."""
+
+    def agree(chosen: Sequence[Question], question: Question) -> bool:
+        if not problem.windows_agree(chosen, question):
+            return False
+        return problem.search.agrees_in_halves(chosen, question)
+
+    return agree
+
+
+def _rivals(found: Investigation, question: Question) -> list[Question]:
+    """
+    Return alternatives to a finding, and doubtful effects that would replace it.
+
+    The alternatives fit nearly as well. The doubtful effects would replace half of the finding.
+    """
+    near = [rival.other for rival in found.rivals if rival.question.name == question.name]
+    values = dict(zip(found.problem.space.names, found.problem.values(found.named)))
+    own = [found.problem.space.names[k] for k in question.parameters]
+    for other in found.rejected:
+        moved = found.search.moved_by(found.named, other, found.problem.space.names)
+        near += (
+            [other]
+            if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own)
+            else []
+        )
+    return near
+
+
+def _clipping(limit: Saturation, solution: Solution) -> Finding:
+    effect = solution.model.effect_of(limit.sensor, Role.LIMIT)
+    parameters = parameters_of(solution, limit.sensor, effect.name)
+    gain = Gain(
+        limit.sensor,
+        'clipped samples',
+        limit.rms_before,
+        limit.rms_after,
+        (float('nan'), float('nan')),
+        0,
+    )
+    return Finding(
+        effect.name,
+        limit.sensor,
+        sentence(effect, parameters, None, n_clipped=limit.n_clipped),
+        parameters,
+        limit.p_value,
+        limit.n_expected,
+        1.0,
+        gain,
+        (),
+        '',
+    )

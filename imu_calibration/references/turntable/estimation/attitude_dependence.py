@@ -1,0 +1,88 @@
+"""Means at rest that depend on the attitude, which the parameters of the model do not explain."""
+
+import numpy as np
+
+from imu_calibration.core.distributions import f_sf
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
+from imu_calibration.estimation.scaled_solve import orthonormal_basis
+from imu_calibration.estimation.solution import AttitudeDependence
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+
+MIN_SPARE = 6
+"""Fewest degrees of freedom that must remain after the fit of the attitude."""
+PRODUCT_AXES = np.triu_indices(3)
+"""Axes of the six products of two components of gravity."""
+
+
+def attitude_dependence(
+    system: WeightedSystem, sensor: str, values: np.ndarray, *, noise: NoiseModel
+) -> AttitudeDependence | None:
+    """
+    Return the `AttitudeDependence` of a sensor at rest; None with too few rests.
+
+    The whitened residuals ``r`` of the means at rest, less their part along the design of the
+    model, are fitted with the components f_i of gravity in the sensor and their products f_i f_j,
+    on each axis of the sensor. With S0 the sum of squares of r over n degrees of freedom, and S1
+    that of the fit with m more parameters::
+
+        ratio = (S0 / n) / (S1 / (n - m)),    F = ((S0 - S1) / m) / (S1 / (n - m))
+
+    The offsets of windows and the bias processes of `noise` are part of the whitening. They absorb
+    the dependence, which a ratio does not notice because it divides S0 and S1 alike. A bias that
+    changes with time is no function of the attitude.
+
+    Parameters
+    ----------
+    system : WeightedSystem
+    sensor : str
+    values : ndarray, shape (n_params,)
+        The estimate.
+    noise : NoiseModel
+        Of the sensor.
+
+    """
+    still = np.flatnonzero(np.array(system.kinds) == 'static')
+    model = system.model
+    # The rows of the accelerometer contain the attitude.
+    if len(still) == 0 or 'accelerometer' not in system.sensors:
+        return None
+
+    # Rows of the rests, of each axis: [design | f and its products | residual].
+    means = system.means[sensor][still]
+    design = np.einsum('kp,paq->kaq', means[:, :-3], coefficient_jacobian(model, sensor, values))
+    misfit = system.misfit(sensor, means, values)
+    of_force = model.columns_of('accelerometer', Role.LINEAR)
+    force = system.means['accelerometer'][still][:, of_force]
+    first, second = PRODUCT_AXES
+    shapes = np.concatenate([force, force[:, first] * force[:, second]], axis=1)
+    candidates = np.einsum('ks,ab->kabs', shapes, np.eye(3)).reshape(len(still), 3, -1)
+    rows = np.concatenate([design, candidates, misfit[:, :, None]], axis=2)
+
+    # Independent rows of unit variance.
+    whitening = Whitening(
+        system.mean_variance(noise)[still] + noise.offset_sd**2,
+        system.times[still],
+        sessions_of([system.accumulator.rows[int(index)] for index in still]),
+        processes=noise.bias_processes,
+        session_variance=noise.session_variance,
+    )
+    white = whitening(rows).reshape(3 * len(still), -1)
+    n_design = design.shape[2]
+
+    # S0: without the part along the design. S1: also without the attitude.
+    basis = orthonormal_basis(white[:, :n_design])
+    of_both = orthonormal_basis(white[:, :-1])
+    residual = white[:, -1]
+    before = float(residual @ residual - np.sum((basis.T @ residual) ** 2))
+    after = float(residual @ residual - np.sum((of_both.T @ residual) ** 2))
+    freedom = len(residual) - basis.shape[1]
+    spare = len(residual) - of_both.shape[1]
+    n_added = freedom - spare
+    if n_added == 0 or spare < MIN_SPARE or after <= 0:
+        return None
+    ratio = (before / freedom) / (after / spare)
+    fall = ((before - after) / n_added) / (after / spare)
+    return AttitudeDependence(ratio, float(f_sf(fall, n_added, spare)))

@@ -1,0 +1,98 @@
+"""Model error in standard deviations: the scatter of parameters between blocks of windows."""
+
+import numpy as np
+
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+from imu_calibration.estimation.model_error import (
+    MIN_SCATTER_BLOCKS,
+    ModelError,
+    errors_of_waves,
+    waves_of_blocks,
+)
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+
+COMMON_MEAN_FACTOR = 1.5
+"""
+Factor on the scatter of means in the variance of an accelerometer's bias, which absorbs an error
+with a mean as large as its scatter.
+"""
+
+
+NO_BIAS = 30.0
+"""Biases wander with longer correlation times than this, s."""
+
+
+def model_error(
+    system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray
+) -> ModelError:
+    """
+    Return the model error from the scatter of parameters between blocks, beyond noise.
+
+    Parameters
+    ----------
+    system : WeightedSystem
+    values : ndarray, shape (n_params,)
+        The estimate.
+    noises : dict
+        Sensor -> NoiseModel of the estimate.
+    free : ndarray of bool, shape (n_params,)
+        Parameters that were estimated.
+
+    """
+    if len(system.accumulator.blocks) < MIN_SCATTER_BLOCKS or not free.any():
+        return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
+    waves = waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free=free)
+    found, misfits = errors_of_waves(waves, system.model)
+    if 'accelerometer' in misfits:
+        # An error that depends on the attitude has a mean as large as its scatter, absorbed by the
+        # bias
+        offset = system.model.part('accelerometer', Role.OFFSET)
+        found.scatter_variance[offset] += COMMON_MEAN_FACTOR * _scatter_of_means(
+            noises['accelerometer']
+        )
+    return found
+
+
+def _scatter_of_means(noise: NoiseModel) -> float:
+    """
+    Return the variance of the means between windows.
+
+    From offsets and from bias processes too fast for a bias.
+    """
+    return noise.offset_sd**2 + sum(
+        process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS
+    )
+
+
+def _block_scores(
+    system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the information of each block of windows.
+
+    Shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params).
+    """
+    blocks = system.accumulator.blocks
+    information = np.zeros((len(blocks), len(values), len(values)))
+    gradient = np.zeros((len(blocks), len(values)))
+    block = system.accumulator.block_of(
+        np.array([row.session for row in system.accumulator.rows]), system.times
+    )
+    for sensor in system.sensors:
+        own = coefficients(system.model, sensor, values)
+        slope = coefficient_jacobian(system.model, sensor, values)
+        noise = noises[sensor]
+        white = system.whitened_means(sensor, noise)
+        for number, part in enumerate(blocks):
+            weighed = list(system.weighed_rows(sensor, noise, part))
+            for axis in range(3):
+                # The means of the block's windows, and their centred rows.
+                at = system.columns_and(sensor, axis)
+                centred = [rows[:, at] * weight[axis] for rows, weight in weighed]
+                rows = np.concatenate([white[block == number, axis], *centred])
+                design = rows[:, :-1] @ slope[:, axis]
+                information[number] += design.T @ design
+                gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ own[:, axis])
+    return information, gradient

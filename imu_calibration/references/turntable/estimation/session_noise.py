@@ -1,0 +1,441 @@
+"""Noise of the rows of a session, at rest and in the slow and fast parts of moving windows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.estimation.noise_model import (
+    BiasProcess,
+    MovingFactors,
+    NoiseModel,
+    ReferenceNoise,
+)
+from imu_calibration.estimation.prior import fixed_parameters
+from imu_calibration.references.turntable.estimation.accumulated_rows import MeanRows
+from imu_calibration.references.turntable.estimation.noise_search import estimate_offsets
+from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+
+MIN_VARIANCE_RATIO = 2.0
+"""
+The parts have separate weights above this ratio of their residual variances, fast over slow; below
+it all samples count alike.
+"""
+CAUTIOUS_SDS = 2.0
+"""
+The residual variance of the slow part is raised by this many of its standard deviations, in
+comparison and use.
+"""
+SURE_SDS = 4.0
+"""Standard deviations by which a slow part must exceed that of white noise to show structure."""
+DESIGN_EIGENVALUE_SHARE = 1e-6
+"""
+Directions of a scaled design with less than this share of the largest eigenvalue do not count.
+"""
+RESIDUAL_EIGENVALUE_SHARE = 1e-9
+"""The same for the least residual."""
+WEIGHTLESS = 1e6
+"""Factor on a variance that makes the weight negligible."""
+
+
+@dataclass(frozen=True, eq=False)
+class BandMisfit:
+    """
+    Residual variance per row of the centred rows of one kind of window.
+
+    Equal in all parts for white noise.
+    """
+
+    overall: np.ndarray
+    """Of all rows, shape (3,)."""
+    slow: np.ndarray
+    """
+    Of the means of short pieces, times the root of their length, shape (3,); zero when there are
+    none.
+    """
+    fast: np.ndarray
+    """Of the other rows, shape (3,)."""
+    apart: np.ndarray
+    """Whether slow and fast part have separate weights, shape (3,)."""
+    dof_slow: float = 0.0
+    """Degrees of freedom of the slow part."""
+
+    def slow_over_fast(self, inflation: np.ndarray) -> float:
+        """
+        Return the least plausible ratio of slow over fast residual, 1 at most for white noise.
+
+        It is the ratio of the variances, of the axis with the largest one. A residual with
+        structure is correlated in time, so that its slow part exceeds that of white noise; louder
+        white noise raises both parts alike.
+
+        Parameters
+        ----------
+        inflation : ndarray, shape (3,)
+            Variance of the noise at low frequency over that of white noise (`NoiseModel`).
+
+        """
+        if self.dof_slow < 1:
+            return 0.0
+        largest_chance = 1 + SURE_SDS * np.sqrt(2 / self.dof_slow)
+        noise = np.maximum(self.fast, np.finfo(float).tiny) * np.maximum(inflation, 1.0)
+        return float(np.max(self.slow / (noise * largest_chance)))
+
+    def factors(self, noise: NoiseModel) -> MovingFactors:
+        """
+        Return the excess variance of moving windows with this residual over the noise at rest.
+        """
+        # With separate weights the samples have the variance of the fast part, and only its slow
+        # part counts for the pieces; otherwise the larger excess of both applies to all rows.
+        samples = np.where(self.apart, self.fast, self.overall)
+        pieces = np.where(self.apart, 0.0, self.slow)
+        of_samples = samples / noise.white_variance
+        of_pieces = pieces / noise.low_variance
+        factor = np.maximum.reduce([of_samples, of_pieces, np.ones(3)])
+        slow_factor = np.minimum(np.maximum(self.slow / noise.low_variance, 1.0), factor)
+        return MovingFactors(factor, np.where(self.apart, slow_factor, factor))
+
+    def without_fast(self) -> 'BandMisfit':
+        """Return the same with a variance of the fast part so large that its weight is zero."""
+        return replace(self, fast=np.where(self.apart, WEIGHTLESS * self.fast, self.fast))
+
+    @property
+    def noise(self) -> np.ndarray:
+        """
+        Return the variance that replaces the one of white noise in the absence of rest, shape (3,).
+        """
+        return np.where(self.apart, self.slow, self.overall)
+
+
+def band_misfit(
+    total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_slow: float
+) -> BandMisfit:
+    """
+    Return the `BandMisfit` of centred rows.
+
+    A reference with errors at high frequency (ripple beyond the band of the joint states, an
+    unmodelled low-pass) raises the residual of the fast part. Where the slow part fits worse, its
+    residual variance applies to all rows, because the residual is correlated in time.
+
+    Parameters
+    ----------
+    total, slow : array, shape (3,)
+        Sums of squares of all rows, and of the slow ones among them.
+    dof_total, dof_slow : int
+        Degrees of freedom of both.
+
+    """
+    overall = total / max(dof_total, 1)
+    if dof_slow < 1:
+        return BandMisfit(overall, np.zeros(3), overall, np.zeros(3, bool))
+    of_slow = slow / dof_slow
+    of_fast = np.maximum(total - slow, 0.0) / max(dof_total - dof_slow, 1)
+    cautious = of_slow * (1 + CAUTIOUS_SDS * np.sqrt(2 / dof_slow))
+    apart = of_fast > MIN_VARIANCE_RATIO * cautious
+    return BandMisfit(overall, np.where(apart, cautious, of_slow), of_fast, apart, dof_slow)
+
+
+def own_misfit(rows: np.ndarray) -> np.ndarray:
+    """
+    Return the residuals of the least-squares fit of each axis to rows ``[columns | output]``.
+
+    Shape (k, 3).
+    """
+    columns, output = rows[:, :-3], rows[:, -3:]
+    scale = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(scale > 0, scale, 1.0)
+    if not len(rows):
+        return output
+    return output - columns @ np.linalg.lstsq(columns, output, rcond=1e-10)[0]
+
+
+def misfit_along(products: np.ndarray) -> tuple[float, int]:
+    """
+    Return the sum of squares of projected residuals, and the number of dimensions.
+
+    The residuals are projected on the columns of designs.
+
+    For residual e and design A: ``e' A (A'A)^+ A' e`` and the rank of A, summed over designs. Their
+    ratio is the variance of e when e is white noise. It grows with the number of samples when the
+    best-fit parameters differ from the given ones.
+
+    Parameters
+    ----------
+    products : array, shape (k, q + 1, q + 1)
+        Products of ``[design | residual]``.
+
+    """
+    gram, gradient = products[:, :-1, :-1], products[:, :-1, -1]
+    scale = _scales(np.einsum('kii->ki', gram))
+    eigenvalues, vectors = np.linalg.eigh(gram * scale[:, :, None] * scale[:, None, :])
+    along = np.einsum('kij,ki->kj', vectors, gradient * scale)
+    strong = eigenvalues > DESIGN_EIGENVALUE_SHARE * eigenvalues[:, -1:]
+    squares = along**2 * strong / np.where(strong, eigenvalues, 1.0)
+    return float(squares.sum()), int(strong.sum())
+
+
+def least_misfit(products: np.ndarray) -> tuple[float, int]:
+    """
+    Return the residual sum of squares of the best fit from products of ``[design | output]``.
+
+    Shape (q + 1, q + 1), and the rank.
+    """
+    scale = np.append(_scales(np.diag(products)[:-1]), 1 / np.sqrt(max(products[-1, -1], 1e-300)))
+    scaled = products * np.outer(scale, scale)
+    eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
+    seen = eigenvalues > RESIDUAL_EIGENVALUE_SHARE * max(eigenvalues[-1], 1e-300)
+    along = (vectors.T @ scaled[:-1, -1])[seen]
+    # |output|^2 less the part along the design, in the scale of the output.
+    remaining = max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0)
+    return remaining / scale[-1] ** 2, int(seen.sum())
+
+
+def _scales(squares: np.ndarray) -> np.ndarray:
+    """
+    Return the scales that give columns unit length.
+
+    0 for a column that is zero or negative through rounding.
+    """
+    return np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
+
+
+MIN_INFLATION, MIN_SHAKEN_INFLATION = 0.8, 0.01
+"""
+Least noise at low frequency as a share of white noise of the same variance, at rest and under
+vibration.
+"""
+LEAST_NOISE = {'accelerometer': 1e-6, 'gyroscope': 1e-7}
+"""
+Least noise of a sample, m/s^2 and rad/s: readings of a noise-free simulator are exact except for
+stamps in integer ns.
+"""
+VIBRATES = 4.0
+"""Variance of a window over the quiet level above which the table vibrates."""
+MIN_INFLATION_SAMPLES = 32
+"""Samples of a static window from which its noise at low frequency is estimated."""
+LEAST_MOVING_VARIANCE = 1e-30
+"""Least variance of the noise from moving windows, above zero."""
+
+
+def white_noise(rows: Sequence[MeanRows], sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """
+    Return (white_variance, inflation) pooled over static windows, each shape (3,).
+
+    Or None without static windows.
+
+    Windows whose variance differs from the median by more than a factor of two (clipped, knocked)
+    are excluded. If vibration varies, the reference is the quietest level instead of the median,
+    because vibration changes the means little.
+
+    Parameters
+    ----------
+    rows : sequence of MeanRows
+
+    """
+    static = _rests(rows, sensor)
+    if not static:
+        return None
+
+    # A code may be constant at rest: the noise is at least that of rounding, from moving windows.
+    moving = [row.sensors[sensor].noise_variance for row in rows if row.kind != 'static']
+    rounding = np.array(moving).reshape(-1, 3)
+    rounding = np.where(rounding > 0, rounding, np.inf)
+    floor = np.min(rounding, axis=0, initial=np.inf)
+    floor = np.where(np.isfinite(floor), floor, 0.0)
+    variances = np.maximum([row.sensors[sensor].noise_variance for row in static], floor)
+    inflations = np.array([row.sensors[sensor].inflation for row in static])
+    counts = np.array([row.count for row in static], float)
+
+    pooled = np.empty(3)
+    factors = np.empty(3)
+    for axis in range(3):
+        usual, shaken = _usual(variances[:, axis], inflations[:, axis])
+        near = (variances[:, axis] <= 2 * usual) & (variances[:, axis] >= 0.5 * usual)
+        weight = counts * near
+        pooled[axis] = usual
+        if weight.sum():
+            pooled[axis] = np.average(variances[:, axis], weights=weight)
+        # Short windows have no means of pieces, and hence no inflation.
+        weight = (counts >= MIN_INFLATION_SAMPLES) * near
+        factors[axis] = 1.0
+        if weight.sum():
+            factors[axis] = np.average(inflations[:, axis], weights=weight)
+        factors[axis] = max(factors[axis], MIN_SHAKEN_INFLATION if shaken else MIN_INFLATION)
+    return np.maximum(pooled, LEAST_NOISE[sensor] ** 2), factors
+
+
+def _rests(rows: Sequence[MeanRows], sensor: str) -> list[MeanRows]:
+    """Return the static windows of which the variance of a sensor is known."""
+    found = []
+    for row in rows:
+        if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance)):
+            found.append(row)
+    return found
+
+
+def _usual(variances: np.ndarray, inflations: np.ndarray) -> tuple[float, bool]:
+    """
+    Return (the median variance, False).
+
+    For vibration above the band of the means in most windows, (the second least, True).
+    """
+    median = float(np.median(variances))
+    quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
+    if not 0.0 < VIBRATES * quiet < median:
+        return median, False
+    # Vibration above the band of the means raises the variance of samples, not that of the means.
+    louder = variances > VIBRATES * quiet
+    if float(np.median(inflations[louder])) < MIN_INFLATION:
+        return quiet, True
+    return median, False
+
+
+def shaken_means(rows: Sequence[MeanRows], sensor: str) -> dict[tuple[int, float], np.ndarray]:
+    """
+    Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level.
+    """
+    static = _rests(rows, sensor)
+    if not static:
+        return {}
+    variances = np.array([row.sensors[sensor].noise_variance for row in static])
+    inflations = np.array([row.sensors[sensor].inflation for row in static])
+    of_means = np.zeros(variances.shape)
+    for axis in range(3):
+        quiet, shaken = _usual(variances[:, axis], inflations[:, axis])
+        loud = (variances[:, axis] > VIBRATES * quiet) & shaken
+        of_means[loud, axis] = variances[loud, axis] * inflations[loud, axis]
+    found = {}
+    for row, variance in zip(static, of_means):
+        if variance.any():
+            found[row.session, row.time] = variance / row.count
+    return found
+
+
+def first_noise(
+    system: WeightedSystem, values: np.ndarray, known: dict[str, tuple[BiasProcess, ...]]
+) -> dict[str, NoiseModel]:
+    """
+    Return the initial noise without residuals.
+
+    Fast parts have weight zero where slow parts can be fitted better.
+    """
+    found = {}
+    for sensor in system.sensors:
+        noise = replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))
+        found[sensor] = _with_bands(system, sensor, noise)
+    return found
+
+
+def _at_rest(system: WeightedSystem, sensor: str, values: np.ndarray) -> NoiseModel:
+    """Return the noise from static windows; without one, from the residuals of moving windows."""
+    rows = system.accumulator.rows
+    largest_step = max(row.encoder_step for row in rows)
+    reference = ReferenceNoise.of_steps(largest_step, sensor)
+    white = white_noise(rows, sensor)
+    if white is not None:
+        return NoiseModel(*white, reference=reference, shaken=shaken_means(rows, sensor))
+    variance = np.full(3, LEAST_MOVING_VARIANCE)
+    for kind in system.within[sensor]:
+        variance = np.maximum(variance, moving_misfit(system, sensor, kind, values=values).noise)
+    return NoiseModel(variance, np.ones(3), reference=reference)
+
+
+def _with_bands(system: WeightedSystem, sensor: str, noise: NoiseModel) -> NoiseModel:
+    """
+    Return the noise with weight zero for the fast parts where slow parts fit better.
+
+    The slow parts, fitted separately, have a smaller residual variance there.
+    """
+    moving = {}
+    for kind in system.within[sensor]:
+        misfit = moving_misfit(system, sensor, kind)
+        if misfit.apart.any():
+            moving[kind] = misfit.without_fast().factors(noise)
+    return replace(noise, moving=moving)
+
+
+def updated_noise(
+    system: WeightedSystem, sensor: str, values: np.ndarray, *, noise: NoiseModel
+) -> NoiseModel:
+    """
+    Return the noise of a sensor estimated from the residuals at `values`, starting from `noise`.
+    """
+    if white_noise(system.accumulator.rows, sensor) is None:
+        known, left_out = noise.known, noise.left_out
+        noise = replace(_at_rest(system, sensor, values), known=known, left_out=left_out)
+
+    # Centred rows: the excess over the noise at rest.
+    moving = {}
+    for kind in system.within[sensor]:
+        moving[kind] = _judged(system, sensor, kind, values).factors(noise)
+    noise = replace(noise, moving=moving)
+
+    # Means: offsets of windows and bias processes.
+    rows, information = system.linearised(sensor, values, noise)
+    white = system.mean_variance(noise, beside_bias=False)
+    offsets = estimate_offsets(
+        rows,
+        white,
+        system.times,
+        sessions=system.sessions,
+        information=information,
+        known=noise.known,
+        durations=system.durations,
+    )
+    return replace(noise, **offsets)
+
+
+def _judged(system: WeightedSystem, sensor: str, kind: str, values: np.ndarray) -> BandMisfit:
+    """
+    Return the misfit of the centred rows of a kind.
+
+    Of the fast part at least the misfit along the parameters.
+    """
+    misfit = moving_misfit(system, sensor, kind, values=values)
+    if not misfit.apart.any():
+        return misfit
+    slopes = coefficient_jacobian(system.model, sensor, values)
+    slopes = slopes[:, :, ~fixed_parameters(system.model)]
+
+    def products(rows: np.ndarray, axis: int) -> np.ndarray:
+        """Return the products of ``[design | residual]`` of one axis."""
+        design = rows[:, :-3] @ slopes[:, axis]
+        residual = system.misfit(sensor, rows, values)[:, axis]
+        joined = np.column_stack([design, residual])
+        return joined.T @ joined
+
+    all_rows = system.within[sensor][kind]
+    slow_rows = system.accumulator.slow[sensor, kind]
+    along = np.zeros(3)
+    for axis in range(3):
+        of_fast = products(all_rows, axis) - products(slow_rows, axis)
+        squares, rank = misfit_along(of_fast[None])
+        along[axis] = squares / max(rank, 1)
+    return replace(misfit, fast=np.where(misfit.apart, np.maximum(misfit.fast, along), misfit.fast))
+
+
+def moving_misfit(
+    system: WeightedSystem, sensor: str, kind: str, *, values: np.ndarray | None = None
+) -> BandMisfit:
+    """
+    Return the misfit of the centred rows of a kind at `values`.
+
+    Without them, of each part at its own best fit.
+    """
+    accumulator = system.accumulator
+    rows = system.within[sensor][kind]
+    # Each window loses one slow row to its mean.
+    n_slow = accumulator.slow_rows.get(kind, 0) - accumulator.windows[kind]
+    slow_rows = rows[:0]
+    if n_slow > 0:
+        slow_rows = accumulator.slow[sensor, kind]
+
+    def squares(part: np.ndarray) -> np.ndarray:
+        """Return the sums of squares of the residuals of a part, shape (3,)."""
+        if values is None:
+            residual = own_misfit(part)
+        else:
+            residual = system.misfit(sensor, part, values)
+        return (residual**2).sum(axis=0)
+
+    return band_misfit(squares(rows), system.dof_within[kind], squares(slow_rows), dof_slow=n_slow)

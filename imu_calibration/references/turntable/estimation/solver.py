@@ -1,0 +1,402 @@
+"""Weighted least squares over all windows: noise, outliers, held parameters, covariance."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.core.errors import NotObservableError
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.gauss_newton import gauss_newton, halved
+from imu_calibration.estimation.held_parameters import Factors, undetermined_parameters, weak_alone
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
+from imu_calibration.estimation.prior import fixed_parameters
+from imu_calibration.estimation.scaled_solve import covariance_with_held, scaled_lstsq
+from imu_calibration.estimation.solution import (
+    AttitudeDependence,
+    Solution,
+    terms_of_fit,
+)
+from imu_calibration.estimation.whitening import predict_session_offsets
+from imu_calibration.references.turntable.estimation.accumulated_rows import (
+    AccumulatedRows,
+    not_separable,
+)
+from imu_calibration.references.turntable.estimation.attitude_dependence import attitude_dependence
+from imu_calibration.references.turntable.estimation.implausible_parameters import (
+    implausible_parameters,
+)
+from imu_calibration.references.turntable.estimation.model_error_of_windows import model_error
+from imu_calibration.references.turntable.estimation.session_noise import (
+    first_noise,
+    moving_misfit,
+    updated_noise,
+)
+from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.estimation.window_outliers import outlier_windows
+
+NOISE_ROUNDS = 6
+"""Largest number of alternating estimates of noise and parameters."""
+LEAVING_ROUNDS = 5
+"""Largest number of rounds of outlier exclusion; one outlier may hide another."""
+MAX_SOLVE_STEPS = 40
+"""Largest number of Gauss-Newton steps of one solve."""
+SMALL_STEP = 1e-7
+"""A solve ends with a step below this many standard deviations."""
+SMALL_STEP_OF_NOISE = 0.01
+"""The same while the noise is not known yet."""
+MAX_HALVINGS = 11
+"""Largest number of times that a step is halved which raises the cost."""
+EQUALLY_WEAK = 0.99
+"""Part of the largest share of a prior's sd from which parameters are equally undetermined."""
+START_PENALTY = 1e-6
+"""Weight of the nominal sensor in the first values, for motions that do not determine them."""
+Noises = dict[str, NoiseModel]
+"""Sensor -> its noise."""
+
+
+def solve(
+    accumulator: AccumulatedRows,
+    model: SensorModel,
+    *,
+    allow_holding: bool = True,
+    noise: dict[str, NoiseModel] | None = None,
+    bias_processes: dict[str, tuple[BiasProcess, ...]] | None = None,
+) -> Solution:
+    """
+    Estimate all parameters jointly from accumulated windows.
+
+    Minimises the sum of squares of whitened rows ``[columns | output] @ [coefficients(values);
+    -1]`` over all windows and axes plus the prior. Window offsets and bias processes are part of
+    the noise (restricted maximum likelihood).
+
+    Parameters
+    ----------
+    accumulator : AccumulatedRows
+        Rows of windows, reduced with the columns of `model`.
+    model : SensorModel
+    allow_holding : bool
+        Whether parameters that the data do not determine may be fixed at their prior.
+    noise : dict, optional
+        Sensor -> NoiseModel, if known.
+    bias_processes : dict, optional
+        Sensor -> bias processes from a separate measurement; the other noise parameters are
+        estimated.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    NotObservableError
+        When no parameter is determined, or one is undetermined and `allow_holding` is False.
+
+    """
+    if not accumulator.rows:
+        raise NotObservableError(
+            'at least one static window, spin or dynamic stretch must be found, none was; '
+            'rest the table between moves, or check the joint states',
+            code='no_windows',
+        )
+    system = WeightedSystem(accumulator, model)
+    prior = system.prior
+    free = ~fixed_parameters(model)
+
+    # Noise, first values, and windows that deviate.
+    values = start(system)
+    noises = noise or first_noise(system, values, bias_processes or {})
+    if noise is None:
+        values, noises = _with_estimated_noise(system, values, noises, free)
+
+    # Parameters that the data do not determine are fixed at their prior.
+    factors = _factors(system, noises)
+    values = _minimised(system, values, factors, free)
+    data = system.jacobian(values, factors)
+    held = undetermined_parameters(
+        np.concatenate([data, prior.root]),
+        prior.sd,
+        free=free,
+        held=free & weak_alone(data, prior.sd),
+        tie=EQUALLY_WEAK,
+    )
+    held |= not_separable(accumulator, model)
+    _refuse_held(held, free, model, allow_holding)
+
+    # Values that only misfit gives are fixed too: solve without them, until all are plausible.
+    not_believed: dict[str, float] = {}
+    while True:
+        estimated = free & ~held
+        if held.any():
+            values = _minimised(system, np.where(held, prior.mean, values), factors, estimated)
+        data = system.jacobian(values, factors)
+        rows = np.concatenate([data, prior.root])
+        own, of_held = covariance_with_held(rows, estimated, held, prior_sd=prior.sd)
+        sd = np.sqrt(np.diag(own + of_held))
+        implausible = implausible_parameters(system, values, sd=sd, noises=noises, free=estimated)
+        nothing_remains = (held | implausible | ~free).all()
+        if not allow_holding or not implausible.any() or nothing_remains:
+            break
+        for name, value, flag in zip(model.param_names, values, implausible):
+            if flag:
+                not_believed[name] = float(value)
+        held |= implausible
+
+    # The covariance as a sum of named terms: C = C_noise + C_bias + C_held + C_model.
+    of_bias = own @ system.bias_information(values, noises) @ own
+    of_model = model_error(system, values, noises, free=free & ~held)
+    terms = {**terms_of_fit(own, of_bias, of_held), **of_model.terms(own + of_held)}
+    quality = _fit_quality(system, values, noises)
+    return Solution(
+        model,
+        values,
+        terms,
+        held,
+        noises,
+        quality.chi2,
+        data.T @ data,
+        quality.rms,
+        _session_biases(system, values, noises),
+        not_believed,
+        slow_over_fast=quality.slow_over_fast,
+        attitude=quality.attitude,
+    )
+
+
+def _with_estimated_noise(
+    system: WeightedSystem, values: np.ndarray, noises: Noises, free: np.ndarray
+) -> tuple[np.ndarray, Noises]:
+    """Return (values, noise) without the windows that deviate; one outlier may hide another."""
+    values, noises = _alternately(system, values, noises, free)
+    for _ in range(LEAVING_ROUNDS):
+        more = outlier_windows(system, values, noises)
+        if not any(more.values()):
+            break
+        without = {}
+        for sensor in system.sensors:
+            left_out = noises[sensor].left_out | more[sensor]
+            without[sensor] = replace(noises[sensor], left_out=left_out)
+        values, noises = _alternately(system, values, without, free)
+    return values, noises
+
+
+def _alternately(
+    system: WeightedSystem, values: np.ndarray, noises: Noises, free: np.ndarray
+) -> tuple[np.ndarray, Noises]:
+    """
+    Return (values, noise), estimated alternately.
+
+    One round usually suffices: the likelihood of the offsets is restricted, so it does not depend
+    on the values of the parameters. With separate weights of slow and fast parts, weights and
+    parameters depend on each other.
+    """
+    for _ in range(NOISE_ROUNDS):
+        factors = _factors(system, noises)
+        values = _minimised(system, values, factors, free, enough=SMALL_STEP_OF_NOISE)
+        before = noises
+        noises = {}
+        for sensor in system.sensors:
+            noises[sensor] = updated_noise(system, sensor, values, noise=before[sensor])
+        if all(noises[sensor].weighs_alike(before[sensor]) for sensor in system.sensors):
+            break
+    return values, noises
+
+
+def _refuse_held(
+    held: np.ndarray, free: np.ndarray, model: SensorModel, allow_holding: bool
+) -> None:
+    """Raise where no parameter is determined, or one is not and must be."""
+    if (held | ~free).all():
+        raise NotObservableError(
+            'the recording must determine at least one parameter, it determines none; '
+            'record static positions in at least four different attitudes'
+        )
+    if held.any() and not allow_holding:
+        names = [name for name, flag in zip(model.param_names, held) if flag]
+        raise NotObservableError(
+            f'every parameter must be determined, {len(names)} are not: {", ".join(names)}; '
+            'record more motion or allow holding',
+            code='undetermined',
+        )
+
+
+def start(system: WeightedSystem) -> np.ndarray:
+    """
+    Return the solution for bias and matrix of each sensor, all other parameters at their prior.
+
+    Shape (n_params,).
+    """
+    model = system.model
+    values = model.start()
+    values = np.where(np.isfinite(values), values, 0.0)
+    weight = np.sqrt(system.counts / system.counts.max())[:, None]
+    nominal = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    penalty = START_PENALTY * np.eye(4)
+    for sensor in system.sensors:
+        columns = np.arange(model.layout(sensor).width)
+        of_bias = columns[model.columns_of(sensor, Role.OFFSET)]
+        of_matrix = columns[model.columns_of(sensor, Role.LINEAR)]
+        means = system.means[sensor]
+        design = np.concatenate([weight * means[:, [*of_bias, *of_matrix]], penalty])
+        target = np.concatenate([weight * means[:, -3:], penalty @ nominal])
+        solution = np.linalg.lstsq(design, target, rcond=None)[0]
+        values[model.part(sensor, Role.OFFSET)] = solution[0]
+        values[model.part(sensor, Role.LINEAR)] = solution[1:].T.ravel()
+    return values
+
+
+def _factors(system: WeightedSystem, noises: Noises) -> Factors:
+    """Return the triangular factors of the whitened rows of both sensors."""
+    return {sensor: system.factors(sensor, noises[sensor]) for sensor in system.sensors}
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Values of the parameters with their residuals."""
+
+    values: np.ndarray
+    """Shape (n_params,)."""
+    residual: np.ndarray
+    """Whitened residuals, those of the prior last, shape (m,)."""
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step of the free parameters."""
+
+    change: np.ndarray
+    """Shape (n_free,)."""
+    length: float
+    """Largest change in sds of each parameter if all other ones were known."""
+
+
+@dataclass(frozen=True, eq=False)
+class _WindowSquares:
+    """Sum of squares of triangular factors of all windows and of the prior (`LeastSquares`)."""
+
+    system: WeightedSystem
+    factors: Factors
+    """Triangular factors of the whitened rows."""
+    free: np.ndarray
+    """True for the parameters that are estimated, shape (n_params,)."""
+    enough: float
+    """Length of the last step."""
+
+    def at(self, values: np.ndarray) -> _Point:
+        """Return values with their residuals."""
+        return _Point(values, self.system.residuals(values, self.factors))
+
+    def step(self, point: _Point) -> _Step:
+        """Return the step from a point."""
+        prior = self.system.prior
+        data = self.system.jacobian(point.values, self.factors)[:, self.free]
+        rows = np.concatenate([data, prior.root[:, self.free]])
+        change = scaled_lstsq(rows, -point.residual)
+        information = (data**2).sum(axis=0) + 1 / prior.sd[self.free] ** 2
+        return _Step(change, float(np.max(np.abs(change) * np.sqrt(information), initial=0.0)))
+
+    def moved(self, point: _Point, step: _Step) -> _Point:
+        """Return the point after the longest of the halved steps that does not raise the cost."""
+
+        def after(share: float) -> _Point:
+            values = point.values.copy()
+            values[self.free] += step.change * share
+            return self.at(values)
+
+        return halved(point, after, lambda each: each.cost, n_halvings=MAX_HALVINGS)
+
+    def is_last(self, point: _Point, step: _Step) -> bool:
+        """Return whether a step is small; a large misfit limits the accuracy."""
+        return step.length < self.enough * max(1.0, 1e-7 * np.sqrt(point.cost))
+
+
+def _minimised(
+    system: WeightedSystem,
+    values: np.ndarray,
+    factors: Factors,
+    free: np.ndarray,
+    enough: float = SMALL_STEP,
+) -> np.ndarray:
+    """Return the values of least cost; steps below `enough` standard deviations are the last."""
+    squares = _WindowSquares(system, factors, free, enough)
+    return gauss_newton(squares, squares.at(values), n_steps=MAX_SOLVE_STEPS).values
+
+
+@dataclass(frozen=True, eq=False)
+class _FitQuality:
+    """How well the rows fit."""
+
+    chi2: dict[str, dict[str, float]]
+    """Sensor -> 'means' or kind of the centred rows -> chi-square per degree of freedom."""
+    rms: dict[str, np.ndarray]
+    """Sensor -> rms residual of the moving samples and of the means of windows, SI, shape (2,)."""
+    slow_over_fast: dict[str, dict[str, float]]
+    """Sensor -> kind -> `BandMisfit.slow_over_fast`."""
+    attitude: dict[str, AttitudeDependence]
+    """Sensor -> its means at rest with the attitude, with sufficiently many rests."""
+
+
+def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> _FitQuality:
+    """Return the `_FitQuality` at the estimate."""
+    chi2 = {}
+    rms = {}
+    slow_over_fast = {}
+    attitude = {}
+    for sensor in system.sensors:
+        noise = noises[sensor]
+        dependence = attitude_dependence(system, sensor, values, noise=noise)
+        if dependence is not None:
+            attitude[sensor] = dependence
+        misfit = system.misfit(sensor, system.means[sensor], values)
+        white = system.whitened(misfit[:, :, None], noise)
+        freedom = max(white.size - _parameters_of_means(system, sensor), 1)
+        chi2[sensor] = {'means': float((white**2).sum() / freedom)}
+        slow_over_fast[sensor] = {}
+        moving_squares = 0.0
+        moving_count = 0
+        for kind, rows in system.within[sensor].items():
+            squares = (system.misfit(sensor, rows, values) ** 2).sum(axis=0)
+            expected = system.dof_within[kind] * noise.white_variance
+            chi2[sensor][kind] = float(np.mean(squares / expected))
+            moving_squares = moving_squares + squares.sum()
+            moving_count += 3 * system.dof_within[kind]
+            bands = moving_misfit(system, sensor, kind, values=values)
+            slow_over_fast[sensor][kind] = bands.slow_over_fast(noise.inflation)
+        rms_moving = np.sqrt(moving_squares / moving_count) if moving_count else np.nan
+        rms[sensor] = np.array([rms_moving, np.sqrt((misfit**2).mean())])
+    return _FitQuality(chi2, rms, slow_over_fast, attitude)
+
+
+def _session_biases(
+    system: WeightedSystem, values: np.ndarray, noises: Noises
+) -> dict[str, np.ndarray]:
+    """
+    Return the bias of each recording for sensors with a bias of its own per recording.
+
+    The best linear prediction.
+    """
+    found = {}
+    for sensor in system.sensors:
+        noise = noises[sensor]
+        if noise.session_variance <= 0:
+            continue
+        misfit = system.misfit(sensor, system.means[sensor], values)
+        variance = system.mean_variance(noise) + noise.offset_sd**2
+        offsets = predict_session_offsets(
+            misfit, variance, system.times, sessions=system.sessions, noise=noise
+        )
+        found[sensor] = values[system.model.part(sensor, Role.OFFSET)] + offsets
+    return found
+
+
+def _parameters_of_means(system: WeightedSystem, sensor: str) -> int:
+    """
+    Return how many parameters the means determine: the ones of the sensor, at most half the data.
+    """
+    own = sum(effect.size for effect in system.model.concerning(sensor))
+    return min(own, system.means[sensor].shape[0] * 3 // 2)

@@ -1,0 +1,142 @@
+"""Windows whose means deviate from the other windows of their kind."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.core.distributions import chance_of_fall
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.outliers import Outliers, find_outliers
+from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+
+MAX_WINDOW_OUTLIERS = 0.15
+"""
+Largest share of each kind that is excluded; a more frequent deviation is a property of the
+recording.
+"""
+MIN_WINDOW_FREEDOM = 9.0
+"""Residual degrees of freedom of the other windows of the kind that the test requires."""
+OUTLIER_CANDIDATES = 8
+"""Windows of each kind under test per round, in order of their residual."""
+LEAST_SEEN = 0.05
+"""A window whose error keeps less than this share in the residuals is not tested."""
+WindowKey = tuple[int, float]
+"""Recording, and middle of the window in s."""
+
+
+def outlier_windows(
+    system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
+) -> dict[str, frozenset[WindowKey]]:
+    """
+    Return sensor -> keys of the outlying windows, without those that the noise excludes already.
+
+    Mean-shift F test, one kind of window per round (the one with the least probable outlier),
+    because with a bias process one outlier makes its neighbours look inconsistent.
+
+    A separate offset for one window must improve the fit of the other windows significantly (F test
+    with Bonferroni correction). The noise may be overestimated because of that window; the factor
+    is common to all windows and cancels in the ratio.
+
+    Parameters
+    ----------
+    system : WeightedSystem
+    values : ndarray, shape (n_params,)
+        The estimate.
+    noises : dict
+        Sensor -> NoiseModel of the estimate.
+
+    """
+    kinds = np.array(system.kinds)
+    found = {}
+    for sensor in system.sensors:
+        fit = _MeanFit.of(system, sensor, values, noises[sensor])
+        excluded = np.array([key in noises[sensor].left_out for key in system.keys])
+        of_kinds = []
+        for kind in sorted(set(system.kinds)):
+            of_kinds.append(_outliers_of_kind(kinds == kind, excluded, fit))
+        # The kind with the least probable outlier.
+        most = min(of_kinds, key=lambda outliers: outliers.least_p_value)
+        found[sensor] = frozenset(system.keys[window] for window in most.numbers)
+    return found
+
+
+def _outliers_of_kind(of_kind: np.ndarray, excluded: np.ndarray, fit: '_MeanFit') -> Outliers:
+    """Return the outliers among the windows of a kind (mask) that are not `excluded` (mask)."""
+    count = int(of_kind.sum())
+    kept = np.flatnonzero(of_kind & ~excluded)
+    n_allowed = max(1, int(MAX_WINDOW_OUTLIERS * count)) - (count - len(kept))
+    if n_allowed <= 0:
+        return Outliers(1.0, ())
+
+    # The windows with the largest residuals are tested.
+    squares = (fit.residual[kept] ** 2).sum(axis=1)
+    tested = kept[np.argsort(-squares, kind='stable')][:OUTLIER_CANDIDATES]
+    p_values = {int(window): fit.p_value(window, kept) for window in tested}
+    return find_outliers(p_values, n_tests=len(kept), most=n_allowed)
+
+
+@dataclass(frozen=True, eq=False)
+class _MeanFit:
+    """Whitened means of one sensor with the covariance of the parameters."""
+
+    residual: np.ndarray
+    """Whitened residuals, shape (n_windows, 3)."""
+    design: np.ndarray
+    """Whitened columns, shape (n_windows, 3, q)."""
+    covariance: np.ndarray
+    """Of the parameters, from the means, the centred rows and the prior, shape (q, q)."""
+    whiten: Callable[[np.ndarray], np.ndarray]
+    """Function that whitens columns, shape (n_windows, 3, k)."""
+
+    @classmethod
+    def of(
+        cls, system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel
+    ) -> '_MeanFit':
+        rows, normal = system.linearised(sensor, values, noise)
+        white = system.whitened(rows, noise)
+        design = white[:, :, :-1]
+        q = design.shape[2]
+        normal = normal[:q, :q] + np.einsum('kap,kaq->pq', design, design)
+        return cls(
+            white[:, :, -1],
+            design,
+            inverse_normal(normal),
+            lambda columns: system.whitened(columns, noise),
+        )
+
+    def p_value(self, window: int, of_kind: np.ndarray) -> float:
+        """
+        Return the p-value of a separate offset b for one window.
+
+        With the whitened column h of the offset, the design A and the covariance C of the
+        parameters, of each axis::
+
+            s = h' h - h' A C A' h            share of h that the parameters do not take up
+            b = h' r / s
+            r -> r - (h - A C A' h) b
+
+        The test concerns the improvement of the windows `of_kind`.
+        """
+        column = np.zeros(self.residual.shape + (1,))
+        column[window] = 1.0
+        column = self.whiten(column)[:, :, 0]
+        along = np.einsum('kap,ka->ap', self.design, column)
+        squares = (column**2).sum(axis=0)
+        visible = squares - np.einsum('ap,pq,aq->a', along, self.covariance, along)
+        if np.any(visible < LEAST_SEEN * squares):
+            return 1.0
+        offset = (column * self.residual).sum(axis=0) / visible
+        taken_up = np.einsum('kap,pq,aq->ka', self.design, self.covariance, along)
+        improved = self.residual - (column - taken_up) * offset
+
+        # F test of three offsets with the residual degrees of freedom of these windows.
+        design = self.design[of_kind]
+        leverage = np.einsum('kap,pq,kaq->ka', design, self.covariance, design).sum()
+        freedom = 3 * len(of_kind) - leverage - 3
+        if freedom < MIN_WINDOW_FREEDOM:
+            return 1.0
+        without_offset = (self.residual[of_kind] ** 2).sum()
+        with_offset = (improved[of_kind] ** 2).sum()
+        return chance_of_fall(without_offset - with_offset, 3, rest=with_offset, spare=freedom)

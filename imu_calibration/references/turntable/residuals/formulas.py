@@ -1,0 +1,473 @@
+"""Formulas of regressors for a residual: grammar, search, and evaluation."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations, combinations_with_replacement, product
+
+import numpy as np
+from scipy.linalg import svd
+
+from imu_calibration.core.distributions import chi2_sf
+from imu_calibration.effects.base import AXES, TEMPERATURE_RISE
+from imu_calibration.effects.expressions import (
+    FUNCTIONS,
+    PLACES,
+    QUANTITY_OF,
+    array_function,
+    names_in,
+    read,
+)
+from imu_calibration.references.turntable.residuals.residual_blocks import RestBlocks
+from imu_calibration.selection.search import FAMILY_WISE, TIE
+
+JOINT_ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
+"""Harmonics per turn: of one joint, of two joints at once, of a joint times another quantity."""
+CONSTANTS = (0.07, 0.2, 0.6)
+"""Time constants of settling, as shares of the recording."""
+SOFT_SIGN = 'tanh({} / 0.005)'
+"""
+The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise,
+and would shake the bias there.
+"""
+TEMPERATURE_FACTOR = f'({TEMPERATURE_RISE})'
+UNIT_OF = {
+    'force': 'm/s^2',
+    'rate': 'rad/s',
+    'angular acceleration': 'rad/s^2',
+    'temperature': 'K',
+    'temperature rate': 'K/s',
+    'joint rate': 'rad/s',
+    'time': 's',
+}
+"""Quantity -> unit of one factor of it; angles, attitudes and arguments of functions have none."""
+Column = str | tuple[str, ...]
+"""Text of a column for all axes, or of three, one for each axis."""
+Product = tuple[str, tuple[str, ...]]
+"""Text of a product, and the quantities that it is the product of."""
+
+
+@dataclass(frozen=True)
+class Formula:
+    """Columns that are tried together: with one amplitude for each column and axis."""
+
+    columns: tuple
+    """Texts: each a str for all axes, or three, one for each axis."""
+    factors: tuple
+    """Quantities that a column is the product of, with repetition; its unit follows."""
+    phased: str = ''
+    """
+    The same with a phase, where the columns are the cosine and the sine of one angle: text with
+    {phase}.
+    """
+
+    @property
+    def family(self) -> frozenset[str]:
+        """Quantities in it."""
+        quantities = set()
+        for column in self.columns:
+            for text in (column,) if isinstance(column, str) else column:
+                for name in names_in(read(text)):
+                    quantities.add(QUANTITY_OF[name])
+        return frozenset(quantities) - {'reference temperature'}
+
+    @property
+    def smooth(self) -> bool:
+        """Whether it changes slowly, as every bias does."""
+        return self.family <= {'time', 'temperature', 'temperature rate'}
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Measure of complexity: columns; factors and functions."""
+        text = str(self.columns[0])
+        n_functions = sum(text.count(f'{name}(') for name in FUNCTIONS)
+        return len(self.columns), len(self.factors) + n_functions
+
+    def unit(self, output: str) -> str:
+        """Return the unit of an amplitude, with `output` that of the sensor."""
+        powers = Counter(UNIT_OF[factor] for factor in self.factors if factor in UNIT_OF)
+        text = output
+        for unit, power in powers.items():
+            text += f'/({unit})' if '/' in unit else f'/{unit}'
+            if power > 1:
+                text += f'^{power}'
+        return text
+
+
+@lru_cache(maxsize=16)
+def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...]:
+    """
+    Return the formulas that are tried.
+
+    Products of up to three of specific force and rate; angular acceleration, magnitudes and signs
+    with one more factor; all of these times the temperature and times settling; harmonics of one
+    joint, of two joints, times the joint's rate, the temperature, or the sensor's input; and
+    vectors fixed to the table while the sensor turns.
+
+    Parameters
+    ----------
+    n_joints : int
+        Joints of the table.
+    thermal : bool
+        Whether a temperature was recorded.
+    duration : float
+        Length of the recording, s, to two digits: texts hold time constants.
+
+    """
+    formulas = []
+    for text, factors in (*_of_motion(), *_slow(thermal, duration)):
+        formulas.append(Formula((text,), factors))
+    formulas += _harmonics(n_joints, thermal)
+    formulas += _of_joint_rates(n_joints)
+    formulas += _with_the_table(n_joints, thermal)
+    return tuple(formulas)
+
+
+def _atoms(*letters: str) -> list[Product]:
+    """Return the components of the motion: of force (f), rate (w), angular acceleration (alpha)."""
+    quantities = {'f': 'force', 'w': 'rate', 'alpha': 'angular acceleration'}
+    return [(f'{letter}_{axis}', (quantities[letter],)) for letter in letters for axis in AXES]
+
+
+def _sense(text: str) -> str:
+    """Return the sign of a quantity; of a rate a smooth one."""
+    return SOFT_SIGN.format(text) if text.startswith('w') else f'sign({text})'
+
+
+def _times(*parts: Product) -> Product:
+    """Return (text, factors) of a product, powers gathered: f_x, f_x, w_y is f_x ** 2 * w_y."""
+    powers: dict[str, int] = {}
+    factors: tuple[str, ...] = ()
+    for text, factors_of_text in parts:
+        powers[text] = powers.get(text, 0) + 1
+        factors += factors_of_text
+    texts = []
+    for text, power in powers.items():
+        texts.append(text if power == 1 else f'{text} ** {power}')
+    return ' * '.join(texts), factors
+
+
+def _monomials(degree: int) -> list[Product]:
+    """Return the products of `degree` components of force and rate."""
+    return [_times(*parts) for parts in combinations_with_replacement(_atoms('f', 'w'), degree)]
+
+
+def _of_motion() -> Iterator:
+    """Yield the formulas of force, rate and angular acceleration."""
+    components = _atoms('f', 'w')
+    for degree in (1, 2, 3):
+        yield from _monomials(degree)
+    yield from _atoms('alpha')
+    for pair in product(_atoms('alpha'), components):
+        yield _times(*pair)
+
+    # Magnitude and sign, single and with one more factor; the sign times its own quantity is the
+    # magnitude.
+    for text, factors in components:
+        magnitude = (f'abs({text})', factors)
+        yield magnitude
+        for component in components:
+            yield _times(magnitude, component)
+        sign: Product = (_sense(text), ())
+        yield sign
+        for component in components:
+            if component[0] != text:
+                yield _times(sign, component)
+
+    for letter, name in (('f', 'force'), ('w', 'rate')):
+        squares = ' + '.join(f'{letter}_{axis} ** 2' for axis in AXES)
+        yield squares, (name, name)
+        yield f'sqrt({squares})', (name,)
+
+
+def _slow(thermal: bool, duration: float) -> Iterator:
+    """Yield the formulas with temperature or time, alone and times motion."""
+    warm: Product = (TEMPERATURE_FACTOR, ('temperature',))
+    slow: list[Product] = []
+    if thermal:
+        yield 'temperature_rate', ('temperature rate',)
+        for power in (2, 3):
+            yield f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power
+        slow.append(warm)
+    for share in CONSTANTS:
+        slow.append((f'(1 - exp(-time / {share * duration:.3g}))', ()))
+    slow.append(('time', ('time',)))
+
+    for factor in slow:
+        for entry in (*_monomials(1), *_monomials(2)):
+            yield _times(factor, entry)
+        for text, factors in _atoms('f', 'w'):
+            yield _times(factor, (f'abs({text})', factors))
+            yield _times(factor, (_sense(text), ()))
+    if thermal:
+        for entry in _monomials(1):
+            yield _times(warm, warm, entry)
+
+
+def _turn(joint: int, order: int, before: str = '') -> tuple[str, str, str]:
+    """Return (cosine, sine, text with a phase) of an order of a joint."""
+    inside = f'angle_{joint}' if order == 1 else f'{order} * angle_{joint}'
+    return f'{before}cos({inside})', f'{before}sin({inside})', f'{before}cos({inside} - {{phase}})'
+
+
+def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
+    """Yield cosine and sine of the angle of one joint, and their products for two joints."""
+    joints = range(1, n_joints + 1)
+    for joint, order in product(joints, JOINT_ORDERS):
+        prefixes = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))]
+        if thermal:
+            prefixes.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
+        if order in FEW_ORDERS:
+            prefixes += [(f'{text} * ', factors) for text, factors in _atoms('f', 'w')]
+        for prefix, factors in prefixes:
+            cosine, sine, phased = _turn(joint, order, prefix)
+            yield Formula((cosine, sine), factors, phased)
+
+    # cos a cos b, cos a sin b, sin a cos b, sin a sin b: any phase of both.
+    for first, second in combinations(joints, 2):
+        for first_order, second_order in product(PAIR_ORDERS, PAIR_ORDERS):
+            of_first = _turn(first, first_order)[:2]
+            of_second = _turn(second, second_order)[:2]
+            yield Formula(tuple(f'{a} * {b}' for a, b in product(of_first, of_second)), ())
+
+
+def _of_joint_rates(n_joints: int) -> Iterator[Formula]:
+    """Yield magnitude, sign, signed square of a joint's rate, and products of up to two rates."""
+    rates = [(f'joint_rate_{joint}', ('joint rate',)) for joint in range(1, n_joints + 1)]
+    for text, factors in rates:
+        yield Formula((f'abs({text})',), factors)
+        yield Formula((SOFT_SIGN.format(text),), ())
+        yield Formula((f'{text} * abs({text})',), factors * 2)
+    for degree in (1, 2):
+        for parts in combinations_with_replacement(rates, degree):
+            text, factors = _times(*parts)
+            yield Formula((text,), factors)
+
+
+def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
+    """Yield vectors fixed to the level frame while the sensor turns."""
+    joints = range(1, n_joints + 1)
+    # The components of a level axis along the axes of the sensor: elements of the attitude.
+    vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
+    prefixes: list[tuple[str, tuple[str, ...]]] = [('', ())]
+    if thermal:
+        prefixes.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
+    for joint in joints:
+        prefixes.append((f'joint_rate_{joint} * ', ('joint rate',)))
+    for prefix, factors in prefixes:
+        yield Formula(tuple(_each_times(prefix, vector) for vector in vectors), factors)
+    for vector, joint, order in product(vectors, joints, FEW_ORDERS):
+        cosine, sine, _ = _turn(joint, order)
+        columns = (_each_times(f'{cosine} * ', vector), _each_times(f'{sine} * ', vector))
+        yield Formula(columns, ())
+
+
+def _each_times(prefix: str, vector: Sequence[str]) -> tuple[str, ...]:
+    return tuple(prefix + text for text in vector)
+
+
+NEW = 1e-3
+"""Least share of a column's size outside the span of the catalogue for a test of it."""
+COLUMN_CHUNK = 128
+"""Columns that are worked out at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class FormulaChoice:
+    """One formula with its evidence."""
+
+    formula: Formula
+    """The candidate."""
+    columns: np.ndarray
+    """Means over the blocks, shape (b, k, 3): the last index is the axis it acts on."""
+    p_value: float
+    """Probability of such a reduction of the misfit by noise, times the number of formulas."""
+    alike: tuple[Formula, ...]
+    """Formulas that are not separable from it, the likeliest first."""
+
+
+@lru_cache(maxsize=64)
+def _function(texts: Iterable[str]) -> Callable:
+    return array_function([read(text) for text in texts])
+
+
+class FormulaSearch:
+    """
+    Formulas on one sensor's blocks.
+
+    With baseline and catalogue projected out up to plausible sizes.
+
+    Parameters
+    ----------
+    blocks : RestBlocks
+    formulas : sequence of Formula
+    plausible : array, shape (q, q)
+        Factor of the covariance that the parameters of the space may plausibly have.
+    reference_temperature : float
+
+    """
+
+    def __init__(
+        self,
+        blocks: RestBlocks,
+        formulas: Sequence[Formula],
+        plausible: np.ndarray,
+        *,
+        reference_temperature: float,
+    ):
+        self.blocks = blocks
+        self.formulas = formulas
+        # Text -> its column; many formulas have the same ones.
+        self._place: dict[str, int] = {}
+        for formula in formulas:
+            for column in formula.columns:
+                for text in _three(column):
+                    self._place.setdefault(text, len(self._place))
+        self.means = self._worked_out(tuple(self._place), reference_temperature)
+
+        # Independent rows of the catalogue's columns and residual of each axis, then of the texts.
+        whiten = blocks.white[0]
+        white = whiten(np.concatenate([*blocks.design, self.means], axis=1))
+        ends = np.cumsum([0, *(part.shape[1] for part in blocks.design)])
+        self._rest = []
+        self._free = []
+        self.known = []
+        for axis in range(3):
+            catalogue_and_residual = white[:, ends[axis] : ends[axis + 1]] / whiten.scale[axis]
+            residual = catalogue_and_residual[:, -1]
+            columns = white[:, ends[3] :] / whiten.scale[axis]
+
+            # Plausible contributions A p of the catalogue, cov(p) = P P', count as noise of unit
+            # variance more: with A P = U S V' the rows are multiplied by (1 + U S^2 U')^(-1/2)
+            # = 1 - U diag(1 - 1 / sqrt(1 + S^2)) U'.
+            basis, sizes, _ = svd(
+                catalogue_and_residual[:, :-1] @ plausible[blocks.index[axis]],
+                full_matrices=False,
+                lapack_driver='gesdd',
+            )
+            damped = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)
+            self._rest.append(residual - basis @ (damped * (basis.T @ residual)))
+            free = columns - basis @ (damped[:, None] * (basis.T @ columns))
+
+            # A column that the catalogue contains is no formula beyond it.
+            square = np.einsum('bt,bt->t', columns, columns)
+            free_square = np.einsum('bt,bt->t', free, free)
+            is_new = free_square > NEW**2 * np.maximum(square, 1e-300)
+            self._free.append(np.where(is_new, free, 0.0))
+            self.known.append(int((sizes > 1.0).sum()))
+
+    def _worked_out(self, texts: Sequence[str], reference_temperature: float) -> np.ndarray:
+        ref = self.blocks.ref
+        known = {
+            name: (getattr(ref, field), index) for name, (field, *index) in PLACES.items() if field
+        }
+        places = {'temperature_ref_c': reference_temperature}
+        for name, (values, index) in known.items():
+            if values is not None and (not index or index[-1] < values.shape[-1]):
+                column = (slice(None), *index)  # of every sample
+                places[name] = values[column]
+        means = np.empty((len(self.blocks.time), len(texts)))
+        with np.errstate(all='ignore'):
+            for first in range(0, len(texts), COLUMN_CHUNK):
+                worked = _function(texts[first : first + COLUMN_CHUNK])(places)
+                rows = np.stack(
+                    [np.broadcast_to(np.asarray(column, float), len(ref)) for column in worked],
+                    axis=1,
+                )
+                means[:, first : first + len(worked)] = self.blocks.means(rows)
+        return np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0)
+
+    @property
+    def misfit(self) -> float:
+        """Chi-square per degree of freedom of the part outside the catalogue, at least 1."""
+        dof = max(3 * len(self._rest[0]) - sum(self.known), 1)
+        return max(sum(float(rest @ rest) for rest in self._rest) / dof, 1.0)
+
+    def best(self) -> FormulaChoice | None:
+        """Return the simplest of the likeliest formulas, or None where none is significant."""
+        gains, counts = self._gains()
+        price = 2.0 * counts
+        order = np.argsort(price - gains)
+        likeliest = order[0]
+        p_value = min(
+            1.0, float(chi2_sf(gains[likeliest], max(counts[likeliest], 1))) * len(self.formulas)
+        )
+        if p_value > FAMILY_WISE or gains[likeliest] <= price[likeliest]:
+            return None
+        dof = max(3 * len(self._rest[0]) - sum(self.known), 1)
+        left = max((sum(float(rest @ rest) for rest in self._rest) - gains[likeliest]) / dof, 1.0)
+        near = [
+            k
+            for k in order[:200]
+            if (gains - price)[likeliest] - (gains - price)[k] < 2 * TIE * left and counts[k]
+        ]
+        chosen = min(near, key=lambda k: (self.formulas[k].complexity, price[k] - gains[k]))
+        return FormulaChoice(
+            self.formulas[chosen],
+            self.columns_of(self.formulas[chosen]),
+            p_value,
+            tuple(self.formulas[k] for k in near if k != chosen),
+        )
+
+    def columns_of(self, formula: Formula) -> np.ndarray:
+        """Return the means of a formula's columns, shape (b, k, 3)."""
+        return np.stack([self.means[:, self._at(column)] for column in formula.columns], axis=1)
+
+    def take(self, choice: FormulaChoice) -> None:
+        """Project a choice out, so that the next is tested conditional on it."""
+        for axis in range(3):
+            columns = self._free[axis][
+                :, [self._at(column)[axis] for column in choice.formula.columns]
+            ]
+            basis, sizes = svd(columns, full_matrices=False)[:2]
+            basis = basis[:, sizes > 1e-9 * max(sizes.max(), 1e-300)]
+            self._rest[axis] = self._rest[axis] - basis @ (basis.T @ self._rest[axis])
+            self._free[axis] = self._free[axis] - basis @ (basis.T @ self._free[axis])
+            self.known[axis] += basis.shape[1]
+
+    def _at(self, column: Column) -> list[int]:
+        return [self._place[text] for text in _three(column)]
+
+    def _gains(self) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return (fall of chi-square, number of amplitudes) of each formula, shape (n,) both.
+
+        With the columns X of a formula, scaled to unit length, and the residual r of an axis::
+
+            fall = (X'r)' (X'X)^-1 (X'r)
+
+        """
+        gains = np.zeros(len(self.formulas))
+        counts = np.zeros(len(self.formulas))
+        # All formulas with the same number of columns at once.
+        for width in {len(formula.columns) for formula in self.formulas}:
+            chosen = [k for k, formula in enumerate(self.formulas) if len(formula.columns) == width]
+            places = []
+            for k in chosen:
+                places.append([self._at(column) for column in self.formulas[k].columns])
+            place_on_axes = np.array(places)  # (n_chosen, width, 3)
+            for axis in range(3):
+                at = place_on_axes[:, :, axis]
+                free = self._free[axis]
+                size = np.sqrt(np.maximum(np.einsum('bt,bt->t', free, free), 1e-300))
+                slopes = (free.T @ self._rest[axis]) / size
+                gram = np.eye(width) * np.ones((len(chosen), 1, 1))
+                for i in range(width):
+                    for j in range(i):
+                        first = at[:, i]
+                        second = at[:, j]
+                        inner = np.einsum('bg,bg->g', free[:, first], free[:, second])
+                        cosine = np.clip(inner / (size[first] * size[second]), -1.0, 1.0)
+                        gram[:, i, j] = cosine
+                        gram[:, j, i] = cosine
+                gram += 1e-6 * np.eye(width)  # collinear columns
+                right = slopes[at]
+                amplitudes = np.linalg.solve(gram, right[..., None])[..., 0]
+                gains[chosen] += np.einsum('gk,gk->g', right, amplitudes)
+                counts[chosen] += (size[at] > 1e-100).sum(axis=1)
+        return gains, counts
+
+
+def _three(column: Column) -> tuple[str, ...]:
+    return (column,) * 3 if isinstance(column, str) else column

@@ -1,0 +1,160 @@
+"""The residual of windows on a table after the test of every effect."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.effects.base import AXES
+from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.reduced_recording import ReducedRecording
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.unexplained import (
+    IN_MOTION,
+    MIN_EXPLAINED_WINDOWS,
+    SIGNIFICANT_SDS,
+    Unexplained,
+    correlate,
+    largest_axes,
+    slow_explanations,
+)
+
+WITHIN_SHARE = 0.02
+"""Least excess of the variance within windows that counts."""
+
+
+MUCH_SCATTER = 10.0
+"""
+Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of
+an axis with a cause of its own.
+"""
+
+
+LOUD = 0.5
+"""
+Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained
+residual.
+"""
+
+
+def unexplained(
+    problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]
+) -> dict[str, Unexplained]:
+    """Return sensor -> Unexplained for a choice of effects."""
+    excess, used = explained.excess(chosen), problem.search.indices(chosen)
+    values = problem.space.reduced(used, problem.evidence.fit(used)[0])
+    return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in excess}
+
+
+def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> Unexplained:
+    """
+    Return the residual of a sensor.
+
+    As significant if loud tones or the scatter in motion of one axis exceed the noise at rest.
+    """
+    scatter, noise = _scatter_of_one_axis(problem, sensor), problem.noise[sensor].white_variance
+    squares = np.array(scatter)
+    for tone in rest.tones:
+        axis, mean_square = AXES.index(tone.axis), 0.5 * tone.amplitude**2
+        if mean_square > LOUD * noise[axis]:
+            squares[axis] += mean_square
+    if not squares.any():
+        return rest
+    return replace(
+        rest,
+        significant=True,
+        rms=float(np.sqrt(squares.mean())),
+        axes=largest_axes(squares, 0.0),
+        correlates_with=IN_MOTION if scatter.any() else None,
+    )
+
+
+def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
+    """
+    Return the excess variance of moving samples over the noise at rest, shape (3,).
+
+    It is given for an axis that exceeds the remaining axes, otherwise 0.
+
+    Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a
+    cause in the sensor its own axis.
+    """
+    excess = scatter_in_motion(problem, sensor)
+    least = np.maximum(np.median(excess), problem.noise[sensor].at_rest_only().low_variance)
+    return np.where(excess > MUCH_SCATTER * least, excess, 0.0)
+
+
+def scatter_in_motion(problem: LinearisedProblem, sensor: str) -> np.ndarray:
+    """Return the excess variance of moving samples over the noise at rest, shape (3,)."""
+    noise, recording = problem.noise[sensor].at_rest_only(), problem.recording
+    kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
+    if not len(kinds):
+        return np.zeros(3)
+    in_motion = np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts)
+    return np.maximum(in_motion - noise.low_variance, 0.0)
+
+
+def _rest(
+    problem: LinearisedProblem,
+    explained: ExplainedWindows,
+    sensor: str,
+    excess: np.ndarray,
+    values: np.ndarray,
+) -> Unexplained:
+    space, recording = problem.space, problem.recording
+    residual = np.stack(
+        [space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1
+    )
+    floor = explained.floor.noise[sensor]
+    white = floor.variance_beside_bias(
+        recording.kind, recording.count, recording.duration, keys=recording.keys
+    )
+    noise_sd = np.sqrt(white + floor.bias_variance)
+    sigma_means, sigma_within = explained.sigma(sensor, excess)
+    # Quiet axes dilute the excess of one.
+    means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
+    sigma = (
+        max(sigma_means, sigma_within)
+        if within > WITHIN_SHARE * explained.n_within
+        else sigma_means
+    )
+    rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
+    significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
+    found = Unexplained(significant, rms, float(sigma), None, 0.0, residual, noise_sd)
+    if not significant:
+        return found
+    if sigma_means <= SIGNIFICANT_SDS:
+        inside = np.mean(
+            [floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])]
+        )
+        return replace(found, rms=float(np.sqrt(inside * within / explained.n_within)))
+    if rms == 0:  # less than biases may wander, and more than neighbours may differ
+        rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
+    # The fit has absorbed a part of the cause, as far as the columns of the model resemble it.
+    fitted = []
+    for axis in range(3):
+        used = np.flatnonzero(values[space.places(sensor, axis)[:-1]])
+        fitted.append(space.mean[sensor][axis][:, used])
+    name, share = correlate(_explanations(recording), residual, noise_sd, fitted=fitted)
+    return replace(found, rms=rms, correlates_with=name, share=share)
+
+
+def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield (name, columns (k, m), windows where they are known)."""
+    describe, every = recording.describe, np.ones(len(recording.kind), bool)
+    yield from slow_explanations(describe['time'], describe['temperature'])
+    yield 'rate', np.stack([describe['rate'], describe['rate'] ** 2], axis=1), every
+    yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
+    for name in describe:
+        if name.startswith('angle'):
+            number = name[len('angle') :]
+            angle, known = describe[name], describe['span' + number] < 0.7
+            turns = []
+            for multiple in (1, 2, 3):
+                turns += [np.cos(multiple * angle), np.sin(multiple * angle)]
+            yield (
+                f'angle of {recording.model.joint_names[int(number)]}',
+                np.stack(turns, axis=1),
+                known,
+            )
+    yield IN_MOTION, recording.moving[:, None].astype(float), every

@@ -1,0 +1,297 @@
+"""Fits of the windows with parameters that change along functions of time."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.references.turntable.selection.parameter_space import (
+    ParameterSpace,
+    mean_whitening,
+)
+from imu_calibration.selection.explained_share import SIGNIFICANT_REST
+
+NO_WEIGHT = 1e8
+"""Factor on the variance of the mean of a window that does not count."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeFit:
+    """Least squares of some parameters, with changes of a group along functions of time."""
+
+    loss: float
+    """Sum of squares of the residual and the prior."""
+    values: np.ndarray
+    """Values of the parameters."""
+    change: np.ndarray
+    """Changes along the functions, all parameters of the group for each."""
+    change_sd: np.ndarray
+    """Their standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """Normal matrices of changes of c parameters along m functions, the functions first."""
+
+    cross: np.ndarray
+    """With the columns of the parameters and the residual, of each part, (parts, q + 1, m c)."""
+    squares: np.ndarray
+    """With one another, shape (parts, m c, m c)."""
+
+
+@dataclass(frozen=True)
+class SignificantExcess:
+    """Excess over the expectation from noise, of the parts in which it is significant."""
+
+    squares: float
+    """Squares beyond the expectation."""
+    limit: float
+    """From this on an excess of these parts is significant."""
+
+
+@dataclass(frozen=True, eq=False)
+class _RowsOfAxis:
+    """Rows ``[columns | residual]`` of one axis of a sensor."""
+
+    part: int
+    """Number of the part that the means belong to; the rows within windows are the next one."""
+    places: np.ndarray
+    """Places of the columns in the normal matrix, that of the residual last, shape (p + 1,)."""
+    whitening: Whitening
+    """Makes the means of the windows independent and of unit variance."""
+    mean: np.ndarray
+    """Means of the windows, shape (n, p + 1)."""
+    within: np.ndarray
+    """Products of the white rows within each window, shape (n, p + 1, p + 1)."""
+
+    @cached_property
+    def white(self) -> np.ndarray:
+        """Independent means of unit variance, shape (n, p + 1)."""
+        return self.whitening(self.mean[:, None])[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class WindowRows:
+    """
+    Rows of the windows that count, in parts: means, and within windows, of each sensor.
+
+    A change of a parameter along a function f of time has the column ``f * column``. It is made
+    independent after the product: the bias processes connect the windows, so that the product with
+    independent rows would be another one.
+    """
+
+    space: ParameterSpace
+    """The parameters that may be fitted."""
+    noise: dict[str, NoiseModel]
+    """Sensor -> its noise."""
+    clear: np.ndarray
+    """Whether each window counts, shape (n,)."""
+    axes: tuple[_RowsOfAxis, ...]
+    """Rows of the axes of both sensors."""
+
+    @classmethod
+    def of(cls, space: ParameterSpace, noise: dict[str, NoiseModel]) -> 'WindowRows':
+        """Return the rows of all windows."""
+        moving = space.recording.moving
+        kind = space.recording.kind
+        axes = []
+        for number, sensor in enumerate(space.sensors):
+            whitenings = mean_whitening(space, noise, sensor)
+            for axis, (whitening, mean) in enumerate(zip(whitenings, space.mean[sensor])):
+                within = np.zeros((len(kind), mean.shape[1], mean.shape[1]))
+                if moving.any():
+                    variances = [noise[sensor].row_variance(name)[axis] for name in kind[moving]]
+                    variance = np.array(variances)
+                    products = np.concatenate(list(space.within_each(sensor, axis, moving)))
+                    within[moving] = products / variance[:, None, None]
+                places = space.places(sensor, axis)
+                axes.append(_RowsOfAxis(2 * number, places, whitening, mean, within))
+        return cls(space, noise, np.ones(len(kind), bool), tuple(axes))
+
+    def selected(self, clear: np.ndarray) -> 'WindowRows':
+        """Return the rows with other windows that count (mask, shape (n,))."""
+        scatter = np.where(clear, 1.0, NO_WEIGHT)[:, None] * np.ones(3)
+        whitenings = []
+        for sensor in self.space.sensors:
+            whitenings += mean_whitening(self.space, self.noise, sensor, scatter=scatter)
+        axes = []
+        for rows, whitening in zip(self.axes, whitenings):
+            within = np.where(clear[:, None, None], rows.within, 0.0)
+            axes.append(replace(rows, whitening=whitening, within=within))
+        return replace(self, clear=clear, axes=tuple(axes))
+
+    @property
+    def count(self) -> int:
+        """Number of windows."""
+        return len(self.clear)
+
+    @cached_property
+    def expected(self) -> np.ndarray:
+        """Expectation of the squares of each part from noise, shape (parts,)."""
+        recording = self.space.recording
+        of_means = 3.0 * self.clear.sum()
+        within = 3.0 * (recording.count - 1)[recording.moving & self.clear].sum()
+        return np.array([of_means, within] * len(self.space.sensors))
+
+    @cached_property
+    def part_normals(self) -> np.ndarray:
+        """Normal matrices of the parts, shape (parts, q + 1, q + 1)."""
+        size = self.space.size + 1
+        normals = np.zeros((len(self.expected), size, size))
+        for rows in self.axes:
+            at = np.ix_(rows.places, rows.places)
+            normals[rows.part][at] += rows.white.T @ rows.white
+            normals[rows.part + 1][at] += rows.within.sum(axis=0)
+        return normals
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Normal matrix of the columns and the residual, shape (q + 1, q + 1)."""
+        return self.part_normals.sum(axis=0)
+
+    def changing(self, at: np.ndarray) -> 'ChangingColumns':
+        """
+        Return the columns of parameters that may change.
+
+        Parameters
+        ----------
+        at : ndarray, shape (c,)
+            Places of the parameters.
+
+        """
+        axes = []
+        for rows in self.axes:
+            columns = np.flatnonzero(np.isin(rows.places[:-1], at))
+            if not len(columns):
+                continue
+            order = np.searchsorted(at, rows.places[columns])
+            mean = rows.mean[:, None, columns]
+            within = rows.within[:, :, columns]
+            axes.append(_ChangingOfAxis(rows, order, mean, within, within[:, columns]))
+        return ChangingColumns(len(self.expected), self.space.size + 1, len(at), tuple(axes))
+
+    def fit(self, own: np.ndarray, changes: Changes | None = None) -> ChangeFit:
+        """
+        Return the least squares fit of the parameters `own`, with their priors, and of changes.
+
+        With the columns A of the parameters, B of the changes and the residual r, all white, the
+        prior mean m and its information W = diag(1 / sd^2)::
+
+            [A'A + W  A'B] [x]   [A'r + W m]
+            [B'A      B'B] [c] = [B'r      ]
+            loss = r'r + m'W m - right' [x; c]
+
+        Parameters
+        ----------
+        own : ndarray of int, shape (p,)
+        changes : Changes, optional
+            Their products with the columns, B'A, and with one another, B'B; no prior.
+
+        """
+        information = 1 / self.space.prior_sd[own] ** 2
+        prior_mean = self.space.prior_mean[own]
+        # The last row and column of `self.normal` belong to the residual.
+        normal = self.normal[np.ix_(own, own)] + np.diag(information)
+        right = self.normal[own, -1] + prior_mean * information
+        if changes is not None:
+            cross = changes.cross.sum(axis=0)
+            squares = changes.squares.sum(axis=0)
+            normal = np.block([[normal, cross[own]], [cross[own].T, squares]])
+            right = np.concatenate([right, cross[-1]])
+
+        # Scaled to a unit diagonal, because the units differ; collinear columns share their value.
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        scales = np.outer(scale, scale)
+        covariance = np.linalg.pinv(normal / scales, rcond=1e-12, hermitian=True) / scales
+        values = covariance @ right
+        prior_squares = (prior_mean**2 * information).sum()
+        loss = self.normal[-1, -1] + prior_squares - right @ values
+        sd = np.sqrt(np.diag(covariance))
+        count = len(own)
+        return ChangeFit(float(loss), values[:count], values[count:], sd[count:])
+
+    def excess(
+        self, own: np.ndarray, fit: ChangeFit, changes: Changes | None = None
+    ) -> SignificantExcess:
+        """
+        Return the SignificantExcess at a ChangeFit of the parameters `own` and of changes.
+
+        With the vector v = (-x, 1) of parameters and residual, and the changes c, in each part::
+
+            squares = v'N v - 2 v'C c + c'S c,   expected = n, variance 2 n
+
+        """
+        weights = self.space.reduced(own.tolist(), fit.values)
+        squares = np.einsum('i,kij,j->k', weights, self.part_normals, weights)
+        if changes is not None:
+            squares -= 2 * weights @ changes.cross @ fit.change
+            squares += fit.change @ changes.squares @ fit.change
+        excess = squares - self.expected
+        significant = excess > SIGNIFICANT_REST * np.sqrt(2 * self.expected)
+        limit = SIGNIFICANT_REST * np.sqrt(2 * self.expected[significant].sum())
+        return SignificantExcess(float(excess[significant].sum()), float(limit))
+
+
+@dataclass(frozen=True, eq=False)
+class _ChangingOfAxis:
+    """Columns of one axis of a sensor that belong to c of the parameters that may change."""
+
+    rows: _RowsOfAxis
+    """All rows of the axis."""
+    order: np.ndarray
+    """Numbers of the c parameters among those that may change, shape (c,)."""
+    mean: np.ndarray
+    """Means of the windows, shape (n, 1, c)."""
+    within: np.ndarray
+    """Products with all columns within each window, shape (n, p + 1, c)."""
+    squares: np.ndarray
+    """Products with one another within each window, shape (n, c, c)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangingColumns:
+    """Columns of parameters that may change, selected once for many functions of time."""
+
+    n_parts: int
+    """Number of parts."""
+    size: int
+    """Number of all columns, that of the residual included."""
+    count: int
+    """Number of parameters that may change."""
+    axes: tuple[_ChangingOfAxis, ...]
+    """The axes that have some of the columns."""
+
+    def along(self, functions: np.ndarray) -> Changes:
+        """
+        Return the Changes of the parameters along functions of time.
+
+        Parameters
+        ----------
+        functions : ndarray, shape (n, m)
+            Their values in each window.
+
+        """
+        n_functions = functions.shape[1]
+        n_changes = n_functions * self.count
+        cross = np.zeros((self.n_parts, self.size, n_changes))
+        squares = np.zeros((self.n_parts, n_changes, n_changes))
+        pairs = functions[:, :, None] * functions[:, None]
+        for axis in self.axes:
+            rows = axis.rows
+            places = (np.arange(n_functions)[:, None] * self.count + axis.order).ravel()
+            at_cross, at_squares = (rows.places[:, None], places), (places[:, None], places)
+
+            # Means: the product with the function first, then independent rows.
+            columns = functions[:, :, None] * axis.mean
+            white = rows.whitening(columns.reshape(len(columns), 1, -1))[:, 0]
+            cross[rows.part][at_cross] += rows.white.T @ white
+            squares[rows.part][at_squares] += white.T @ white
+
+            # Within windows, where the function is constant: sum_w f_w P_w and sum_w f_w g_w P_w.
+            along = np.tensordot(axis.within, functions, (0, 0)).transpose(0, 2, 1)
+            both = np.tensordot(pairs, axis.squares, (0, 0)).transpose(0, 2, 1, 3)
+            cross[rows.part + 1][at_cross] += along.reshape(len(rows.places), -1)
+            squares[rows.part + 1][at_squares] += both.reshape(len(places), -1)
+        return Changes(cross, squares)

@@ -1,0 +1,95 @@
+"""The solution of a recording with the effects that a search has chosen."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.solution import SAMPLE_NOISE, Solution
+from imu_calibration.references.turntable.estimation.session_noise import WEIGHTLESS
+from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.selection.parameter_space import ParameterSpace
+from imu_calibration.references.turntable.selection.saturation import Saturation
+from imu_calibration.selection.questions import Question
+
+
+def extended_solution(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    baseline: SensorModel,
+    *,
+    chosen: Sequence[Question],
+    saturations: Sequence[Saturation] = (),
+) -> Solution:
+    """
+    Return the Solution of the baseline extended by the chosen effects.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        Of a recording linearised at the chosen effects.
+    noise : dict
+        Sensor -> NoiseModel.
+    baseline : SensorModel
+    chosen : sequence of Question
+    saturations : sequence of Saturation
+        Limits to write into the model.
+
+    """
+    # Linearised where the rows of the recording are.
+    model_of_rows = space.recording.model
+    model = replace(
+        baseline,
+        point={**baseline.point, **model_of_rows.point},
+        temperature_ref_c=model_of_rows.temperature_ref_c,
+        folded_arms=model_of_rows.folded_arms,
+    )
+    for question in chosen:
+        model = model.with_effect(question.sensor, question.name)
+    weighed = {}
+    for sensor in space.sensors:
+        weighed[sensor] = _in_trusted_band(noise[sensor], space.slow_only[sensor])
+    solution = solve(space.recording.accumulated(model), model, noise=weighed)
+    solution = replace(solution, model=replace(model, folded_arms=None))
+    for limit in saturations:
+        solution = _with_limit(solution, limit)
+    return solution
+
+
+def _in_trusted_band(noise: NoiseModel, slow_only: np.ndarray) -> NoiseModel:
+    """
+    Return the noise with weight zero for fast parts on axes where only the slow part is compared.
+    """
+    moving = {}
+    for kind, factors in noise.moving.items():
+        every = np.where(slow_only, WEIGHTLESS * factors.every, factors.every)
+        moving[kind] = replace(factors, every=every)
+    return replace(noise, moving=moving)
+
+
+def _with_limit(solution: Solution, limit: Saturation) -> Solution:
+    """Return the solution with the level of a saturation as a further, independent parameter."""
+    model = solution.model.with_role(limit.sensor, Role.LIMIT)
+    place = model.part(limit.sensor, Role.LIMIT).start
+
+    def grown(matrix: np.ndarray, variance: float) -> np.ndarray:
+        matrix = np.insert(matrix, place, 0.0, axis=0)
+        matrix = np.insert(matrix, place, 0.0, axis=1)
+        matrix[place, place] = variance
+        return matrix
+
+    # Its only uncertainty is the noise of the clipped samples.
+    terms = {}
+    for name, term in solution.terms.items():
+        terms[name] = grown(term, limit.level_sd**2 if name == SAMPLE_NOISE else 0.0)
+    return replace(
+        solution,
+        model=model,
+        values=np.insert(solution.values, place, limit.level),
+        held=np.insert(solution.held, place, False),
+        terms=terms,
+        information=grown(solution.information, limit.level_sd**-2),
+    )

@@ -1,0 +1,512 @@
+"""
+The search from windows to named effects.
+
+Remove clipped samples, linearise, choose, prove, relinearise.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import AbstractSet
+
+import numpy as np
+
+from imu_calibration.core.errors import NotObservableError
+from imu_calibration.effects.reference_effects import CLOCK, FAMILY
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.residuals.find_onset import find_onset
+from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
+from imu_calibration.references.turntable.selection.extended_solution import extended_solution
+from imu_calibration.references.turntable.selection.lag_explanations import (
+    LagExplanations,
+    lag_explanations,
+)
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.rivals import (
+    Rival,
+    best_pairs,
+    same_questions,
+    settle_rivals,
+    simpler,
+)
+from imu_calibration.references.turntable.selection.saturation import windows_at, without_clipping
+from imu_calibration.references.turntable.selection.testable_effects import testable_effects
+from imu_calibration.references.turntable.selection.window_evidence import MIN_FOLD_WINDOWS
+from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
+from imu_calibration.selection.explained_share import pruned
+from imu_calibration.selection.gain import LEAST_REDUCTION
+from imu_calibration.selection.onset import Onset
+from imu_calibration.selection.order_of_tests import select_findings, without_weakest
+from imu_calibration.selection.questions import Question, point_with, without_saturation
+from imu_calibration.selection.search import SelectedEffects
+
+LINEARISATIONS = 5
+"""Largest number of linearisations."""
+EXPLANATIONS = 4
+"""Explanations of the lags that are tried, at most."""
+LEFT = 0.1
+"""Largest remaining share of a significant excess after pairs, or effects of implausible size."""
+LEFT_BEFORE = 3 * LEFT
+"""
+The same before the choice is relinearised: a larger share is rejected at once, because a trial
+needs up to eight linearisations.
+"""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Investigation(SelectedEffects):
+    """Numerical result of a search, without sentences."""
+
+    used: list[Window]
+    """Windows that were fitted to, without clipped samples."""
+    problem: LinearisedProblem
+    explained: ExplainedWindows
+    rivals: Sequence[Rival] = field(default_factory=list)
+    """Alternatives to findings that fit nearly as well."""
+    onset: Onset | None = None
+    """
+    Parameters that change at one moment: the other results are those of the longer part of the
+    recording.
+    """
+
+    @property
+    def changed_at(self) -> float | None:
+        """Time of the onset, s."""
+        return None if self.onset is None else self.onset.time
+
+    @property
+    def param_names(self) -> Sequence[str]:
+        """Names of the parameters of the baseline and of the effects under test."""
+        return self.problem.space.names
+
+    @property
+    def baseline_model(self) -> SensorModel:
+        """The model that the search extends."""
+        return self.problem.baseline
+
+    @property
+    def point_of_named(self) -> Mapping[str, np.ndarray]:
+        """Effect -> values at which its columns are linearised."""
+        return self.problem.recording.model.point
+
+    def clipped_solution(self) -> Solution | None:
+        """Return the solution without the saturated samples; None where no limit was found."""
+        if not self.limits:
+            return None
+        problem = self.problem
+        return extended_solution(
+            problem.space,
+            problem.noise,
+            problem.baseline,
+            chosen=self.adopted,
+            saturations=self.limits,
+        )
+
+
+def investigate(
+    windows: Sequence[Window],
+    table: Table,
+    model: SensorModel,
+    *,
+    bias_processes: dict | None = None,
+) -> Investigation:
+    """
+    Test every effect that a model lacks on held-out windows.
+
+    If parameters change at one moment (`find_onset`), the search is repeated: with a step of the
+    clock, or on the longer part alone.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        One recording in order; windows of kind 'unused' are excluded.
+    table : Table
+        The reference.
+    model : SensorModel
+        The model to be extended.
+    bias_processes : dict, optional
+        Sensor -> its bias processes, where measured separately.
+
+    Raises
+    ------
+    NotObservableError
+        When there are too few windows to hold any out.
+
+    """
+    # Windows of the search without clipped samples, the locked ones, and the effects under test.
+    used = [window for window in windows if window.kind != 'unused']
+    if len(used) < MIN_FOLD_WINDOWS:
+        raise too_few_windows(len(used))
+    model = replace(model, joint_names=table.joint_names)
+    used, locked, limits = without_clipping(used, table, model)
+    testable, not_testable = testable_effects(model, table, windows_at(used, ~locked))
+    effects = without_saturation(testable)
+    linearised_at = partial(
+        LinearisedProblem,
+        used,
+        table,
+        model,
+        effects=effects,
+        locked=locked,
+        bias_processes=bias_processes,
+    )
+
+    # Search for constant parameters.
+    outcome, rivals, linearised_again = _explained(linearised_at(), linearised_at)
+
+    # An excess remains: do parameters change at one moment?
+    onset = None
+    if outcome.rest:
+        onset = find_onset(
+            outcome.problem, outcome.explained, outcome.named, windows=used, table=table
+        )
+
+    # A step of the clock is an effect: the search is repeated with it, from the values of the
+    # onset, and counts if it removes most of the excess.
+    step = next((effect for effect in testable if effect.located), None)
+    if onset is not None and onset.what == CLOCK and step is not None:
+        stepped_at = partial(linearised_at, effects=[*effects, step])
+        ((name, before),) = onset.before.items()
+        size_and_time = (onset.after[name] - before, onset.time)
+        values = {name: before, **dict(zip(step.param_names(), size_and_time))}
+        problem = stepped_at(point=point_with(model, [*effects, step], values))
+        start = [question for question in problem.questions if question.name == step.name]
+        with_step, rivals_with_step, stepped_again = _explained(problem, stepped_at, start)
+        if with_step.rest < LEFT * outcome.rest:
+            outcome = with_step
+            rivals = rivals_with_step
+            linearised_again = stepped_again
+            onset = None
+
+    # Any other change: only the longer part.
+    if onset is not None:
+        before_onset = [window for window in used if window.time[-1] < onset.time]
+        after_onset = [window for window in used if window.time[0] >= onset.time]
+        longer = max(before_onset, after_onset, key=len)
+        of_part = investigate(longer, table, model, bias_processes=bias_processes)
+        return replace(of_part, onset=onset)
+
+    # Once more where an excess remains: with plausible sizes, then with any size.
+    tried = {_labels(outcome.chosen)}
+    for any_size in (False, True):
+        at_any_size = partial(linearised_again, any_size=any_size)
+        outcome = _looked_again(outcome, at_any_size, any_size, tried)
+
+    named = outcome.named
+    unstable = outcome.unstable
+    names = {question.name for question in named}
+    rivals = [
+        rival for rival in rivals if rival.question.name in names and rival.other.name not in names
+    ]
+    rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
+    return Investigation(
+        used=used,
+        problem=outcome.problem,
+        explained=outcome.explained,
+        named=named,
+        not_testable=not_testable,
+        unstable=unstable,
+        rejected=rejected,
+        limits=limits,
+        rivals=rivals,
+    )
+
+
+def _explained(
+    problem: LinearisedProblem, linearised_at: Callable, start: Sequence[Question] = ()
+) -> tuple['_Outcome', Sequence[Rival], Callable]:
+    """
+    Return (the '_Outcome' of a search, rivals of its findings, `linearised_at`).
+
+    In `linearised_at` the lags are resolved if there are any.
+    """
+    chosen = problem.search.run(start)
+    chosen = [
+        question
+        for question in chosen
+        if question.name not in FAMILY or problem.windows_agree(chosen, question)
+    ]
+    explanations = lag_explanations(
+        problem, [*chosen, *problem.search.early(chosen)], linearised_at
+    )
+    if explanations is not None:
+        linearised_at = partial(linearised_at, resolved=FAMILY)
+        return *_with_lags(explanations, linearised_at), linearised_at
+    settled, rivals = settle_rivals(problem, chosen, linearised_at)
+    if settled is not problem:
+        chosen = settled.search.run()
+    return _settled(linearised_at, settled, chosen), rivals, linearised_at
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """Result of a choice."""
+
+    problem: LinearisedProblem
+    explained: ExplainedWindows
+    chosen: Sequence[Question]
+    named: Sequence[Question]
+    unstable: Sequence[Question]
+
+    @cached_property
+    def rest(self) -> float:
+        """Significant excess over noise with the findings in the model."""
+        return self.explained.rest(self.named)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """One explanation of the lags with the outcome of its search."""
+
+    number: int
+    lags: AbstractSet[str]
+    outcome: _Outcome
+    rivals: Sequence[Rival]
+
+    @property
+    def rank(self) -> tuple[int, int, int]:
+        """Numbers of its lags that are named and chosen, then the order of the trials."""
+        named = {question.name for question in self.outcome.named}
+        chosen = {question.name for question in self.outcome.chosen}
+        return len(self.lags & named), len(self.lags & chosen), -self.number
+
+    @property
+    def helps(self) -> bool:
+        """Whether all of its lags are named."""
+        return self.rank[0] == len(self.lags)
+
+    def finished(self, linearised_at: Callable) -> '_Trial':
+        """Return the trial relinearised at its choice, without the lags that are not named."""
+        return replace(
+            self, outcome=_settled(linearised_at, self.outcome.problem, self.outcome.chosen)
+        )
+
+
+def _with_lags(
+    explanations: LagExplanations, linearised_at: Callable
+) -> tuple[_Outcome, Sequence[Rival]]:
+    """
+    Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
+
+    Where one of several effects does not help, a shorter one is tried, where a single one does not,
+    another. Only a trial that helps where it begins, or the best of all, is relinearised at its
+    choice.
+    """
+    most, refused, tried = None, [], []
+    for number in range(EXPLANATIONS):
+        selected = explanations.select(most, refused)
+        there, chosen, of_lags = explanations.settled(selected, linearised_at)
+        chosen = there.search.run(chosen)
+        settled, rivals = settle_rivals(there, chosen, linearised_at)
+        outcome = _outcome(settled, chosen if settled is there else _searched(settled, chosen))
+        trial = _Trial(number, selected.lags.keys(), outcome, [*of_lags, *rivals])
+        if trial.helps and (trial := trial.finished(linearised_at)).helps:
+            return trial.outcome, trial.rivals
+        tried.append(trial)
+        most, refused = max(len(selected.lags) - 1, 1), [*refused, selected]
+        if not explanations.others(most, refused):
+            break
+    best = _best_of(tried, linearised_at)
+    return best.outcome, best.rivals
+
+
+def _best_of(trials: Iterable[_Trial], linearised_at: Callable) -> _Trial:
+    """
+    Return the finished trial with the highest rank.
+
+    A trial is finished only if its rank exceeds that of the best.
+    """
+    best = None
+    for trial in sorted(trials, key=lambda trial: trial.rank, reverse=True):
+        if best is None or trial.rank > best.rank:
+            finished = trial.finished(linearised_at)
+            best = finished if best is None or finished.rank > best.rank else best
+    assert best is not None, 'there is at least one trial'
+    return best
+
+
+def _labels(chosen: Sequence[Question]) -> frozenset[str]:
+    return frozenset(question.label for question in chosen)
+
+
+def _looked_again(
+    outcome: _Outcome, linearised_at: Callable, any_size: bool, tried: set[frozenset[str]]
+) -> _Outcome:
+    """
+    Return the _Outcome of the searches for the cause of a remaining significant excess.
+
+    Further searches start from pairs, or allow implausible sizes. Any two of many effects reduce an
+    excess of a different cause somewhat: together they must remove nearly all. `tried` has the
+    labels of each choice that was linearised.
+    """
+    if not outcome.rest:
+        return outcome
+    problem = outcome.problem.asking_any_size() if any_size else outcome.problem
+    search = problem.search
+    lags = _resolved(problem, outcome.chosen)
+    choices = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
+    best = min(choices, key=search.cost)
+    if _labels(best) in tried:
+        return outcome
+    if outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest:
+        return outcome
+    # Implausible sizes have a price; without them the better choice has the lower cost.
+    if not any_size and search.cost(best) >= search.cost(outcome.chosen):
+        return outcome
+
+    tried.add(_labels(best))
+    other = _settled(linearised_at, problem, best)
+    return other if other.rest < LEFT * outcome.rest else outcome
+
+
+def _settled(
+    linearised_at: Callable, problem: LinearisedProblem, chosen: Sequence[Question]
+) -> _Outcome:
+    """
+    Return the _Outcome of a choice.
+
+    Relinearise at the effects, then keep the ones with sufficient share and gain.
+    """
+    return _without_unnamed(_relinearised(linearised_at, problem, chosen), linearised_at)
+
+
+def _relinearised(
+    linearised_at: Callable, problem: LinearisedProblem, chosen: Sequence[Question]
+) -> _Outcome:
+    """Return the same, linearised at all effects of the choice."""
+    for _ in range(LINEARISATIONS - 1):
+        if not problem.needs_another(chosen):
+            break
+        problem = linearised_at(point=problem.point(chosen))
+        chosen = _searched(problem, chosen)
+    return _outcome(problem, chosen)
+
+
+def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome:
+    """Return the _Outcome of a choice where it is linearised."""
+    # A warm-up of the bank that appears this late has no columns of its own for the final solution.
+    chosen = [question for question in chosen if '@' not in question.label]
+    explained = ExplainedWindows(problem.evidence, problem.search)
+    found = select_findings(WindowTests(problem, explained), chosen)
+    return _Outcome(problem, explained, chosen, found.named, found.unstable)
+
+
+def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
+    """
+    Return the _Outcome linearised at its findings alone.
+
+    Where lags or errors of the table that are not named act at its point.
+    """
+    for _ in range(LINEARISATIONS - 1):
+        if not outcome.problem.acts_beside(outcome.named):
+            break
+        problem = linearised_at(point=outcome.problem.point(outcome.named))
+        explained = ExplainedWindows(problem.evidence, problem.search)
+        named = pruned(same_questions(problem, outcome.named), explained.share)
+        outcome = _Outcome(
+            problem,
+            explained,
+            same_questions(problem, outcome.chosen),
+            WindowTests(problem, explained).predicting(named),
+            same_questions(problem, outcome.unstable),
+        )
+    return outcome
+
+
+def _searched(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
+    """
+    Return the choice of a search at another linearisation; it starts from the resolved effects.
+    """
+    return problem.search.run(_resolved(problem, chosen))
+
+
+def _resolved(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
+    return same_questions(
+        problem, [question for question in chosen if question.name in problem.search.resolved]
+    )
+
+
+def too_few_windows(count: int) -> NotObservableError:
+    """Return the error of a recording with so few windows that none can be held out."""
+    return NotObservableError(
+        f'a diagnosis needs at least {MIN_FOLD_WINDOWS} windows, so that some can be held out, '
+        f'{count} were found; rest in more poses, or spin and swing the table',
+        code='too_few_windows',
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class WindowTests:
+    """The tests of a choice on the windows of a table (`EffectTests`)."""
+
+    problem: LinearisedProblem
+    explained: ExplainedWindows
+
+    def explaining(self, chosen: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects that explain most of the excess, without a simpler alternative."""
+        return simpler(self.problem, self.explained, pruned(chosen, self.explained.share))
+
+    def predicting(self, named: Sequence[Question]) -> list[Question]:
+        """
+        Return the admissible findings that improve cross-validated prediction.
+
+        Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a
+        misfit that repeats with the motion is evidence for any effect that correlates with it. So
+        the unweighted residual must decrease too. The locked windows are not used: their later gain
+        would be biased.
+        """
+        problem = self.problem
+        admissible = [
+            question
+            for question in named
+            if problem.search.allowed(named, question) and problem.windows_agree(named, question)
+        ]
+
+        def least_helpful(kept: list[Question]) -> int | None:
+            place = None
+            least = np.inf
+            for k, question in enumerate(kept):
+                reduction = _sure_reduction(problem, kept, question)
+                if not reduction > _needed_reduction(problem, self.explained, kept, question):
+                    # NaN is not sure.
+                    rank = -np.inf if np.isnan(reduction) else reduction
+                    if place is None or rank < least:
+                        place = k
+                        least = rank
+            return place
+
+        return without_weakest(admissible, least_helpful)
+
+    def significant(self, named: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects that are significant without those that were removed."""
+        return self.problem.search.drop_insignificant(named)
+
+
+def _needed_reduction(
+    problem: LinearisedProblem,
+    explained: ExplainedWindows,
+    chosen: Sequence[Question],
+    question: Question,
+) -> float:
+    """
+    Return the required relative reduction of the residual.
+
+    Zero; `LEAST_REDUCTION` with an unexplained excess, or without rests to separate misfit from
+    noise.
+    """
+    clear = not problem.recording.moving.all() and not explained.rest_beside(chosen, question)
+    return 0.0 if clear else LEAST_REDUCTION
+
+
+def _sure_reduction(
+    problem: LinearisedProblem, chosen: Sequence[Question], question: Question
+) -> float:
+    """
+    Return the lower end of the interval of an effect's reduction of the cross-validated residual.
+    """
+    others = [q for q in chosen if q is not question]
+    gain = gain_in_turn(problem, others, chosen, sensors=question.effect.sensors)
+    return gain.ci95[0]

@@ -1,0 +1,447 @@
+"""
+One explanation of the lags of both sensors.
+
+As simple and as common to both as the recording allows.
+
+A late clock, a delay of one sensor and its filters have the same first derivative, so a search
+meets them in any order, and halves of one recording may name one lag differently. Here every
+description of a sensor's lag is linearised at its own estimate, both sensors' costs are summed, and
+of all explanations within the search's price of the best the simplest is selected: fewest effects
+first, then a common clock before separate lags, then a delay before a filter. All other ones are
+its rivals.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag_name
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.rivals import (
+    MIN_CURVATURE_NATS,
+    Rival,
+    same_questions,
+)
+from imu_calibration.selection.questions import Question, point_with
+from imu_calibration.selection.search import PENALTY, TIE
+
+LAG_KINDS = (('delay',), ('bandwidth',), ('filter',), ('delay', 'bandwidth'))
+"""Descriptions of one sensor's lag, the simplest first."""
+DELAY = LAG_KINDS[0]
+FIRST_SHARE = 0.3
+"""
+Initial share of the low-pass in a lag with a delay: at zero its derivative equals the delay's.
+"""
+MAX_CLOCK_LOSS = 0.01
+"""
+Without rests: largest loss of a common clock against separate lags, as a share of their log
+likelihood: noise is estimated from the misfit there, and the evidence that separates a motor's
+ripple from a filter is not reproducible between recordings.
+"""
+DELAY_LINEARISATIONS = 3
+"""Linearisations of a delay with a low-pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class LagHypothesis:
+    """One description of both sensors' lags at once, linearised where it is."""
+
+    kind: tuple[str, ...]
+    problem: LinearisedProblem
+    chosen: list[Question]
+    """The lags of both sensors, then the other chosen effects."""
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter of the baseline, of the lags and of clocks that change -> value."""
+        wanted = set(self.problem.baseline.param_names)
+        for question in self.chosen:
+            if question.name in FAMILY | CLOCKS:
+                wanted.update(question.effect.param_names())
+        found = {}
+        for name, value in zip(self.problem.space.names, self.problem.values(self.chosen)):
+            if name in wanted:
+                found[name] = value
+        return found
+
+    def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return (values, covariance) of the lags of one sensor, in the order of the kind."""
+        used = self.problem.search.indices(self.chosen)
+        values, covariance = self.problem.evidence.fit(used)
+        parameter = {question.name: question.parameters[0] for question in self.chosen}
+        at = [used.index(parameter[lag_name(sensor, ending)]) for ending in self.kind]
+        return values[at], covariance[np.ix_(at, at)]
+
+    def without(self, sensor: str) -> list[Question]:
+        """Return the choice without the lags of one sensor."""
+        return [q for q in self.chosen if q.name not in FAMILY or q.sensor != sensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Which effects make both lags."""
+
+    lags: dict[str, float]
+    """Effect -> value, s."""
+    cost: float
+    """Held-out cost, nats, penalties included."""
+    values: dict[str, float] = field(default_factory=dict)
+    """Parameter of the baseline and of clocks that change -> value."""
+
+    @property
+    def rank(self) -> tuple:
+        """Sort key of simplicity."""
+        kinds = [name.rpartition('_')[2] for name in self.lags]
+        return (
+            len(self.lags),
+            CLOCK not in self.lags,
+            sum(map(('delay', 'offset', 'bandwidth', 'filter').index, kinds)),
+            self.cost,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LagExplanations:
+    """All explanations of the lags of a recording."""
+
+    problem: LinearisedProblem
+    """Linearised where no lag acts."""
+    explanations: Sequence[Explanation]
+    rest: Sequence[Question]
+    """The other chosen effects."""
+    silent: float | None
+    """Held-out cost without any lag, nats, without rests; None where rests determine the noise."""
+
+    def others(
+        self, most: int | None = None, refused: Sequence[Explanation] = ()
+    ) -> list[Explanation]:
+        """
+        Return the explanations with at most so many effects.
+
+        Without given ones and without those of the same columns and cost.
+        """
+        costs = {each.cost for each in refused}
+        found = []
+        for each in self.explanations:
+            few_enough = most is None or len(each.lags) <= most
+            if few_enough and each.cost not in costs:
+                found.append(each)
+        return found
+
+    def select(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
+        """Return the simplest explanation of `others`."""
+        return simplest(self.others(most, refused), self.silent)
+
+    def settled(
+        self, selected: Explanation, linearised_at: Callable
+    ) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
+        """
+        Return (the LinearisedProblem at an explanation, the choice with it, alternatives).
+
+        The alternatives to the choice's members fit nearly as well.
+        """
+        # Linearise at the lags of the explanation.
+        parameter = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
+        values = dict(selected.values)
+        for name, lag in selected.lags.items():
+            values[parameter[name]] = lag
+        there = linearised_at(point=point_with(self.problem.baseline, self.problem.effects, values))
+
+        # Its effects, the other chosen effects, and what fits nearly as well.
+        asked = _questions_by_name(there)
+        lags = [asked[name] for name in selected.lags]
+        near = [each for each in self.explanations if each.cost < selected.cost + TIE]
+        return there, [*lags, *same_questions(there, self.rest)], _rivals(there, selected, near)
+
+
+def _questions_by_name(problem: LinearisedProblem) -> dict[str, Question]:
+    """Return effect -> its first question."""
+    found: dict[str, Question] = {}
+    for question in problem.questions:
+        found.setdefault(question.name, question)
+    return found
+
+
+def lag_explanations(
+    problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable
+) -> LagExplanations | None:
+    """
+    Return the LagExplanations of a choice.
+
+    None where it has no lag, no lag explains the data, or some of the family cannot be tested.
+
+    Parameters
+    ----------
+    problem : LinearisedProblem
+        Linearised where no lag acts.
+    chosen : sequence of Question
+    linearised_at : callable
+        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, with some of the
+        effects.
+
+    """
+    effects = {effect.name: effect for effect in problem.effects}
+    has_lag = any(question.name in FAMILY for question in chosen)
+    if not has_lag or not FAMILY <= set(effects):
+        return None
+    rest = [each for each in chosen if each.name not in FAMILY and '@' not in each.label]
+
+    # Lags are nonlinear at a clock of zero where a clock changes.
+    values = problem.values(chosen)
+    clocks = {}
+    for question in chosen:
+        if question.name in CLOCKS:
+            for k in question.parameters:
+                clocks[problem.space.names[k]] = float(values[k])
+    described = _described(problem, linearised_at, effects, rest=rest, clocks=clocks or None)
+
+    judges = [each.problem for each in described]
+    names = [name for name in described[0].values if name.split('.')[1] not in FAMILY]
+    explanations = _explanations(described, judges, names)
+    if not explanations:
+        return None
+
+    # Without rests the noise is that of the misfit: the cost without a lag is the scale of costs.
+    silent = None
+    if problem.recording.moving.all():
+        without = [question for question in described[0].chosen if question.name not in FAMILY]
+        silent = sum(_cost(described[0], without, judges, sensor) for sensor in SENSORS)
+    return LagExplanations(problem, explanations, rest, silent)
+
+
+def simplest(explanations: Sequence[Explanation], silent: float | None = None) -> Explanation:
+    """
+    Return the simplest explanation within the search's price of the best.
+
+    Parameters
+    ----------
+    explanations : sequence of Explanation
+    silent : float, optional
+        Cost without any lag, for a recording without rests: an explanation of as many effects with
+        a common clock is then accepted within the resolution of the misfit.
+
+    """
+    best = min(each.cost for each in explanations)
+    near = [each for each in explanations if each.cost < best + TIE]
+    selected = min(near, key=lambda each: each.rank)
+    if silent is None or len(selected.lags) < 2 or CLOCK in selected.lags:
+        return selected
+    dearest = best + TIE + MAX_CLOCK_LOSS * (silent - best)
+    common = []
+    for each in explanations:
+        has_as_many = CLOCK in each.lags and len(each.lags) == len(selected.lags)
+        if has_as_many and each.cost < dearest:
+            common.append(each)
+    return simplest(common) if common else selected
+
+
+def _described(
+    problem: LinearisedProblem,
+    linearised_at: Callable,
+    effects: Mapping[str, Effect],
+    *,
+    rest: Sequence[Question],
+    clocks: dict[str, float] | None,
+) -> list[LagHypothesis]:
+    """Return the description of each kind; only the first if no curvature is observable."""
+
+    def at(kind: tuple[str, ...], values: dict[str, float] | None = clocks) -> LagHypothesis:
+        names = [lag_name(sensor, ending) for ending, sensor in product(kind, SENSORS)]
+        asked = [effects[name] for name in names] + [question.effect for question in rest]
+        point = None
+        if values is not None:
+            point = point_with(problem.baseline, asked, values)
+        there = linearised_at(effects=asked, point=point)
+        known = _questions_by_name(there)
+        lags = [known[name] for name in names]
+        return LagHypothesis(kind, there, [*lags, *same_questions(there, rest)])
+
+    # Delays only, at zero; without an observable curvature all kinds have the same columns.
+    first = at(DELAY)
+    curvatures = []
+    for question in first.chosen:
+        if question.name in FAMILY:
+            curvatures.append(first.problem.curvature_shows(first.chosen, question))
+    if max(curvatures) < MIN_CURVATURE_NATS:
+        return [first]
+
+    # Delays at their own estimate, then each other kind from there.
+    first = at(DELAY, first.values)
+    found = [first]
+    for kind in LAG_KINDS[1:]:
+        values = dict(first.values)
+        for sensor in SENSORS:
+            delay = first.lags(sensor)[0][0]
+            own = [delay]
+            if len(kind) == 2:
+                low_pass = FIRST_SHARE * abs(delay)
+                own = [delay - low_pass, low_pass]
+            for ending, value in zip(kind, own, strict=True):
+                values[effects[lag_name(sensor, ending)].param_names()[0]] = value
+        hypothesis = at(kind, values)
+        if len(kind) > 1:
+            for _ in range(DELAY_LINEARISATIONS - 1):
+                hypothesis = at(kind, hypothesis.values)
+        found.append(hypothesis)
+    return found
+
+
+def _explanations(
+    described: Sequence[LagHypothesis], judges: Sequence[LinearisedProblem], names: Sequence[str]
+) -> list[Explanation]:
+    """
+    Return every Explanation that the descriptions of each sensor make together.
+
+    Only an Explanation that is better than none is returned.
+    """
+    # Each sensor without a lag, and with one of each kind.
+    options = []
+    cost_without = 0.0
+    for sensor in SENSORS:
+        none = _none(described[0], judges, sensor)
+        cost_without += none.cost
+        own = [none, *(_option(each, judges, sensor) for each in described)]
+        if len(described) == 1:
+            # Without curvature the kinds are one column.
+            for ending in ('bandwidth', 'filter'):
+                own.append(replace(own[1], kind=(ending,), alike=True))
+        options.append(own)
+
+    found = []
+    for one, two in product(*options):
+        if one.kind or two.kind:
+            for each in _described_together(one, two, names):
+                if each.cost < cost_without:
+                    found.append(each)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Option:
+    """One sensor with a lag of one kind, or with none."""
+
+    sensor: str
+    kind: tuple[str, ...]
+    cost: float
+    lags: np.ndarray
+    covariance: np.ndarray
+    values: dict[str, float]
+    alike: bool = False
+    """Whether its columns equal those of a delay."""
+
+    def own(self, lags: Sequence[float] | np.ndarray) -> dict[str, float]:
+        return {
+            lag_name(self.sensor, ending): float(value) for ending, value in zip(self.kind, lags)
+        }
+
+    def with_delay(self, delay: float) -> np.ndarray:
+        """Return the lags with the first one given, the remaining ones shifted accordingly."""
+        return self.lags + self.covariance[:, 0] / self.covariance[0, 0] * (delay - self.lags[0])
+
+
+def _option(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str) -> _Option:
+    cost = _cost(hypothesis, hypothesis.chosen, judges, sensor) + PENALTY * len(hypothesis.kind)
+    lags, covariance = hypothesis.lags(sensor)
+    return _Option(sensor, hypothesis.kind, cost, lags, covariance, hypothesis.values)
+
+
+def _none(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str) -> _Option:
+    left = hypothesis.without(sensor)
+    values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(left)))
+    cost = _cost(hypothesis, left, judges, sensor)
+    return _Option(sensor, (), cost, np.zeros(0), np.zeros((0, 0)), values)
+
+
+def _cost(
+    hypothesis: LagHypothesis,
+    chosen: Sequence[Question],
+    judges: Sequence[LinearisedProblem],
+    sensor: str,
+) -> float:
+    """
+    Return the held-out cost of one sensor's windows, nats.
+
+    It is judged with the noise and the band of each linearisation in turn.
+    """
+    used = hypothesis.problem.search.indices(chosen)
+    losses = []
+    for judge in judges:
+        losses.append(hypothesis.problem.judged_by(judge).heldout_parts(used)[sensor].sum())
+    return 0.5 * float(np.mean(losses))
+
+
+def _described_together(one: _Option, two: _Option, names: Sequence[str]) -> Iterator[Explanation]:
+    """
+    Yield the explanations of two sensors' lags.
+
+    Separate lags, or a common clock and the additional lags of each.
+    """
+    values = {}
+    for name in names:
+        of_its_sensor = two if name.startswith(two.sensor) else one
+        values[name] = of_its_sensor.values[name]
+    cost = one.cost + two.cost
+
+    # Separate lags.
+    own = one.own(one.lags) | two.own(two.lags)
+    if all(value > 0 for value in own.values()):
+        yield Explanation(own, cost, values)
+    if not (one.kind and two.kind):
+        return
+
+    # A common clock with the smaller lag, and the rest of the larger one.
+    apart = float(one.lags[0] - two.lags[0])
+    late, clock = (one, two) if apart > 0 else (two, one)
+    if clock.kind == DELAY and (late.kind == DELAY or late.alike):
+        yield Explanation({CLOCK: float(clock.lags[0])} | late.own([abs(apart)]), cost, values)
+
+    # A common clock in place of both delays: a parameter less, for the misfit of their difference.
+    if one.kind[0] == two.kind[0] == 'delay':
+        variances = np.array([one.covariance[0, 0], two.covariance[0, 0]])
+        shared = float(np.average([one.lags[0], two.lags[0]], weights=1 / variances))
+        remaining = one.own(one.with_delay(shared)) | two.own(two.with_delay(shared))
+        remaining = {name: lag for name, lag in remaining.items() if not name.endswith('delay')}
+        if all(value > 0 for value in remaining.values()):
+            misfit = 0.5 * apart**2 / float(variances.sum())
+            yield Explanation({CLOCK: shared} | remaining, cost - PENALTY + misfit, values)
+
+
+def _rivals(
+    settled: LinearisedProblem, selected: Explanation, near: Sequence[Explanation]
+) -> list[Rival]:
+    """
+    Return the alternatives to a member of an explanation that fit nearly as well.
+
+    Members of explanations with no more effects.
+    """
+    question_of = {question.name: question for question in settled.questions}
+    rivals: dict[str, Rival] = {}
+    for other in sorted(near, key=lambda explanation: explanation.cost):
+        removed = sorted(set(selected.lags) - set(other.lags))
+        added = sorted(set(other.lags) - set(selected.lags))
+        if len(other.lags) > len(selected.lags) or not removed:
+            continue
+        moves = {name: other.values[name] - selected.values[name] for name in selected.values}
+        for name in added:
+            if name in rivals:
+                continue
+
+            # It replaces a lag of its own sensor; otherwise that of the clock, or the first one.
+            replaced = CLOCK if CLOCK in removed else removed[0]
+            for lag in removed:
+                if question_of[lag].sensor == question_of[name].sensor:
+                    replaced = lag
+                    break
+
+            # The change of the parameters counts once for each replaced lag.
+            known = {rival.question.name for rival in rivals.values()}
+            rivals[name] = Rival(
+                question_of[replaced],
+                question_of[name],
+                other.cost - selected.cost,
+                {} if replaced in known else moves,
+            )
+    return list(rivals.values())

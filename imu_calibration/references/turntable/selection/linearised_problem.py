@@ -1,0 +1,309 @@
+"""
+The recording reduced around a point of linearisation, and the search on it.
+
+It also holds the decision whether to relinearise.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from itertools import chain
+from typing import AbstractSet
+
+import numpy as np
+
+from imu_calibration.effects.base import Effect
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.scaled_solve import solve_normal
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.selection.noise_beside_effects import (
+    in_trusted_band,
+    noise_before_fit,
+    noise_beside_effects,
+)
+from imu_calibration.references.turntable.selection.parameter_space import (
+    ParameterSpace,
+    counted_from_values,
+    normal_matrix,
+    parameter_space,
+    questions,
+)
+from imu_calibration.references.turntable.selection.reduced_recording import (
+    ReducedRecording,
+    make_bank,
+    mean_arms,
+    reduce_recording,
+)
+from imu_calibration.references.turntable.selection.window_evidence import WindowEvidence, folds_of
+from imu_calibration.selection.questions import (
+    Question,
+    extended_model,
+    smooth_parameters,
+    time_constants,
+)
+from imu_calibration.selection.search import FAMILY_WISE, Search
+
+DELAY_FREQUENCY = 2 * np.pi * 3.0
+"""Assumed angular frequency of motions in the curvature of a delay, rad/s."""
+TOO_COARSE = 4.0
+"""Evidence of a curvature above which the columns are relinearised, nats."""
+BILINEAR = 2e-3
+"""Relative change of the matrix that an effect left out may have caused."""
+
+
+class LinearisedProblem:
+    """
+    One linearisation: the reduced recording, its noise, the evidence and the search.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Of one recording, without clipped samples.
+    table : Table
+    baseline : SensorModel
+        The model to be extended.
+    effects : sequence of Effect
+        Candidate effects.
+    point : (SensorModel, array), optional
+        Point of linearisation; default: the baseline's solution.
+    locked : array, shape (k,)
+        Mask of the windows reserved for the gain: they have columns, but are excluded from noise,
+        fits and choices.
+    bias_processes : dict, optional
+        Sensor -> its bias processes, where measured separately.
+    any_size : bool
+        Whether sizes above those of any known instrument are allowed.
+    resolved : set of str
+        Effects that were compared with each other already, as for `Search`.
+
+    """
+
+    def __init__(
+        self,
+        windows: Sequence[Window],
+        table: Table,
+        baseline: SensorModel,
+        *,
+        effects: Sequence[Effect],
+        locked: np.ndarray,
+        point: tuple[SensorModel, np.ndarray] | None = None,
+        bias_processes: dict | None = None,
+        any_size: bool = False,
+        resolved: AbstractSet[str] = frozenset(),
+    ):
+        self.baseline, self.effects, self.locked = baseline, effects, locked
+        self.duration = max(float(window.time[-1]) for window in windows)
+        self.constants = time_constants(self.duration)
+        model, values = point or _start(baseline, effects)
+        model = replace(model, folded_arms=mean_arms(model, values))
+        recording = reduce_recording(
+            windows,
+            table,
+            model,
+            values=values,
+            bank=make_bank(effects, self.constants, model, values=values),
+        )
+        places = range(len(values))
+        own = chain.from_iterable(places[model.slices[effect.key]] for effect in baseline.effects)
+        used = tuple(own)  # parameters of the baseline within the full model
+        judged = recording.select(~locked)
+        if point is None:
+            judged = _at_baseline(judged, baseline, used)
+            recording = recording.rebased(judged.values)
+        self.all_samples = parameter_space(judged, baseline)
+        judged = in_trusted_band(self.all_samples)
+        self.space = replace(judged, recording=recording)
+        self.questions = questions(judged, effects)
+        self.noise = noise_beside_effects(judged, smooth_parameters(self.questions), bias_processes)
+        self.evidence = WindowEvidence(judged, self.noise, folds_of(judged.recording.kind))
+        self.search = Search(
+            self.evidence,
+            used,
+            self.questions,
+            encoder_step=judged.recording.encoder_step,
+            any_size=any_size,
+            resolved=resolved,
+        )
+
+    def asking_any_size(self) -> 'LinearisedProblem':
+        """Return the same, asking about sizes that are known of no instrument too."""
+        other = copy(self)
+        other.search = self.search.asking_any_size()
+        return other
+
+    @property
+    def recording(self) -> ReducedRecording:
+        """The reduced recording, all of its windows."""
+        return self.space.recording
+
+    @cached_property
+    def locked_samples(self) -> ParameterSpace:
+        """The locked windows, with all samples: for the gain only."""
+        return replace(self.all_samples, recording=self.recording.select(self.locked))
+
+    def values(self, chosen: Sequence[Question]) -> np.ndarray:
+        """
+        Return all parameters of the space for a choice, fitted to the selection windows.
+
+        With all of the baseline, shape (q,).
+        """
+        return self.absolute(self.search.values(chosen))
+
+    def absolute(self, values: np.ndarray) -> np.ndarray:
+        """
+        Return parameters of the whole space in full, from those that count from the linearisation.
+
+        Shape (q,).
+        """
+        values = np.array(values)
+        change = counted_from_values(self.recording.model, self.baseline)
+        values[: len(change)] += np.where(change, self.recording.values, 0.0)
+        return values
+
+    def judged_by(self, judge: 'LinearisedProblem') -> WindowEvidence:
+        """Return the evidence with the noise and the band of another linearisation."""
+        space = replace(
+            self.evidence.space,
+            slow_only=judge.space.slow_only,
+            slow_variance=judge.space.slow_variance,
+        )
+        return WindowEvidence(space, judge.noise, self.evidence.fold)
+
+    def needs_another(self, chosen: Sequence[Question]) -> bool:
+        """
+        Return whether the linearisation is too coarse for the choice: curvature times evidence.
+        """
+        return any(
+            '@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE
+            for question in chosen
+        )
+
+    def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
+        """
+        Return the evidence of an effect's curvature, nats.
+
+        Its separability from its first derivative.
+        """
+        without = self.search.indices([q for q in chosen if q is not question])
+        weight = self.evidence.loss(without) - self.evidence.loss(self.search.indices(chosen))
+        return (
+            weight
+            * _curvature(question, self.values(chosen), self.recording.model, self.duration) ** 2
+        )
+
+    def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
+        """
+        Return whether an effect is also significant against its scatter over windows.
+
+        The scatter is judged by `WindowEvidence.p_value_by_scatter`.
+        """
+        p_value = self.evidence.p_value_by_scatter(self.search.indices(chosen), question.parameters)
+        return p_value * len(self.questions) < FAMILY_WISE
+
+    def acts_beside(self, chosen: Sequence[Question]) -> bool:
+        """
+        Return whether the point of linearisation has a timing effect that is not chosen.
+
+        Timing effects are a lag, a delay or an error of the table that is not among the chosen
+        effects.
+        """
+        kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
+        model = self.recording.model
+        return any(
+            e.warp is not None and e.key not in kept and np.any(model.point_of(e))
+            for e in model.effects
+        )
+
+    def point(self, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray]:
+        """Return the point of linearisation (model, values) for this choice."""
+        values = self.values(chosen)
+        model = extended_model(self.baseline, self.effects)
+        for question in chosen:
+            if question.effect.time_constant:
+                model = model.with_effect(question.sensor, question.name)
+        start = model.start()
+        for effect in model.effects:
+            known = self.recording.model.slices.get(effect.key)
+            if known is not None:
+                start[model.slices[effect.key]] = values[known]
+                if effect.time_constant:  # a straight line may lead beyond zero
+                    last = model.slices[effect.key].stop - 1
+                    start[last] = np.clip(
+                        start[last], 0.25 * self.constants[0], 4.0 * self.constants[-1]
+                    )
+        for question in chosen:
+            if '@' in question.label:
+                start[model.slices[question.sensor, question.name]] = self._warm_up(
+                    chosen, question, values
+                )
+        kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
+        for effect in model.effects:
+            if effect.key not in kept:
+                start[model.slices[effect.key]][: effect.n_amplitudes] = 0.0
+        return model.at(start), start
+
+    def _warm_up(
+        self, chosen: Sequence[Question], question: Question, values: np.ndarray
+    ) -> np.ndarray:
+        """Return amplitudes and time constant of a warm-up, interpolated in the bank."""
+        number = int(question.label.split('@')[1])
+        place = chosen.index(question)
+        near = [k for k in (number - 1, number, number + 1) if 0 <= k < len(self.constants)]
+        losses = []
+        for k in near:
+            other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
+            losses.append(
+                self.evidence.loss(
+                    self.search.indices([*chosen[:place], other, *chosen[place + 1 :]])
+                )
+            )
+        logs = np.log(self.constants[near])
+        if len(near) < 3:
+            return np.append(values[list(question.parameters)], self.constants[number])
+        curve = np.polyfit(logs - logs[1], losses, 2)
+        shift = (
+            np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1])
+            if curve[0] > 0
+            else 0.0
+        )
+        return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
+
+
+def _start(baseline: SensorModel, effects: Sequence[Effect]) -> tuple[SensorModel, np.ndarray]:
+    model = extended_model(baseline, effects)
+    values = model.start()
+    return model, np.where(np.isfinite(values), values, 0.0)
+
+
+def _at_baseline(
+    recording: ReducedRecording, baseline: SensorModel, used: Sequence[int]
+) -> ReducedRecording:
+    """Move the residual to the baseline's own solution."""
+    for _ in range(2 if baseline.arms else 1):
+        space = in_trusted_band(parameter_space(recording, baseline))
+        values = recording.values.copy()
+        values[list(used)] += solve_normal(
+            normal_matrix(space, noise_before_fit(space)),
+            np.asarray(used),
+            space.prior_sd,
+            prior_mean=space.prior_mean,
+        )[0]
+        recording = recording.rebased(values)
+    return recording
+
+
+def _curvature(
+    question: Question, values: np.ndarray, model: SensorModel, duration: float
+) -> float:
+    """Return the relative error of the first derivative at the size of the effect."""
+    effect = question.effect
+    value = values[list(question.parameters)]
+    if effect.warp is not None:
+        moved = np.max(np.abs(value - model.point_of(effect)))
+        sensitivity = {'s': DELAY_FREQUENCY, 's/s': DELAY_FREQUENCY * duration}
+        return moved * sensitivity.get(str(effect.unit), 1.0)
+    if effect.time_constant:
+        return abs(np.log(max(value[-1], 1e-3) / model.point_of(effect)[-1]))
+    return BILINEAR

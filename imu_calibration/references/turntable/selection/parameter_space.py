@@ -1,0 +1,476 @@
+"""Parameters of a search and their columns, and normal matrices over them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.references.turntable.selection.reduced_recording import ReducedRecording
+from imu_calibration.selection.questions import Question
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterSpace:
+    """
+    A reduced recording in the parameters under test.
+
+    The parameters of the extended model are first, then the amplitudes of the banks of time
+    constants, per sensor. Rows are ``[design | residual]`` of one axis; all their columns act on
+    that axis.
+    """
+
+    recording: ReducedRecording
+    """The recording."""
+    names: tuple[str, ...]
+    """Parameter names."""
+    prior_sd: np.ndarray
+    """Prior standard deviations, shape (q,)."""
+    prior_mean: np.ndarray
+    """Prior minus the values of the linearisation, shape (q,)."""
+    index: dict[str, list[np.ndarray]]
+    """Sensor -> the parameters that act on each axis."""
+    join: dict[str, list[np.ndarray]]
+    """
+    Sensor -> per axis the matrix that turns ``[columns | residual]`` of three axes into ``[design |
+    residual]``, shape (p + 3, q_a + 1).
+    """
+    join_within: dict[str, list[np.ndarray]]
+    """
+    The same for the part within windows: zero for effects that are smooth in time, since the bias
+    varies there too and the noise within is modelled as white.
+    """
+    slow_only: dict[str, np.ndarray] = field(
+        default_factory=lambda: {sensor: np.zeros(3, bool) for sensor in SENSORS}
+    )
+    """Sensor -> whether only the slow part of the centred rows is compared, shape (3,)."""
+    slow_variance: dict[str, np.ndarray] = field(
+        default_factory=lambda: {sensor: np.zeros(3) for sensor in SENSORS}
+    )
+    """Sensor -> variance of the white noise that then replaces the fast part, shape (3,)."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors with rows: those with readings."""
+        return tuple(self.index)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self.names)
+
+    def places(self, sensor: str, axis: int) -> np.ndarray:
+        """
+        Return the positions of the rows of an axis in a normal matrix of all parameters.
+
+        Shape (q_a + 1,).
+        """
+        return np.append(self.index[sensor][axis], self.size)
+
+    def reduced(self, used: Sequence[int], values: np.ndarray) -> np.ndarray:
+        """
+        Return the vector that maps rows of all parameters to residuals, shape (q + 1,).
+
+        The residuals are taken at `values` of the parameters `used`.
+        """
+        found = np.zeros(self.size + 1)
+        found[list(used)], found[-1] = -values, 1.0
+        return found
+
+    def restricted(self, kept: np.ndarray) -> 'ParameterSpace':
+        """Return the space of some of the parameters, in this order."""
+        order = np.argsort(kept)
+        index: dict[str, list[np.ndarray]] = {}
+        join: dict[str, list[np.ndarray]] = {}
+        join_within: dict[str, list[np.ndarray]] = {}
+        for sensor in self.sensors:
+            index[sensor], join[sensor], join_within[sensor] = [], [], []
+            for axis, acting in enumerate(self.index[sensor]):
+                own = np.isin(acting, kept)
+                # The new number of a parameter is its place in `kept`.
+                place = np.searchsorted(kept, acting[own], sorter=order)
+                index[sensor].append(order[place])
+                columns = np.append(own, True)
+                join[sensor].append(self.join[sensor][axis][:, columns])
+                join_within[sensor].append(self.join_within[sensor][axis][:, columns])
+        return replace(
+            self,
+            names=tuple(self.names[k] for k in kept),
+            prior_sd=self.prior_sd[kept],
+            prior_mean=self.prior_mean[kept],
+            index=index,
+            join=join,
+            join_within=join_within,
+        )
+
+    @cached_property
+    def mean(self) -> dict[str, list[np.ndarray]]:
+        """Sensor -> mean rows of the windows for each axis, shape (k, q_a + 1)."""
+        found = {}
+        for sensor in self.sensors:
+            rows = self.recording.mean(sensor)
+            found[sensor] = [rows @ join for join in self.join[sensor]]
+        return found
+
+    def within_each(self, sensor: str, axis: int, rows: np.ndarray) -> Iterator[np.ndarray]:
+        """
+        Yield the products of the centred rows of the windows `rows` (mask), some windows at a time.
+
+        Shape (m, q_a + 1, q_a + 1).
+        """
+        missing = self._missing(sensor, axis)
+        join = self.join_within[sensor][axis]
+        for some, factors in self.recording.factors_of(sensor, self._compared(sensor, axis), rows):
+            found = join.T @ (factors.transpose(0, 2, 1) @ factors @ join)
+            found[:, -1, -1] += missing[some]
+            yield found
+
+    def within_sum(
+        self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None
+    ) -> np.ndarray:
+        """
+        Return the sum of `within_each`, shape (q_a + 1, q_a + 1).
+
+        `part` 'within' or 'slow'; default: the part that is compared on this axis.
+        """
+        join = self.join_within[sensor][axis]
+        products = self.recording.product_sum(sensor, part or self._compared(sensor, axis), rows)
+        found = join.T @ products @ join
+        if part is None:
+            found[-1, -1] += self._missing(sensor, axis)[rows].sum()
+        return found
+
+    def slopes_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
+        """
+        Return the products of the centred rows of each window with themselves.
+
+        They are multiplied by `weights` (q_a + 1,), and the shape is (k, q_a + 1).
+        """
+        recording = self.recording
+        join = self.join_within[sensor][axis]
+        weighed = join @ weights
+        compared = self._compared(sensor, axis)
+        found = np.zeros((len(recording.kind), join.shape[1]))
+        for some, factors in recording.factors_of(sensor, compared, recording.moving):
+            # w' J' F' F J of each window, with the factor F of its centred rows.
+            found[some] = ((factors @ weighed)[:, None] @ factors)[:, 0] @ join
+        return found
+
+    def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
+        """
+        Return the sum of squares of the weighted centred rows of each window, shape (k,).
+
+        The centred rows are multiplied by the window's `weights` (k, q_a + 1).
+        """
+        recording = self.recording
+        columns = weights @ self.join[sensor][axis].T
+        found = np.zeros(len(columns))
+        for some, factors in recording.factors_of(sensor, 'within', recording.moving):
+            found[some] = ((factors @ columns[some, :, None]) ** 2).sum(axis=(1, 2))
+        return found
+
+    def _compared(self, sensor: str, axis: int) -> str:
+        """Return which part of the centred rows is compared on an axis."""
+        return 'slow' if self.slow_only[sensor][axis] else 'within'
+
+    def _missing(self, sensor: str, axis: int) -> np.ndarray:
+        """
+        Return the squares that replace the fast part of each window, shape (k,).
+
+        They are zero where that part is compared.
+        """
+        if not self.slow_only[sensor][axis]:
+            return np.zeros(len(self.recording.count))
+        n_slow = np.maximum(self.recording.slow_rows, 1)
+        n_fast = np.maximum(self.recording.count - n_slow, 0.0)
+        return self.slow_variance[sensor][axis] * n_fast
+
+
+def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> ParameterSpace:
+    """
+    Return the ParameterSpace of a recording.
+
+    The Jacobian of the coefficients joins columns to parameters.
+
+    Parameters of the baseline are relative to the point of linearisation; parameters of all other
+    effects are absolute, so that an omitted effect is zero even where the point of linearisation
+    includes it.
+
+    Parameters
+    ----------
+    recording : ReducedRecording
+    baseline : SensorModel
+        The model to be extended.
+
+    """
+    model = recording.model
+    prior, prior_sd = model.prior()
+    # A time constant has no prior of its own: it is where its columns were computed.
+    for effect in model.effects:
+        if effect.time_constant:
+            prior[model.slices[effect.key]][-1] = recording.values[model.slices[effect.key]][-1]
+
+    # Parameters of the baseline count from the linearisation, the other ones from zero: their
+    # share of the prediction is returned to the residual.
+    in_baseline = counted_from_values(model, baseline)
+    shift = np.where(in_baseline, prior - recording.values, prior)
+    removed = np.where(in_baseline, 0.0, recording.values)
+
+    # The parameters of the model, then those of the banks.
+    names = list(model.param_names)
+    smooth = [model.mask(lambda effect: effect.smooth)]
+    sds = [prior_sd]
+    for entries in recording.bank.values():
+        for entry in entries:
+            names += entry.param_names
+            smooth.append(np.full(len(entry.param_names), entry.effect.smooth))
+            sds.append(entry.prior_sd)
+
+    index: dict[str, list[np.ndarray]] = {}
+    join: dict[str, list[np.ndarray]] = {}
+    join_within: dict[str, list[np.ndarray]] = {}
+    for sensor in recording.sensors:
+        jacobian = coefficient_jacobian(model, sensor, recording.values)
+        index[sensor], join[sensor], join_within[sensor] = [], [], []
+        for axis in range(3):
+            joined = _join(
+                jacobian[:, axis], sensor, axis, recording, removed, np.concatenate(smooth)
+            )
+            index[sensor].append(joined.used)
+            join[sensor].append(joined.columns)
+            join_within[sensor].append(joined.within)
+    return ParameterSpace(
+        recording,
+        tuple(names),
+        np.concatenate(sds),
+        np.pad(shift, (0, len(names) - len(shift))),
+        index,
+        join,
+        join_within,
+    )
+
+
+def bank_places(recording: ReducedRecording) -> dict[str, slice]:
+    """Return label -> parameters of each entry of the banks."""
+    places = {}
+    start = len(recording.model.param_names)
+    for entries in recording.bank.values():
+        for entry in entries:
+            end = start + len(entry.param_names)
+            places[entry.label] = slice(start, end)
+            start = end
+    return places
+
+
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """How columns of three axes become the design of one."""
+
+    used: np.ndarray
+    """Parameters that act on the axis, shape (q_a,)."""
+    columns: np.ndarray
+    """As in `ParameterSpace.join`, shape (p + 3, q_a + 1)."""
+    within: np.ndarray
+    """As in `ParameterSpace.join_within`, shape (p + 3, q_a + 1)."""
+
+
+def _join(
+    jacobian: np.ndarray,
+    sensor: str,
+    axis: int,
+    recording: ReducedRecording,
+    removed: np.ndarray,
+    smooth: np.ndarray,
+) -> _Joined:
+    """Return the matrices that join the columns of an axis to the parameters."""
+    bank = recording.bank[sensor]
+    places = bank_places(recording)
+    p, n_model = jacobian.shape
+    n_columns = p + sum(len(entry.slopes) for entry in bank)
+
+    # Rows: columns of the model and of the banks, then the residuals of three axes.
+    full = np.zeros((n_columns + 3, len(smooth) + 1))
+    full[:p, :n_model] = jacobian
+    start = p
+    for entry in bank:
+        end = start + len(entry.slopes)
+        full[start:end, places[entry.label]] = entry.slopes[:, axis]
+        start = end
+    full[:p, -1] = jacobian @ removed
+    full[n_columns + axis, -1] = 1.0
+
+    # Within windows, effects that are smooth in time have no columns.
+    within = np.where(np.append(smooth, False), 0.0, full)
+    within[:p, -1] = jacobian @ np.where(smooth[:n_model], 0.0, removed)
+
+    used = np.flatnonzero(np.any(full[:, :-1] != 0, axis=0))
+    kept = np.append(used, -1)
+    return _Joined(used, full[:, kept], within[:, kept])
+
+
+def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray:
+    """
+    Return a mask of the parameters that count from the linearisation.
+
+    Those of the baseline, time constants and times of steps.
+    """
+    counted = model.mask(lambda effect: effect.key in baseline.slices)
+    for effect in model.effects:
+        if effect.timed:
+            counted[model.slices[effect.key].stop - 1] = True
+    return counted
+
+
+def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Question]:
+    """
+    Return a Question for each effect.
+
+    One with a time constant gives one per time constant of the bank.
+    """
+    model = space.recording.model
+    places = bank_places(space.recording)
+    asked = []
+    for effect in effects:
+        if effect.key in model.slices:
+            parts = {effect.name: model.slices[effect.key]}
+        else:
+            parts = {}
+            for entry in space.recording.bank.get(effect.sensor, ()):
+                if entry.effect is effect:
+                    parts[entry.label] = places[entry.label]
+        for label, part in parts.items():
+            parameters = tuple(range(part.start, part.stop))
+            asked.append(Question(effect, parameters, effect.size, label))
+    return asked
+
+
+def normal_matrix(
+    space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None
+) -> np.ndarray:
+    """
+    Return the normal matrix of the windows `select` (mask; all where not given).
+
+    Shape (q + 1, q + 1).
+    """
+    of_means = np.zeros((space.size + 1, space.size + 1))
+    for sensor in space.sensors:
+        for axis, rows in enumerate(white_means(space, noise, sensor)):
+            if select is not None:
+                rows = rows[select]
+            at = space.places(sensor, axis)
+            of_means[np.ix_(at, at)] += rows.T @ rows
+    return within_matrix(space, noise, select) + of_means
+
+
+def within_matrix(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    select: np.ndarray | None = None,
+    *,
+    sensors: Sequence[str] | None = None,
+) -> np.ndarray:
+    """Return the part of the normal matrix from within the windows."""
+    total = np.zeros((space.size + 1, space.size + 1))
+    for sensor in space.sensors if sensors is None else sensors:
+        for axis in range(3):
+            at = space.places(sensor, axis)
+            total[np.ix_(at, at)] += within_of_axis(
+                space, noise[sensor], sensor, axis=axis, select=select
+            )
+    return total
+
+
+def within_of_axis(
+    space: ParameterSpace,
+    noise: NoiseModel,
+    sensor: str,
+    *,
+    axis: int,
+    select: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the same of one axis over its own columns, ``space.places(sensor, axis)``."""
+    kind = space.recording.kind
+    chosen = space.recording.moving
+    if select is not None:
+        chosen = select & chosen
+    total = np.zeros((len(space.places(sensor, axis)),) * 2)
+    for name in np.unique(kind[chosen]):
+        products = space.within_sum(sensor, axis, chosen & (kind == name))
+        total += products / noise.row_variance(name)[axis]
+    return total
+
+
+def scatter_of_each(
+    space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray
+) -> dict[str, np.ndarray]:
+    """
+    Return sensor -> factor of each window's scatter within, at parameters (q,), over its kind.
+
+    Shape (k, 3).
+    """
+    recording = space.recording
+    reduced = space.reduced(range(space.size), values)
+    found = {}
+    for sensor in space.sensors:
+        # Squares that the noise of the kind gives, and those of the window.
+        variance = np.array([noise[sensor].row_variance(name) for name in recording.kind])
+        usual = variance * np.maximum(recording.count - 1, 1)[:, None]
+        squares = []
+        for axis in range(3):
+            own = reduced[space.places(sensor, axis)]
+            squares.append(space.slopes_within(sensor, axis, own) @ own)
+        found[sensor] = np.maximum(np.stack(squares, axis=1) / usual, 1.0)
+    return found
+
+
+def white_means(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    sensor: str,
+    *,
+    scatter: np.ndarray | None = None,
+) -> list[np.ndarray]:
+    """
+    Return for each axis the mean rows, turned into independent rows of unit variance.
+
+    Shape (k, q_a + 1).
+
+    `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
+    """
+    whitenings = mean_whitening(space, noise, sensor, scatter=scatter)
+    return [
+        whitening(rows[:, None])[:, 0]
+        for whitening, rows in zip(whitenings, space.mean[sensor], strict=True)
+    ]
+
+
+def mean_whitening(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    sensor: str,
+    *,
+    scatter: np.ndarray | None = None,
+) -> list[Whitening]:
+    """Return for each axis the Whitening of `white_means`, with its arguments."""
+    recording = space.recording
+    own = noise[sensor]
+    variance = own.variance_beside_bias(
+        recording.kind, recording.count, recording.duration, keys=recording.keys
+    )
+    variance = variance + own.offset_sd**2
+    if scatter is not None:
+        variance = variance + (scatter - 1) * own.mean_variance(recording.kind, recording.count)
+    return [
+        Whitening(
+            variance[:, axis : axis + 1],
+            recording.time,
+            recording.sessions,
+            processes=own.bias_processes,
+        )
+        for axis in range(3)
+    ]

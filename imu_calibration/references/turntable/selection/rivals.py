@@ -1,0 +1,325 @@
+"""
+Alternatives to a finding.
+
+Collinear effects compared at their estimated sizes, pairs of effects, and the simpler of two
+explanations.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+import scipy.linalg
+
+from imu_calibration.estimation.scaled_solve import JITTER
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
+from imu_calibration.selection.explained_share import Explained, needed_share
+from imu_calibration.selection.gain import LEAST_REDUCTION
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import PENALTY, TIE, Search
+
+MIN_CURVATURE_NATS = 0.1
+"""
+Evidence of a curvature below which it does not separate effects, nats: a delay of 0.1 ms is a lag
+of 0.1 ms.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """An alternative to a chosen effect that fits nearly as well."""
+
+    question: Question
+    """The effect that it would replace."""
+    other: Question
+    """The effect that was not chosen."""
+    behind: float
+    """Held-out log likelihood that it lacks, nats, each linearised where it is."""
+    moves: dict[str, float] = field(default_factory=dict)
+    """Parameter of the baseline -> its difference with the rival in the model."""
+
+    @property
+    def weight(self) -> float:
+        """Posterior probability of the rival."""
+        return float(1.0 / (1.0 + np.exp(min(self.behind, 700.0))))
+
+
+def settle_rivals(
+    problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable
+) -> tuple[LinearisedProblem, list[Rival]]:
+    """
+    Return (the LinearisedProblem at the best of a choice and its rivals, the rivals close to it).
+
+    The first derivatives of a delay and of a low-pass are the same, and a search that is linearised
+    at one of them represents its rival by its tangent only: the first one would win. So each is
+    linearised at its own estimate, and all are compared with the same noise, estimated with each in
+    turn; only compared effects have columns there.
+
+    Parameters
+    ----------
+    problem : LinearisedProblem
+        Linearised where none of them acts.
+    chosen : sequence of Question
+    linearised_at : callable
+        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, or with some of
+        the effects.
+
+    """
+    chosen = [question for question in chosen if '@' not in question.label]
+    choices: list[Sequence[Question]] = [chosen, *_swapped(problem, chosen)]
+    if len(choices) == 1:
+        return problem, []
+
+    # Linearise each choice at its own estimate, with columns of the compared effects only.
+    effects = {}
+    for choice in choices:
+        for question in choice:
+            effects[question.name] = question.effect
+    compared = list(effects.values())
+    start = linearised_at(effects=compared)
+    attempts = []
+    for number, choice in enumerate(choices):
+        there = linearised_at(effects=compared, point=start.point(same_questions(start, choice)))
+        attempts.append(there)
+        choices[number] = same_questions(there, choice)
+
+    # Mean cost of each choice, judged with the noise of each in turn.
+    costs_of_judges = []
+    for judge in attempts:
+        costs_of_judges.append(
+            [_cost(there, choice, judge) for there, choice in zip(attempts, choices)]
+        )
+    costs = np.mean(costs_of_judges, axis=0)
+    best = int(np.argmin(costs))
+
+    # The rivals within the resolution of the search, with what they would change.
+    values = []
+    for there, choice in zip(attempts, choices):
+        values.append(dict(zip(there.space.names, there.values(choice))))
+    settled = linearised_at(point=problem.point(same_questions(problem, choices[best])))
+    found = []
+    for k, choice in enumerate(choices):
+        if k == best or costs[k] - costs[best] >= TIE:
+            continue
+        # The question of which both choices have another effect.
+        different = next(
+            pair for pair in zip(choices[best], choice) if pair[0].name != pair[1].name
+        )
+        taken, other = same_questions(settled, different)
+        moves = {}
+        for name in problem.baseline.param_names:
+            moves[name] = values[k][name] - values[best][name]
+        found.append(Rival(taken, other, float(costs[k] - costs[best]), moves))
+    return settled, found
+
+
+def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[Question]:
+    """
+    Return the same questions at another linearisation.
+
+    A warm-up at the likeliest time constant of its bank.
+    """
+    found = []
+    for each in chosen:
+        asked = [question for question in problem.questions if question.name == each.name]
+        same = [question for question in asked if question.label == each.label]
+        if same:
+            found.append(same[0])
+            continue
+        losses = [problem.evidence.loss(problem.search.indices([question])) for question in asked]
+        found.append(asked[int(np.argmin(losses))])
+    return found
+
+
+def _swapped(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[list[Question]]:
+    """
+    Return the choices with an effect replaced by one that only curvature separates from it.
+
+    Where the curvature is observable.
+    """
+    swapped = []
+    for place, question in enumerate(chosen):
+        if question.effect.warp is None:
+            continue
+        if problem.curvature_shows(chosen, question) <= MIN_CURVATURE_NATS:
+            continue
+        for other, _ in problem.search.confounded(chosen, question, most=None):
+            if other.effect.warp is not None:
+                swapped.append([*chosen[:place], other, *chosen[place + 1 :]])
+    return swapped
+
+
+def _cost(
+    problem: LinearisedProblem, chosen: Sequence[Question], judge: LinearisedProblem
+) -> float:
+    """Return the held-out cost of a choice at its own linearisation, judged by another one."""
+    misfit = problem.judged_by(judge).heldout(problem.search.indices(chosen))
+    return 0.5 * misfit + PENALTY * sum(question.penalty for question in chosen)
+
+
+AS_MUCH = 0.5
+"""
+Share of the held-out likelihood of an effect that a simpler one must reach to be tested as its
+replacement.
+"""
+
+
+def simpler(
+    problem: LinearisedProblem, explained: Explained, named: Sequence[Question]
+) -> Sequence[Question]:
+    """
+    Return findings with no more parameters than the held-out residual supports.
+
+    With unexplained misfit, likelihood prefers more parameters: arms of the three accelerometers,
+    where one common arm fits as well. So an effect with fewer parameters replaces a finding when
+    the unweighted residual, in the unit of the sensor, is not sure to fall by `LEAST_REDUCTION`
+    from the one to the other.
+    """
+    kept = list(named)
+    for place, question in enumerate(named):
+        if not explained.rest_beside(kept, question):
+            continue
+        for other in _fewer(problem.search, kept, question):
+            instead = [*kept[:place], other, *kept[place + 1 :]]
+            if not problem.search.allowed(instead, other):
+                continue
+            if explained.share(instead, other) < needed_share(other):
+                continue
+            # The finding stays where the residual surely falls from the simpler one to it.
+            gain = gain_in_turn(problem, instead, kept, sensors=question.effect.sensors)
+            if gain.ci95[0] <= LEAST_REDUCTION:
+                kept = instead
+                break
+    return kept
+
+
+def _fewer(search: Search, kept: Sequence[Question], question: Question) -> list[Question]:
+    """
+    Return smaller effects that explain about as much in the place of a finding.
+
+    They are effects of the same sensors with fewer parameters, fewest first.
+    """
+    beside = [each for each in kept if each is not question]
+    enough = AS_MUCH * search.score(beside, question).gain
+    fewer = [
+        other
+        for other in search.others(kept)
+        if other.penalty < question.penalty
+        and '@' not in other.label
+        and other.effect.sensors == question.effect.sensors
+    ]
+    scores = [search.score(beside, other) for other in fewer]
+    return sorted(
+        (score.question for score in scores if score.significant and score.gain >= enough),
+        key=lambda other: other.penalty,
+    )
+
+
+MIN_UNIQUE_SHARE = 0.05
+"""Least share of the signal of each member that the other cannot imitate."""
+TRIED = 3
+"""Pairs from which a search is started."""
+
+
+def best_pairs(search: Search) -> list[list[Question]]:
+    """
+    Return the pairs that lower the loss most and are possible, the best first, at most three.
+
+    The normal matrix with the baseline projected out and each effect's block scaled to the unit
+    matrix gives a system of two blocks for each pair; systems of one shape are solved together.
+    Each member must keep some signal that is not collinear with its mate. That each is significant
+    without its mate is tested by the search from the pair (`Search.run`).
+    """
+    blocks = _Blocks(search)
+    shapes = defaultdict(list)
+    for one, two in combinations(range(len(search.questions)), 2):
+        names = {search.questions[one].name, search.questions[two].name}
+        if len(names) == 2 and not names & search.resolved:
+            shapes[blocks.size(one), blocks.size(two)].append((one, two))
+    scored: list[tuple[float, int, int]] = []
+    for pairs in shapes.values():
+        scored += blocks.score(pairs)
+
+    # The best pairs that are possible; of pairs that differ in a time constant only, the best one.
+    best: list[list[Question]] = []
+    known: list[set[str]] = []
+    for _, one, two in sorted(scored, reverse=True):
+        pair = [search.questions[one], search.questions[two]]
+        names = {question.name for question in pair}
+        if names not in known and all(search.allowed(pair, each) for each in pair):
+            best.append(pair)
+            known.append(names)
+        if len(best) == TRIED:
+            break
+    return best
+
+
+class _Blocks:
+    """
+    Normal equations of all questions, baseline projected out.
+
+    Each question's own block is the unit matrix.
+    """
+
+    def __init__(self, search: Search):
+        self.questions = search.questions
+        information, right = search.evidence.equations()
+        base = list(search.baseline)
+        free: list[int] = []
+        self.at = []
+        for question in search.questions:
+            start = len(free)
+            free += question.parameters
+            self.at.append(slice(start, len(free)))
+
+        # Schur complement: M = I_ff - I_fb I_bb^-1 I_bf, and the same of the right side.
+        factor = scipy.linalg.cho_factor(information[np.ix_(base, base)])
+        cross = information[np.ix_(base, free)]
+        matrix = information[np.ix_(free, free)] - cross.T @ scipy.linalg.cho_solve(factor, cross)
+        right = right[free] - cross.T @ scipy.linalg.cho_solve(factor, right[base])
+
+        # Scale rows and columns by L^-1 of each block L L'.
+        for at in self.at:
+            scale = np.sqrt(np.diag(matrix)[at])
+            own = matrix[at, at] / np.outer(scale, scale)
+            lower = np.linalg.cholesky(own + 1e4 * JITTER * np.eye(len(own))) * scale[:, None]
+            matrix[at] = np.linalg.solve(lower, matrix[at])
+            matrix[:, at] = np.linalg.solve(lower, matrix[:, at].T).T
+            right[at] = np.linalg.solve(lower, right[at])
+        self.matrix, self.right = matrix, right
+
+    def size(self, number: int) -> int:
+        """Return the number of parameters of a question."""
+        return len(self.questions[number].parameters)
+
+    def score(self, pairs: Sequence[tuple[int, int]]) -> Iterator[tuple[float, int, int]]:
+        """
+        Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape.
+
+        The members of a pair are not collinear.
+        """
+        every = np.arange(len(self.right))
+        places = np.array([[*every[self.at[a]], *every[self.at[b]]] for a, b in pairs])
+        n_first = self.size(pairs[0][0])
+        systems = self.matrix[places[:, :, None], places[:, None, :]]
+        systems = systems + 1e4 * JITTER * np.eye(places.shape[1])
+
+        # The loss falls by x' b at the solution x of M x = b.
+        values = np.linalg.solve(systems, self.right[places][:, :, None])[:, :, 0]
+        fall = np.einsum('ki,ki->k', values, self.right[places])
+        # Share of the signal of each member that its mate cannot imitate.
+        cross = systems[:, :n_first, n_first:]
+        first, second = values[:, :n_first], values[:, n_first:]
+        of_first = np.einsum('kij,ki->kj', cross, first)
+        of_second = np.einsum('kij,kj->ki', cross, second)
+        for k, (one, two) in enumerate(pairs):
+            imitated = max(
+                (of_first[k] @ of_first[k]) / max(first[k] @ first[k], 1e-300),
+                (of_second[k] @ of_second[k]) / max(second[k] @ second[k], 1e-300),
+            )
+            if 1.0 - imitated > MIN_UNIQUE_SHARE:
+                penalty = self.questions[one].penalty + self.questions[two].penalty
+                yield 0.5 * fall[k] - PENALTY * penalty, one, two

@@ -1,0 +1,392 @@
+"""Calibration on a table."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from imu_calibration.calibration.calibrate import conclude
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.solved import Solved
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.processes import in_processes
+from imu_calibration.core.progress import counter, report
+from imu_calibration.core.samples import BlockSource
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.trust import judged_from_of, latest_settling
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution, shrunk
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.window import StoredWindows, Window
+from imu_calibration.references.turntable.accumulator import restrict
+from imu_calibration.references.turntable.collector import GatherStep, from_bytes
+from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.requested_model import choose_model, settle_model
+from imu_calibration.references.turntable.session_data import KeptWindows, SessionData, join
+from imu_calibration.references.turntable.uncorrected_windows import end_of
+from imu_calibration.references.turntable.window_observations import TableResult, WindowObservations
+from imu_calibration.references.turntable.window_statistics import reduce_window
+from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
+
+if TYPE_CHECKING:  # in the standard library from Python 3.11 on
+    from typing_extensions import Self
+
+
+def calibrate_on_table(
+    sources: Sequence[BlockSource],
+    table: Table,
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    provenance: dict | None = None,
+    jobs: int = 1,
+    names: Sequence[str] | None = None,
+) -> TableResult:
+    """
+    Calibrate from one or several recordings of the same IMU on a table.
+
+    Parameters
+    ----------
+    sources : sequence of BlockSource
+        Read again when effects must be linearised again.
+    table : Table
+        The reference.
+    options : CalibrationOptions
+    provenance : dict, optional
+        Bag names, hashes and options for the document.
+    jobs : int
+        Number of processes that read recordings.
+    names : sequence of str, optional
+        Names of the recordings for messages.
+
+    Returns
+    -------
+    TableResult
+
+    Raises
+    ------
+    InputError
+        When a recording cannot be used or is of another frame, with its name when there are
+        several.
+
+    """
+    recordings = recordings_on_table(sources, table, jobs=jobs, names=names)
+    return conclude(recordings.solved(options), options, provenance=provenance)
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedWindows(Solved[Solution]):
+    """A solution of windows on a table."""
+
+    data: WindowObservations
+    """The windows."""
+
+    @property
+    def model(self) -> SensorModel:
+        """The model of the columns of the windows."""
+        return self.data.model
+
+
+def solved_windows(data: WindowObservations, options: CalibrationOptions) -> SolvedWindows:
+    """Return the solution of windows (`solve_gathered`)."""
+    return SolvedWindows(solve_gathered(data.gathered, data.model, options), data)
+
+
+class WindowSource(Protocol):
+    """Windows that are reduced again in each pass: of recordings, or of a live session."""
+
+    def solved(self, options: CalibrationOptions) -> SolvedWindows:
+        """Return the solution of the model that options request, at a valid linearisation."""
+
+    def solved_at(
+        self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
+    ) -> SolvedWindows:
+        """
+        Return the solution with the columns of a model.
+
+        Windows from the time `judged_from` (s) on are kept for the proof.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class TableRecordings:
+    """Recordings of one IMU on a table, which each pass reads."""
+
+    sources: Sequence[BlockSource]
+    """The recordings."""
+    table: Table
+    """The reference."""
+    names: tuple[str, ...]
+    """Names of the recordings for messages."""
+    jobs: int = 1
+    """Number of processes that read them."""
+    keep_windows: bool = False
+    """Whether windows are kept for the search of effects."""
+
+    @classmethod
+    def of(
+        cls,
+        sources: Sequence[BlockSource],
+        table: Table,
+        *,
+        jobs: int = 1,
+        names: Sequence[str] | None = None,
+        keep_windows: bool = False,
+    ) -> 'Self':
+        """Return recordings with their numbers as names where none are given."""
+        numbered = [f'recording {number}' for number in range(1, len(sources) + 1)]
+        return cls(sources, table, tuple(names or numbered), jobs, keep_windows)
+
+    def solved(self, options: CalibrationOptions) -> SolvedWindows:
+        """Return the solution of the model that options request, at a valid linearisation."""
+        model = choose_model(options, self.table)
+        if model.needs_temperature:
+            model = model.with_reference_temperature(_first_temperature(self.sources))
+        return solve_in_passes(self, model, options)
+
+    def solved_at(
+        self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
+    ) -> SolvedWindows:
+        """Read all recordings once; see `WindowSource.solved_at`."""
+        # The search has its windows when effects are added.
+        keep_windows = self.keep_windows and not (options.added or options.as_asked)
+        step = GatherStep(
+            self.table,
+            model,
+            options.windows,
+            options.nominal,
+            self.names,
+            keep_windows,
+            judged_from,
+        )
+        parts = self.reduced(step)
+        gathered = join(parts, self.names, model=model, table=self.table)
+        report('solving')
+        return solved_windows(WindowObservations(self.table, gathered, model), options)
+
+    def reduced(self, step: GatherStep) -> list[SessionData]:
+        """Return the windows of each recording, reduced with the columns of a model."""
+        numbered = [(source, session) for session, source in enumerate(self.sources)]
+        advance = counter('recordings', len(numbered) if self.jobs > 1 else 0)
+        return in_processes(step.gather, numbered, self.jobs, advance=advance)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRecording(TableRecordings):
+    """A recording that is read once: later linearisations reduce its stored windows."""
+
+    windows: StoredWindows = field(default_factory=StoredWindows)
+    """Its windows, unused ones too; empty before the first pass."""
+    first_pass: list[SessionData] = field(default_factory=list)
+    """The data of the first pass; empty before it."""
+
+    def reduced(self, step: GatherStep) -> list[SessionData]:
+        """Return the windows of the recording, reduced with the columns of a model."""
+        if not self.first_pass:
+            (source,) = self.sources
+            preflight = Preflight(step.table.gravity_value, one_sensor=True)
+            self.first_pass.append(step.read(source, 0, preflight, windows=self.windows))
+            return [*self.first_pass]
+        windows = (self.windows[number] for number in range(len(self.windows)))
+        used = (window for window in windows if window.kind != 'unused')
+        return [_reduced_again(self.first_pass[0], used, step)]
+
+
+@dataclass(frozen=True, eq=False)
+class KeptRecording(TableRecordings):
+    """A recording that is read once, unless it is long: then each pass reads it."""
+
+    windows: KeptWindows = field(default_factory=KeptWindows)
+    """Its used windows; empty before the first pass."""
+    first_pass: list[SessionData] = field(default_factory=list)
+    """The data of the first pass; empty before it."""
+
+    def reduced(self, step: GatherStep) -> list[SessionData]:
+        """Return the windows of the recording, reduced with the columns of a model."""
+        if self.first_pass and self.windows.is_complete:
+            return [_reduced_again(self.first_pass[0], self.windows.windows, step)]
+        self.windows.clear()
+        self.first_pass.clear()
+        (source,) = self.sources
+        self.first_pass.append(step.read(source, 0, self.checks(step), windows=self.windows))
+        return [*self.first_pass]
+
+    def checks(self, step: GatherStep) -> Preflight:
+        """Return the checks to which the recording is shown while it is read."""
+        return Preflight(step.table.gravity_value, one_sensor=True)
+
+
+@dataclass(frozen=True, eq=False)
+class WatchedRecording(KeptRecording):
+    """A recording that is shown to given checks when it is read for the first time."""
+
+    preflight: Preflight = field(default_factory=Preflight)
+    """The checks."""
+
+    def checks(self, step: GatherStep) -> Preflight:
+        """Return the given checks, of the first pass only."""
+        return super().checks(step) if self.preflight.streams else self.preflight
+
+
+def recordings_on_table(
+    sources: Sequence[BlockSource],
+    table: Table,
+    *,
+    jobs: int = 1,
+    names: Sequence[str] | None = None,
+    keep_windows: bool = False,
+) -> TableRecordings:
+    """Return recordings of one IMU; a single one is read once if it is not long."""
+    kind = KeptRecording if len(sources) == 1 else TableRecordings
+    return kind.of(sources, table, jobs=jobs, names=names, keep_windows=keep_windows)
+
+
+def _reduced_again(
+    first_pass: SessionData, windows: Iterable[Window], step: GatherStep
+) -> SessionData:
+    """Return the data of a recording with its used windows reduced with the columns of a model."""
+    reduced = (reduce_window(window, step.model, step.table) for window in windows)
+    return first_pass.anew(reduced, step.judged_from)
+
+
+def solve_in_passes(
+    source: WindowSource, model: SensorModel, options: CalibrationOptions
+) -> SolvedWindows:
+    """
+    Return the solution at a linearisation that is valid at it.
+
+    Each pass reduces all windows with the columns of a model. A drift that has settled is judged on
+    the last third, which is known after a pass only.
+    """
+    again = _at_time_constants(source, model, options)
+    judged_from = 0.0
+    for _ in range(MAX_TABLE_PASSES):
+        model = again
+        solved = source.solved_at(model, options, judged_from=judged_from)
+        solution = solved.solution
+        linearised = linearise_again(model, solution)
+        latest = latest_settling(solution.model, solution.values, solution.sd)
+        last_third = judged_from_of(latest, end_of(solved.data.gathered.accumulator))
+        if linearised is None and judged_from == last_third:
+            break
+        again = linearised or model
+        judged_from = last_third
+    return solved
+
+
+def _at_time_constants(
+    source: WindowSource, model: SensorModel, options: CalibrationOptions
+) -> SensorModel:
+    """
+    Return the model with the columns of requested warm-ups.
+
+    The columns are at the time constant with the smallest residuals of window means.
+
+    The iteration from the prior does not converge to a time constant that is several times shorter.
+    """
+    for effect in model.effects:
+        if effect.time_constant and effect.name not in options.point:
+            gathered = source.solved_at(model, options, judged_from=0.0).data.gathered
+            trials = at_time_constants(model, effect, end_of(gathered.accumulator))
+            of_means = []
+            for trial in trials:
+                solution = source.solved_at(trial, options, judged_from=0.0).solution
+                of_means.append(solution.residual_rms[effect.sensor][1])
+            model = trials[int(np.argmin(of_means))]
+    return model
+
+
+def _first_temperature(sources: Sequence[BlockSource]) -> float:
+    """Return the first temperature of the first recording."""
+    for block in sources[0]:
+        if block.temperature is not None and len(block.temperature):
+            return float(block.temperature.temperature_c[0])
+    raise InputError(
+        'a thermal effect needs temperatures, the recording has none; record imu/temperature or'
+        ' omit the effect',
+        key='temperature_topic',
+        code='temperature_missing',
+    )
+
+
+def solve_gathered(
+    gathered: SessionData, model: SensorModel, options: CalibrationOptions = CalibrationOptions()
+) -> Solution:
+    """
+    Return the Solution of gathered data with the columns of `model` for the requested effects.
+
+    The reduce step.
+    """
+    narrow = settle_model(model, options, gathered)
+    accumulator = (
+        gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
+    )
+    solution = solve(accumulator, narrow, bias_processes=options.bias_processes)
+    if options.accelerometer_model is None and _size_effect_unseen(solution):
+        smaller = narrow.without_arms()
+        solution = solve(
+            restrict(accumulator, narrow, smaller), smaller, bias_processes=options.bias_processes
+        )
+    return shrunk(solution, _by_default(solution.model, options))
+
+
+def calibration_of_saved(
+    data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()
+) -> Calibration:
+    """
+    Return the calibration of a saved live session (`LiveCalibration.saved`).
+
+    With the model of its columns and the added effects.
+
+    Raises
+    ------
+    DocumentError
+        When it is damaged, or was gathered with different joints.
+    NotObservableError
+        When no parameter is determined.
+
+    """
+    gathered, model, extension = from_bytes(data)
+    if model.joint_names != table.joint_names:
+        raise DocumentError(
+            f'a saved accumulator must be of the joints {", ".join(table.joint_names)}, '
+            f'this is of {", ".join(model.joint_names) or "none"}; '
+            'give the table or the arm that it was gathered on',
+            key='table',
+        )
+    options = extension.options(options)
+    solution = extension.applied(solve_gathered(gathered, model, options))
+    data = WindowObservations(table, gathered, model)
+    return conclude(SolvedWindows(solution, data, extension), options).calibration
+
+
+def _by_default(model: SensorModel, options: CalibrationOptions) -> list[slice]:
+    """
+    Return the parameters of each effect that is in the model unasked.
+
+    Levelling, the Earth's rate, arms of the accelerometers.
+    """
+    arms = options.accelerometer_model is None
+    # A model with an error of table or clock that the recordings support is that of a request for
+    # it: levelling and the Earth's rate are estimated in both.
+    as_described = not any(sensor == 'reference' for sensor, _ in options.added)
+    return [
+        model.slices[effect.key]
+        for effect in model.effects
+        if effect.role is Role.ARMS
+        and arms
+        or effect.sensor == 'reference'
+        and effect.nuisance
+        and options.reference_model is None
+        and as_described
+    ]
+
+
+def _size_effect_unseen(solution: Solution) -> bool:
+    arms, arm = (
+        solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM)
+    )
+    # An arm that is seen would bias the bias if left out.
+    return len(arms) > 0 and bool(arms.all() and arm.all())

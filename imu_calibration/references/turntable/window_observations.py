@@ -1,0 +1,471 @@
+"""
+Windows of a calibration on a table, and its error budget after section V of Avrutov 2017.
+
+The paper sums errors of the reference and of the outputs as if they were independent, with sign.
+Noise gives the covariance of the solution; a wrong reference that changes the predicted output by
+``dA c`` moves the parameters by ``G^+ dA c``, where errors of the rows are common when the table is
+not level and independent when an encoder is read in every pose.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.result import (
+    GRAVITY_SD,
+    CalibrationResult,
+    ErrorBudget,
+    Needs,
+    WindowErrors,
+)
+from imu_calibration.core.units import ARCMIN
+from imu_calibration.document.statistics import RecordingStatistics
+from imu_calibration.document.trust import Uncorrected, latest_settling
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.forward_equations import (
+    References,
+    coefficient_jacobian,
+    coefficients,
+    columns,
+    sensor_output,
+)
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import sessions_of
+from imu_calibration.estimation.observability import tolerance_scaled_singular_values
+from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.solution import GRAVITY, Solution, common_scale, with_term
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.kinematics.chain import tilt
+from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import CheckFinding, with_findings_of
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable import latitude_check, mount_check
+from imu_calibration.references.turntable.document_parts import gauge_of, statistics
+from imu_calibration.references.turntable.held_out_windows import HeldOutWindows, nominal_values
+from imu_calibration.references.turntable.needs import motions_needed, weak_on_table
+from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
+from imu_calibration.references.turntable.residuals.residual_blocks import residuals
+from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock, SessionData
+from imu_calibration.references.turntable.uncorrected_windows import uncorrected_on_table
+from imu_calibration.references.turntable.window_search import search_windows
+
+TableResult = CalibrationResult[Solution]
+"""A calibration on a table."""
+LEVELLING_SD = 2 * ARCMIN
+"""
+Levelling of the table in each of two directions, rad; counts when table_tilt is not estimated.
+"""
+JOINT_POSITION_SD = 10 * ARCMIN / 60
+"""Position of each joint, independent in every window, rad."""
+TABLE_RATE_SD = 1e-4
+"""Relative error of the table rate (its clock), common to all windows."""
+MOVING_SAMPLES = 20_000
+"""Most samples of moving windows that are used; they are subsampled evenly beyond it."""
+
+
+def error_budget(data: 'WindowObservations', solution: Solution) -> ErrorBudget:
+    """
+    Return the ErrorBudget of a calibration on a table.
+
+    First order, around the solution; weights of the solver. All windows at rest are used, and the
+    moving windows with kept samples.
+
+    Parameters
+    ----------
+    data : WindowObservations
+    solution : Solution
+
+    """
+    table = data.table
+    gravity_sd = table.gravity_sd_value
+    if table.gravity is not None and table.gravity_sd is None:
+        gravity_sd = GRAVITY_SD
+    errors = _errors_of_reference(data, solution, gravity_sd)
+    changes: list[Callable] = []
+    for error in errors:
+        changes += error.changes
+    shifts = parameter_shifts(data, solution, changes)
+
+    causes = {'noise': solution.sd}
+    texts = {'noise': 'noise and wander of the sensors, as this recording shows them'}
+    start = 0
+    for error in errors:
+        moved = shifts[start : start + len(error.changes)]
+        start += len(error.changes)
+        # Independent shifts of the windows add as squares, a common one as it is.
+        if not error.scattered:
+            moved = moved.sum(axis=1, keepdims=True)
+        causes[error.name] = np.sqrt((moved**2).sum(axis=(0, 1)))
+        texts[error.name] = error.text
+    return ErrorBudget(tuple(solution.param_names), causes, texts)
+
+
+@dataclass(frozen=True)
+class _ReferenceError:
+    """One cause of error of the reference."""
+
+    name: str
+    """Cause."""
+    text: str
+    """Its size for people."""
+    changes: tuple[Callable, ...]
+    """Each maps (table, motion) to values that differ by one standard deviation."""
+    scattered: bool = False
+    """Whether it is independent in every window, or common to all."""
+
+
+def _errors_of_reference(
+    data: 'WindowObservations', solution: Solution, gravity_sd: float
+) -> list[_ReferenceError]:
+    """Return the errors of the reference that the solution does not estimate."""
+    found = []
+    if solution.model.find('reference', Role.TILT) is None:
+        tilts = LEVELLING_SD * np.eye(2)
+        found.append(
+            _ReferenceError(
+                'levelling',
+                f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated',
+                tuple(partial(_tilted, angles) for angles in tilts),
+            )
+        )
+    arcsec = JOINT_POSITION_SD / ARCMIN * 60
+    turns = JOINT_POSITION_SD * np.eye(len(data.table.joints))
+    found.append(
+        _ReferenceError(
+            'joint position',
+            f'joint positions {arcsec:.2g} arcsec, independent in every window',
+            tuple(partial(_turned, angles) for angles in turns),
+            scattered=True,
+        )
+    )
+    found.append(
+        _ReferenceError(
+            'table rate',
+            f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows',
+            (partial(_faster, 1 + TABLE_RATE_SD),),
+        )
+    )
+    found.append(
+        _ReferenceError(
+            'gravity',
+            f'gravity known to {gravity_sd:.2g} m/s²',
+            (partial(_heavier, gravity_sd),),
+        )
+    )
+    return found
+
+
+def _tilted(angles: np.ndarray, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    return tilt(table, angles), motion
+
+
+def _turned(angles: np.ndarray, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    return table, replace(motion, position=motion.position + angles)
+
+
+def _faster(factor: float, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    return table, replace(
+        motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration
+    )
+
+
+def _heavier(change: float, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    return replace(table, gravity=table.gravity_value + change), motion
+
+
+def parameter_shifts(
+    data: 'WindowObservations', solution: Solution, changes: Sequence[Callable]
+) -> np.ndarray:
+    """
+    Return how each window's share of each change moves the parameters.
+
+    Shape (n_changes, n_windows, n_params).
+
+    Summed over windows: the shift of the estimate when all windows err together. A shift is
+    estimate minus truth.
+    """
+    sources = list(_sources(data.gathered))
+    outputs = [_outputs(data.table, solution, source, changes=changes) for source in sources]
+    kinds = [source.kind for source in sources]
+    counts = np.array([source.samples for source in sources])
+    times = np.array([source.time for source in sources])
+
+    # Normal equations of the solver: A' V^-1 A, and A' V^-1 dA c of each window and change.
+    prior = make_prior(solution.model)
+    normal = prior.root.T @ prior.root
+    right = np.zeros((len(changes), len(sources), len(solution.values)))
+    for sensor in solution.noise:
+        slope = coefficient_jacobian(solution.model, sensor, solution.values)
+        noise = solution.noise[sensor]
+        designs = [np.einsum('nq,qap->nap', own[sensor].columns, slope) for own in outputs]
+
+        # The means of all windows, correlated through the bias.
+        means = np.array([design.mean(axis=0) for design in designs])
+        variance = noise.mean_variance(kinds, counts) + noise.offset_sd**2
+        whitening = Whitening(variance, times, sessions_of(sources), processes=noise.bias_processes)
+        weighted = whitening.adjoint(whitening(means))
+        normal = normal + np.tensordot(weighted, means, ([0, 1], [0, 1]))
+
+        # The samples about the mean of their window.
+        for k, (source, design, own) in enumerate(zip(sources, designs, outputs)):
+            moved = own[sensor].changes
+            centred = design - means[k]
+            within = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
+            normal += np.tensordot(within, centred, ([0, 1], [0, 1]))
+            right[:, k] += moved.mean(axis=1) @ weighted[k]
+            right[:, k] += np.tensordot(moved, within, ([1, 2], [0, 1]))
+    index = np.flatnonzero(~fixed_parameters(solution.model) & ~solution.held)
+    shifts = np.zeros_like(right)
+    shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
+    return shifts
+
+
+class _Source(NamedTuple):
+    """A window at rest, or a moving one that was kept; its samples are `stride` apart."""
+
+    kind: str
+    time: float
+    session: int
+    samples: float
+    stride: int
+    motion: JointMotion
+    temperature_c: np.ndarray | None
+
+
+def _sources(gathered: SessionData) -> Iterator[_Source]:
+    """Yield the windows at rest, and the moving ones that were kept."""
+    rows = {
+        (row.session, row.time): row.count
+        for row in gathered.accumulator.rows
+        if row.kind == 'static'
+    }
+    typical = float(np.median(list(rows.values()))) if rows else 1.0
+    for time, session, position in gathered.poses:
+        motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
+        yield _Source('static', time, session, rows.get((session, time), typical), 1, motion, None)
+    stride = max(1, int(np.ceil(sum(len(w) for w in gathered.kept) / MOVING_SAMPLES)))
+    for window in gathered.kept:
+        some = slice(None, None, stride)
+        temperature = None if window.temperature_c is None else window.temperature_c[some]
+        yield _Source(
+            window.kind,
+            float(window.time.mean()),
+            0,
+            len(window),
+            stride,
+            window.motion.select(some),
+            temperature,
+        )
+
+
+class _Outputs(NamedTuple):
+    """Samples of one sensor in one window."""
+
+    columns: np.ndarray
+    """Columns of the model, shape (n, n_columns)."""
+    changes: np.ndarray
+    """Changes of the output by each error, shape (n_changes, n, 3)."""
+
+
+def _outputs(
+    table: Table, solution: Solution, source: _Source, *, changes: Sequence[Callable]
+) -> dict[str, _Outputs]:
+    """Return sensor -> its columns and changes of the output at the samples of a window."""
+    model = solution.model
+    temperature = source.temperature_c
+    if model.needs_temperature and temperature is None:  # the mean at rest is not kept
+        temperature = np.full(len(source.motion), model.temperature_ref_c)
+    references = [References(model, table, source.motion, temperature_c=temperature)]
+    for change in changes:
+        changed, motion = change(table, source.motion)
+        references.append(References(model, changed, motion, temperature_c=temperature))
+    found = {}
+    for sensor in solution.noise:
+        outputs = [
+            sensor_output(model, sensor, solution.values, ref=each.at(sensor))
+            for each in references
+        ]
+        moved = np.array(outputs[1:]).reshape(-1, *outputs[0].shape) - outputs[0]
+        found[sensor] = _Outputs(columns(references[0], sensor), moved)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class WindowObservations:
+    """Windows of recordings on a table, reduced with the columns of a model."""
+
+    table: Table
+    """The reference."""
+    gathered: SessionData
+    """The windows, conditions and counts."""
+    model: SensorModel
+    """The model of the gathered columns; the solved one may have fewer effects."""
+
+    unit: ClassVar[str] = 'windows'
+    tested: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def reference(self) -> str:
+        """Short description of the table."""
+        table = self.table
+        return f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})'
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Sensors without usable readings."""
+        return self.gathered.absent
+
+    @property
+    def gravity(self) -> float:
+        """Gravity at the table, m/s^2."""
+        return self.table.gravity_value
+
+    @property
+    def period(self) -> float:
+        """Sampling period, s."""
+        rows = self.gathered.accumulator.rows
+        return float(np.median([row.duration / max(row.count - 1, 1) for row in rows]))
+
+    def gauge(self, solution: Solution) -> dict[str, Any]:
+        """Return the conventions of origin and axes."""
+        return gauge_of(solution.model)
+
+    def findings(self, solution: Solution) -> tuple[CheckFinding, ...]:
+        """
+        Return the findings of the recordings, of the mount and of the latitude.
+
+        Raises
+        ------
+        InputError
+            When the latitude has the wrong sign.
+
+        """
+        mounted = with_findings_of(
+            mount_check.MOUNT_CHECK,
+            mount_check.mount_findings(solution, self.table),
+            self.gathered.findings,
+        )
+        if 'gyroscope' in self.absent:
+            return mounted
+        windows = None
+        if not self.absent:
+            windows = latitude_check.window_rates(self.gathered, self.model, self.table)
+        return with_findings_of(
+            latitude_check.LATITUDE_CHECK,
+            latitude_check.latitude_findings(solution, self.table, windows),
+            mounted,
+        )
+
+    def with_reference_errors(self, solution: Solution) -> Solution:
+        """Return the solution with the uncertainty of gravity in its covariance."""
+        table = self.table
+        scale = common_scale(solution.model, solution.values)
+        moved = scale * table.gravity_sd_value / table.gravity_value
+        terms = with_term(solution.terms, GRAVITY, np.outer(moved, moved))
+        return replace(solution, terms=terms)
+
+    def searches(
+        self, solution: Solution, options: CalibrationOptions
+    ) -> Iterator[ResidualAnalysis]:
+        """Yield the search of effects in each recording with enough windows."""
+        return search_windows(self.gathered, self.table, solution.model, options=options)
+
+    def held_out(self, solution: Solution) -> HeldOutWindows:
+        """Return the windows in folds, with the parameters of a solution without each fold."""
+        windows = self.gathered.held_out.restricted(self.model, solution.model)
+        return HeldOutWindows.of(windows, solution, self.uncorrected(solution).centre)
+
+    def uncorrected(self, solution: Solution) -> Uncorrected:
+        """Return the errors that compensation leaves uncorrected."""
+        values = solution.values
+        return uncorrected_on_table(
+            solution.model.at(values),
+            values,
+            self.gathered.accumulator,
+            gathered=self.model,
+            latest=latest_settling(solution.model, values, solution.sd),
+        )
+
+    def statistics(self, solution: Solution) -> RecordingStatistics:
+        """Return the statistics of windows, noise and residuals, and the common turn."""
+        return statistics(solution, self.gathered)
+
+    def needs(
+        self, solution: Solution, tolerances: np.ndarray, *, quality: dict[str, Any]
+    ) -> Needs:
+        """Return the needs of a solution, see `Observations.needs`."""
+        motions = motions_needed(solution, tolerances, self.table, quality=quality)
+        return Needs(motions, weak_on_table(solution, tolerances, motions))
+
+    def singular_values(self, result: TableResult) -> np.ndarray:
+        """
+        Return the singular values of the design in units of the tolerances.
+
+        Directions that the gauge fixes by convention are left out.
+        """
+        prior = make_prior(result.solution.model)
+        convention = prior.root[len(result.tolerances) :]
+        values = tolerance_scaled_singular_values(
+            result.solution.information + convention.T @ convention, result.tolerances
+        )
+        return values[len(prior.gauge) :]
+
+    def window_errors(self, result: TableResult) -> WindowErrors:
+        """
+        Return the errors of window means before and after, against the table.
+
+        After: predicted without the fold of the window.
+        """
+        solution, model = result.solution, result.solution.model
+        held_out = self.gathered.held_out
+        if not held_out.n_windows:
+            held_out = HeldOut([HeldOutBlock(self.gathered.accumulator)])
+        held_out = held_out.restricted(self.model, model)
+        folds = [solution.values]
+        if len(held_out.blocks) > 1:
+            folds = held_out.values_without(solution)
+
+        # The rows of all blocks, and the fold of each row.
+        rows = []
+        fold = []
+        for number, block in enumerate(held_out.blocks):
+            for row in block.accumulator.rows:
+                rows.append(row)
+                fold.append(number % len(folds))
+        count = np.array([row.count for row in rows], float)
+
+        errors = WindowErrors(
+            np.array([row.time for row in rows]),
+            np.array([row.kind for row in rows]),
+            *({} for _ in range(5)),
+        )
+        for sensor, noise in solution.noise.items():
+            means = np.array([row.sensors[sensor].mean for row in rows])
+            columns_of_means, output = means[:, :-3], means[:, -3:]
+            nominal = coefficients(model, sensor, nominal_values(model))
+            after = np.array([coefficients(model, sensor, values) for values in folds])[fold]
+            missed = output - np.einsum('ni,nij->nj', columns_of_means, after)
+            matrix = result.calibration.of(sensor, Role.LINEAR)
+            errors.measured[sensor] = output
+            errors.true[sensor] = means[:, model.columns_of(sensor, Role.LINEAR)]
+            errors.before[sensor] = output - columns_of_means @ nominal
+            errors.after[sensor] = missed @ np.linalg.inv(matrix).T
+            errors.floor[sensor] = np.sqrt(
+                noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance
+            )
+        return errors
+
+    def residuals_of(self, result: TableResult, window: Window) -> dict[str, np.ndarray]:
+        """Return measured values minus those predicted from the motion of the table."""
+        solution = result.solution
+        return residuals([window], self.table, solution.model, values=solution.values)
+
+    def error_budget(self, result: TableResult) -> ErrorBudget:
+        """Return the contributions of the noise and of the table."""
+        return error_budget(self, result.solution)

@@ -1,0 +1,91 @@
+"""Search of effects in the windows of each recording on a table."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.effects.sensor_model import BARE, SensorModel
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.requested_model import choose_model
+from imu_calibration.references.turntable.residuals.residual_analysis import (
+    ResidualAnalysis,
+    inquire,
+)
+from imu_calibration.references.turntable.selection.window_evidence import MIN_FOLD_WINDOWS
+from imu_calibration.references.turntable.session_data import SessionData
+
+
+def search_windows(
+    gathered: SessionData, table: Table, solved: SensorModel, *, options: CalibrationOptions
+) -> Iterator[ResidualAnalysis]:
+    """
+    Yield the search in each recording with enough windows, the largest recording first.
+
+    The unexplained residual of each is evaluated, and its blocks are freed.
+
+    Parameters
+    ----------
+    gathered : SessionData
+        With the windows of each recording.
+    table : Table
+    solved : SensorModel
+        The model of the solution.
+    options : CalibrationOptions
+        Of the requested model.
+
+    """
+    baseline = baseline_model(options, table, solved)
+    for windows in windows_to_ask(gathered):
+        found = inquire(windows, table, baseline, bias_processes=options.bias_processes)
+        found.unexplained_rests()
+        yield found
+
+
+def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
+    """
+    Return the windows of each recording that suffice for a search of effects.
+
+    The largest recording is first.
+    """
+    return [
+        spread.windows for spread in gathered.spreads if len(spread.windows) >= MIN_FOLD_WINDOWS
+    ]
+
+
+def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
+    """
+    Return the options of the baseline model of the search.
+
+    Effects that were not requested have to be significant.
+    """
+    return replace(
+        options,
+        accelerometer_model=options.accelerometer_model or BARE,
+        reference_model=options.reference_model or 'none',
+    )
+
+
+def baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
+    """
+    Return the baseline model of the search.
+
+    Parameters
+    ----------
+    options : CalibrationOptions
+    table : Table
+    solved : SensorModel
+        The model of a solution; the same effects are linearised at its point.
+
+    """
+    model = choose_model(baseline_options(options), table)
+    for effect in solved.effects:
+        # What the search may not test it cannot find: the residual would show it as unexplained.
+        if effect.key not in model.slices and not model.catalogue.is_candidate(effect):
+            model = model.with_effect(*effect.key)
+    names = {effect.name for effect in model.effects}
+    return replace(
+        model,
+        point={name: value for name, value in solved.point.items() if name in names},
+        temperature_ref_c=solved.temperature_ref_c,
+    )
