@@ -19,8 +19,8 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.references.turntable.residuals.residual_analysis import inquire
+from imu_calibration.references.turntable.selection import testable_effects
 from imu_calibration.references.turntable.selection.investigation import investigate
-from imu_calibration.references.turntable.selection.testable_effects import testable_effects
 from imu_calibration.references.turntable.selection.window_evidence import locked_windows
 from imu_calibration.references.turntable.selection.window_gain import heldout_gain
 from imu_calibration.selection.gain import APPLIED, OF_MODEL
@@ -145,7 +145,7 @@ def test_document_holds_what_the_contract_asks_for(sizes):
     assert set(finding['gain']) >= {'heldout_rms_before', 'heldout_rms_after', 'reduction', 'ci95'}
     assert document['baseline']['accelerometer']['effects'] == ['bias', 'matrix']
     used = [window for window in recording.windows if window.kind != 'unused']
-    _, not_testable = testable_effects(recording.model, recording.table, used)
+    _, not_testable = testable_effects.testable_effects(recording.model, recording.table, used)
     assert {entry['effect'] for entry in not_testable} == {'earth_rate'} | {
         f'{short}_{what}'
         for short in ('accel', 'gyro')
