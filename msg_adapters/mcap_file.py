@@ -409,8 +409,7 @@ class McapFile(StorageFile):
         self.n_unpacked = 0
         ahead = FIRST_BYTES
         while position is not None:
-            prefix = self._read(position, PREFIX.size)
-            opcode, length = PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
+            opcode, length = self._prefix(position)
             behind = position + PREFIX.size + length
             if opcode in (DATA_END, FOOTER):
                 return
@@ -439,6 +438,11 @@ class McapFile(StorageFile):
                 yield opcode, position + PREFIX.size, length, None
                 position = behind
 
+    def _prefix(self, position):
+        """Return (opcode, length) of the record at `position`, zeros at the end of the file."""
+        prefix = self._read(position, PREFIX.size)
+        return PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
+
     def _resume(self, position):
         """
         Count the damage at `position` and return the start of the next chunk in the summary.
@@ -461,8 +465,7 @@ class McapFile(StorageFile):
         """Return (channel id, offsets) from the MessageIndex records that start at `position`."""
         indexes = []
         while True:
-            prefix = self._read(position, PREFIX.size)
-            opcode, length = PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
+            opcode, length = self._prefix(position)
             if opcode != MESSAGE_INDEX or position + PREFIX.size + length > self.size:
                 return indexes
             try:

@@ -180,11 +180,11 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
         step = FleetStep(table, settings, None if options.no_report else calibration_report)
+        each = [(unit,) for unit in units]
         if options.scheduler:
-            results = on_cluster(options.scheduler, step.calibrate, units, advance=advance)
+            results = on_cluster(options.scheduler, step.calibrate, each, advance=advance)
         else:
             jobs = jobs_for(options.jobs, len(units))
-            each = [(unit,) for unit in units]
             results = in_processes(step.calibrate, each, jobs, advance=advance)
         spreads = summarise(results)
         reasons = []

@@ -127,3 +127,27 @@ def exit_code(calibration: Calibration) -> int:
     most DROPPED_SHARE of the samples were dropped.
     """
     return exit_code_of(shortcomings(calibration))
+
+
+class JudgedResult:
+    """Exit code of a result with a calibration, and its reasons."""
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration."""
+        raise NotImplementedError
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        return shortcomings(self.calibration)
+
+    @property
+    def exit_code(self) -> int:
+        """
+        0 when each sensor helps and nothing is missing, otherwise 3.
+
+        Nothing is missing when every requested parameter of the sensors is determined and at most
+        1 % of the samples were dropped.
+        """
+        return exit_code(self.calibration)

@@ -77,7 +77,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     ]
     if not windows:
         return None
-    expected = [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
+    expected = _expected_rates(windows, table)
     turning = [np.linalg.norm(rate, axis=1) > MIN_TURN_RATE for rate in expected]
     repeats = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
     same = [np.append(each.all(axis=1), False) for each in repeats]
@@ -107,7 +107,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     windows = _unsaturated(windows)
     if not windows:
         return None
-    expected = [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
+    expected = _expected_rates(windows, table)
     as_described = [rate + bias for rate in expected]
     for k, name in enumerate(table.joint_names):
         spans = _frozen_spans(windows, table, as_described, joint=k)
@@ -130,6 +130,11 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
                 ' time',
             )
     return description_error(windows, table) if is_unexplained(windows, expected) else None
+
+
+def _expected_rates(windows: Sequence[Window], table: Table) -> list[np.ndarray]:
+    """Return the rates of the sensor by the joints in each window, rad/s, shape (n, 3)."""
+    return [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
 
 
 def _unsaturated(windows):

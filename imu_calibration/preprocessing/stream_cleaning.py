@@ -225,8 +225,7 @@ class StreamCheck:
         accepted = []
         while len(samples):
             stamps = samples.stamp_ns
-            newest = stamps[0] - 1 if self._newest_raw is None else self._newest_raw
-            before = np.maximum.accumulate(np.concatenate([[newest], stamps]))[:-1]
+            before = _newest_before(stamps, self._newest_raw)
             reset = _is_reset(stamps - before)
             end = int(np.argmax(reset)) if reset.any() else len(stamps)
             if end:
@@ -255,8 +254,7 @@ class StreamCheck:
         if samples is None or not len(samples):
             return []
         stamps = samples.stamp_ns
-        newest = stamps[0] - 1 if self._newest is None else self._newest
-        before = np.maximum.accumulate(np.concatenate([[newest], stamps]))[:-1]
+        before = _newest_before(stamps, self._newest)
         self._count('repeated stamp', np.count_nonzero(stamps == before))
         self._count('backward stamp', np.count_nonzero(stamps < before))
         keep = stamps > before
@@ -320,6 +318,12 @@ class EpochFilters:
                 passed += imu_filter.push(part)
             parts = passed
         return parts
+
+
+def _newest_before(stamps: np.ndarray, newest: int | None) -> np.ndarray:
+    """Return the largest stamp before each one, shape (n,); `newest`: of earlier samples."""
+    first = stamps[0] - 1 if newest is None else newest
+    return np.maximum.accumulate(np.concatenate([[first], stamps]))[:-1]
 
 
 def _is_reset(step):

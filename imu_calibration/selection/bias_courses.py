@@ -25,6 +25,17 @@ class TemperatureCourse:
     """True for the windows for which the recording contains it, shape (k,)."""
 
 
+def relative_temperature(temperature: np.ndarray) -> np.ndarray | None:
+    """
+    Return the temperature about its mean as a share of its span, shape (k,).
+
+    None where it is not known throughout, or changes too little.
+    """
+    if not np.all(np.isfinite(temperature)) or np.ptp(temperature) <= LEAST_WARMING:
+        return None
+    return (temperature - temperature.mean()) / np.ptp(temperature)
+
+
 def temperature_courses(time: np.ndarray, temperature: np.ndarray) -> Iterator[TemperatureCourse]:
     """
     Yield the rate of the temperature, its earlier values, and its values through a thermal mass.
@@ -38,9 +49,9 @@ def temperature_courses(time: np.ndarray, temperature: np.ndarray) -> Iterator[T
         s, in order, and degrees Celsius.
 
     """
-    if not np.all(np.isfinite(temperature)) or np.ptp(temperature) <= LEAST_WARMING:
+    warm = relative_temperature(temperature)
+    if warm is None:
         return
-    warm = (temperature - temperature.mean()) / np.ptp(temperature)
 
     # The rate over twice the shortest lag, so that noise of the thermometer averages.
     shortest = TEMPERATURE_LAGS[0]

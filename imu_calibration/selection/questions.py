@@ -39,6 +39,11 @@ class Question:
         return self.effect.sensor
 
 
+def with_exchanged(chosen: Sequence[Question], place: int, other: Question) -> list[Question]:
+    """Return a choice with another question in a place."""
+    return [*chosen[:place], other, *chosen[place + 1 :]]
+
+
 def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ...]]]:
     """Return sensor -> list of the parameters of effects that are smooth in time."""
     found: dict[str, list[tuple[int, ...]]] = {sensor: [] for sensor in SENSORS}

@@ -16,7 +16,7 @@ from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.evidence import Evidence, agree
-from imu_calibration.selection.questions import Question
+from imu_calibration.selection.questions import Question, with_exchanged
 
 FAMILY_WISE = 0.001
 """Probability of a finding in a recording with a correct model."""
@@ -372,7 +372,7 @@ class Search:
             for other in self.others(remaining):
                 if other is question:
                     continue
-                trial = [*chosen[:place], other, *chosen[place + 1 :]]
+                trial = with_exchanged(chosen, place, other)
                 trial_cost = self.cost(trial, cost)
                 if not trial_cost < cost:
                     continue
@@ -416,7 +416,7 @@ class Search:
             # A special case with an equal fit is preferred: the general effect is not its rival.
             if question.effect.contained_in == other.name:
                 continue
-            trial = [*chosen[:place], other, *chosen[place + 1 :]]
+            trial = with_exchanged(chosen, place, other)
             tie = smooth_tie if other.effect.smooth else TIE
             difference = self.cost(trial, cost + tie) - cost
             if not difference < tie or not self.allowed(trial, other):

@@ -13,7 +13,7 @@ import numpy as np
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.selection.bias_courses import LEAST_WARMING, temperature_courses
+from imu_calibration.selection.bias_courses import relative_temperature, temperature_courses
 
 LEAST_OF_AXIS = 0.1
 """Share of the strongest axis' squares from which another axis has an excess too."""
@@ -178,9 +178,9 @@ def slow_explanations(
     every = np.ones(len(time), bool)
     for curves in curves_in_time(time):
         yield CURVES_IN_TIME, curves, every
-    if not np.all(np.isfinite(temperature)) or np.ptp(temperature) <= LEAST_WARMING:
+    warm = relative_temperature(temperature)
+    if warm is None:
         return
-    warm = (temperature - temperature.mean()) / np.ptp(temperature)
     yield 'temperature', np.stack([warm, warm**2], axis=1), every
     for course in temperature_courses(time, temperature):
         yield course.name, course.values[:, None], course.known

@@ -26,7 +26,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.change import checked_limit
 from imu_calibration.document.decision import Verdict
-from imu_calibration.document.outcome import exit_code, shortcomings
+from imu_calibration.document.outcome import JudgedResult
 from imu_calibration.document.proof_entry import EarlierErrors
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
@@ -50,7 +50,7 @@ if TYPE_CHECKING:  # in the standard library from Python 3.11 on
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrated:
+class Calibrated(JudgedResult):
     """
     Result of a calibration.
 
@@ -71,21 +71,6 @@ class Calibrated:
     def verdict(self) -> Verdict:
         """The decision per sensor with warnings, notes and next steps."""
         return self.result.verdict
-
-    @property
-    def reasons(self) -> list[str]:
-        """Why the exit code is 3, a line each."""
-        return shortcomings(self.calibration)
-
-    @property
-    def exit_code(self) -> int:
-        """
-        0 when each sensor helps and nothing is missing, otherwise 3.
-
-        Nothing is missing when every requested parameter of the sensors is determined and at most
-        1 % of the samples were dropped.
-        """
-        return exit_code(self.calibration)
 
     def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """

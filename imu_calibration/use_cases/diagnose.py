@@ -13,7 +13,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.outcome import exit_code, shortcomings
+from imu_calibration.document.outcome import JudgedResult
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import (
     Choices,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # in the standard library from Python 3.11 on
 
 
 @dataclass(frozen=True, eq=False)
-class Diagnosed:
+class Diagnosed(JudgedResult):
     """
     Result of a diagnosis.
 
@@ -71,16 +71,6 @@ class Diagnosed:
     def document(self) -> dict:
         """The content of diagnosis.json."""
         return self.result.document
-
-    @property
-    def reasons(self) -> list[str]:
-        """Why the exit code is 3, a line each."""
-        return shortcomings(self.calibration)
-
-    @property
-    def exit_code(self) -> int:
-        """That of the calibration."""
-        return exit_code(self.calibration)
 
     def plot(self, number: int = 1) -> Drawn:
         """

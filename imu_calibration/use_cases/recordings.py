@@ -366,15 +366,15 @@ def jobs_for(asked: int | None, n_items: int) -> int:
 
 def on_cluster(
     address: str,
-    function: Callable[[Any], Returned],
-    items: Sequence[Any],
+    function: Callable[..., Returned],
+    items: Sequence[tuple],
     *,
     advance: Callable[[int], object],
 ) -> list[Returned]:
     """
     Return the results of a function on the workers of a dask scheduler, in the order of the items.
 
-    They must see the same paths and have this package. `advance` as for `in_processes`.
+    They must see the same paths and have this package. Arguments as for `in_processes`.
 
     Raises
     ------
@@ -400,7 +400,7 @@ def on_cluster(
             key='scheduler',
         ) from error
     with client, client.as_current():
-        futures = client.map(function, list(items), pure=False)
+        futures = client.map(function, *zip(*items), pure=False)
         for _ in distributed.as_completed(futures):
             advance(1)
         return [future.result() for future in futures]

@@ -21,7 +21,7 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS, MOTIONS, ONE_JOINT, OTHER_MOUNT
 from imu_calibration.selection.gain import Gain
-from imu_calibration.selection.questions import Question
+from imu_calibration.selection.questions import Question, with_exchanged
 from imu_calibration.selection.search import FAMILY_WISE, Score, Search
 
 MIN_EVIDENCE_GROWTH = 9.0
@@ -279,7 +279,7 @@ def finding(
     question = named[place]
 
     def in_its_place(mate: Question) -> dict[str, tuple[float, float, str]]:
-        return fitted(search, [*named[:place], mate, *named[place + 1 :]], mate)
+        return fitted(search, with_exchanged(named, place, mate), mate)
 
     score = search.score([q for q in named if q is not question], question)
     gain, explained = gain_of(place), share(named, question)

@@ -219,7 +219,7 @@ def values_without(
     )
     scatter = np.array([*(hand.statistics[f'{name}_scatter_sd'] ** 2 for name in COMPONENTS), 0.0])
     free = ~hand.held & ~model.fixed
-    rows = np.column_stack([system.nuisance, system.main[:, free], system.residual])
+    rows = np.column_stack([system.design(free), system.residual])
     rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
     prior = np.column_stack(
         [np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors]

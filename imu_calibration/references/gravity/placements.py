@@ -85,7 +85,7 @@ def covariance_of_placements(rows: RowSet, found: RowEstimate) -> np.ndarray:
     of_poses = np.flatnonzero(rows.component == pose)
     mean = 3 * placement[rows.group[of_poses, 0]] + np.arange(len(of_poses)) % 3
     weights = np.zeros((3 * len(first), len(rows.residual)))
-    weights[mean, of_poses] = 1 / found.scatter.total(rows.noise, rows.component)[of_poses]
+    weights[mean, of_poses] = 1 / rows.variance(found.scatter)[of_poses]
     weights /= weights.sum(axis=1, keepdims=True)
 
     # Excess of the variance of the means over that of independent rests.
@@ -103,8 +103,8 @@ def _variance_of_means(rows: RowSet, found: RowEstimate, weights: np.ndarray) ->
     By restricted likelihood on the means and on the differences within placements: the rows of
     each placement are transformed to their mean and to the directions across it.
     """
-    total = found.scatter.total(rows.noise, rows.component)
-    columns = np.column_stack([rows.nuisance, rows.main[:, found.free], rows.residual])
+    total = rows.variance(found.scatter)
+    columns = np.column_stack([rows.design(found.free), rows.residual])
     white = columns / np.sqrt(total)[:, None]
 
     transformed = [white[rows.component != COMPONENTS.index('pose')], weights @ columns]

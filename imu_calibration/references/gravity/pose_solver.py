@@ -313,8 +313,8 @@ def without_outlying_poses(
 
 def _whitened(rows: RowSet, found: RowEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals in sds, and an orthonormal basis of the fitted columns."""
-    root = np.sqrt(found.scatter.total(rows.noise, rows.component))
-    design = np.hstack([rows.nuisance, rows.main[:, found.free]]) / root[:, None]
+    root = np.sqrt(rows.variance(found.scatter))
+    design = rows.design(found.free) / root[:, None]
     rest = rows.residual / root
     # A ridge, as some columns may be dependent.
     ridge = np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)

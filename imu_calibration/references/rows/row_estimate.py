@@ -63,6 +63,14 @@ class RowSet:
     ends.
     """
 
+    def variance(self, scatter: GroupVariances, *, inflated: bool = False) -> np.ndarray:
+        """Return the variance of each row (`GroupVariances.total`), shape (m,)."""
+        return scatter.total(self.noise, self.component, inflated)
+
+    def design(self, free: np.ndarray) -> np.ndarray:
+        """Return the columns of nuisances and free parameters, shape (m, d + n_free)."""
+        return np.hstack([self.nuisance, self.main[:, free]])
+
 
 class RowReference(Protocol):
     """What an estimate needs of a reference."""
@@ -199,7 +207,7 @@ class _RowSquares:
         rows = self.reference.linearise(at.state)
         n_nuisances = rows.nuisance.shape[1]
         n_free = int(free.sum())
-        columns = np.hstack([rows.nuisance, rows.main[:, free]])
+        columns = rows.design(free)
         design = np.vstack([columns, np.eye(n_nuisances + n_free)[n_nuisances:]])
         distance = (self.reference.nominal - at.state.values)[free]
         residual = np.concatenate([rows.residual, distance])
@@ -249,7 +257,7 @@ def _factor(rows: RowSet, scatter: GroupVariances) -> np.ndarray:
 
     The factor is at inflated variances.
     """
-    sd = np.sqrt(scatter.total(rows.noise, rows.component, inflated=True))
+    sd = np.sqrt(rows.variance(scatter, inflated=True))
     n_nuisances = rows.nuisance.shape[1]
     factor = triangular_of_band(np.hstack([rows.nuisance, rows.main]) / sd[:, None])
     return factor[n_nuisances:, n_nuisances:]
@@ -270,7 +278,7 @@ def _covariance_of_scatter(rows: RowSet, scatter: GroupVariances, free: np.ndarr
         Zero for parameters that are not free.
 
     """
-    variance = scatter.total(rows.noise, rows.component, inflated=True)
+    variance = rows.variance(scatter, inflated=True)
     gain = gain_of_rows(rows, scatter, free) * np.sqrt(variance - rows.noise)
     found = np.zeros((len(free),) * 2)
     found[np.ix_(free, free)] = gain @ gain.T
@@ -284,7 +292,7 @@ def gain_of_rows(rows: RowSet, scatter: GroupVariances, free: np.ndarray) -> np.
     ``(A' V^-1 A)^-1 A' V^-1`` without the rows of the nuisances, A being the columns of nuisances
     and free parameters, V the inflated variances.
     """
-    root = np.sqrt(scatter.total(rows.noise, rows.component, inflated=True))
-    design = np.hstack([rows.nuisance, rows.main[:, free]]) / root[:, None]
+    root = np.sqrt(rows.variance(scatter, inflated=True))
+    design = rows.design(free) / root[:, None]
     solved = scipy.linalg.cho_solve((triangular_of_band(design), False), design.T)
     return solved[rows.nuisance.shape[1] :] / root

@@ -31,7 +31,7 @@ def model_error_of_rows(
 
     """
     # Rows of unit variance, the design without its part along the nuisances (F F' A).
-    root = np.sqrt(found.scatter.total(rows.noise, rows.component))[:, None]
+    root = np.sqrt(rows.variance(found.scatter))[:, None]
     rest = rows.residual / root[:, 0]
     fitted = scipy.linalg.qr(rows.nuisance / root, mode='economic')[0]
     main = rows.main / root

@@ -26,7 +26,7 @@ from imu_calibration.preprocessing.window import Window, all_samples, chunks
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.held_out_windows import nominal_values, with_reference
-from imu_calibration.references.turntable.residuals.proposals import Proposal
+from imu_calibration.references.turntable.residuals.proposals import Proposal, with_formulas
 from imu_calibration.references.turntable.residuals.residual_blocks import residuals
 from imu_calibration.references.turntable.selection.investigation import Investigation
 from imu_calibration.references.turntable.selection.saturation import measured
@@ -114,12 +114,7 @@ def gains_of_formulas(
     before = _applied_parameters(found, found.adopted)
 
     # The model with the formulas, linearised at their amplitudes.
-    model = before.model
-    values = before.values
-    for proposal in proposals:
-        for effect, size in zip(proposal.effects, proposal.values):
-            known = replace(model, catalogue=model.catalogue.with_effects(effect))
-            model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
+    model, values = with_formulas(before.model, before.values, proposals)
     model = model.at(values)
 
     # Estimated from the windows that are not locked.

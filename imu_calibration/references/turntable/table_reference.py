@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, cast
 
 from imu_calibration.calibration.check import ReadingErrors
 from imu_calibration.calibration.coverage import Coverage
@@ -26,6 +26,7 @@ from imu_calibration.references.gravity.hand_recording import read_by_hand
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.live_windows import LiveCalibration
 from imu_calibration.references.turntable.selection.investigation import too_few_windows
+from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.table_calibration import (
     StoredRecording,
     TableRecordings,
@@ -86,7 +87,8 @@ class TableReference:
 
     def too_few(self, result: TableResult) -> NotObservableError:
         """Return the error with the number of windows."""
-        return too_few_windows(len(result.data.gathered.spreads[0].windows))
+        gathered = cast(SessionData, result.data.gathered)
+        return too_few_windows(len(gathered.spreads[0].windows))
 
     def identify(self, result: TableResult) -> Diagnosis:
         """Return the errors of the model in windows."""

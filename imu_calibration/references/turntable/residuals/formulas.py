@@ -44,8 +44,16 @@ UNIT_OF = {
 """Quantity -> unit of one factor of it; angles, attitudes and arguments of functions have none."""
 Column = str | tuple[str, ...]
 """Text of a column for all axes, or of three, one for each axis."""
-Product = tuple[str, tuple[str, ...]]
-"""Text of a product, and the quantities that it is the product of."""
+
+
+@dataclass(frozen=True)
+class Product:
+    """A product of quantities."""
+
+    text: str
+    """Text of the product."""
+    factors: tuple[str, ...] = ()
+    """Quantities that it is the product of, with repetition; functions have none."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +124,8 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
 
     """
     formulas = []
-    for text, factors in (*_of_motion(), *_slow(thermal, duration)):
-        formulas.append(Formula((text,), factors))
+    for entry in (*_of_motion(), *_slow(thermal, duration)):
+        formulas.append(Formula((entry.text,), entry.factors))
     formulas += _harmonics(n_joints, thermal)
     formulas += _of_joint_rates(n_joints)
     formulas += _with_the_table(n_joints, thermal)
@@ -127,7 +135,11 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
 def _atoms(*letters: str) -> list[Product]:
     """Return the components of the motion: of force (f), rate (w), angular acceleration (alpha)."""
     quantities = {'f': 'force', 'w': 'rate', 'alpha': 'angular acceleration'}
-    return [(f'{letter}_{axis}', (quantities[letter],)) for letter in letters for axis in AXES]
+    atoms = []
+    for letter in letters:
+        for axis in AXES:
+            atoms.append(Product(f'{letter}_{axis}', (quantities[letter],)))
+    return atoms
 
 
 def _sense(text: str) -> str:
@@ -136,16 +148,16 @@ def _sense(text: str) -> str:
 
 
 def _times(*parts: Product) -> Product:
-    """Return (text, factors) of a product, powers gathered: f_x, f_x, w_y is f_x ** 2 * w_y."""
+    """Return the product of some parts, powers gathered: f_x, f_x, w_y is f_x ** 2 * w_y."""
     powers: dict[str, int] = {}
     factors: tuple[str, ...] = ()
-    for text, factors_of_text in parts:
-        powers[text] = powers.get(text, 0) + 1
-        factors += factors_of_text
+    for part in parts:
+        powers[part.text] = powers.get(part.text, 0) + 1
+        factors += part.factors
     texts = []
     for text, power in powers.items():
         texts.append(text if power == 1 else f'{text} ** {power}')
-    return ' * '.join(texts), factors
+    return Product(' * '.join(texts), factors)
 
 
 def _monomials(degree: int) -> list[Product]:
@@ -153,7 +165,7 @@ def _monomials(degree: int) -> list[Product]:
     return [_times(*parts) for parts in combinations_with_replacement(_atoms('f', 'w'), degree)]
 
 
-def _of_motion() -> Iterator:
+def _of_motion() -> Iterator[Product]:
     """Yield the formulas of force, rate and angular acceleration."""
     components = _atoms('f', 'w')
     for degree in (1, 2, 3):
@@ -164,42 +176,42 @@ def _of_motion() -> Iterator:
 
     # Magnitude and sign, single and with one more factor; the sign times its own quantity is the
     # magnitude.
-    for text, factors in components:
-        magnitude = (f'abs({text})', factors)
+    for quantity in components:
+        magnitude = Product(f'abs({quantity.text})', quantity.factors)
         yield magnitude
         for component in components:
             yield _times(magnitude, component)
-        sign: Product = (_sense(text), ())
+        sign = Product(_sense(quantity.text))
         yield sign
         for component in components:
-            if component[0] != text:
+            if component is not quantity:
                 yield _times(sign, component)
 
     for letter, name in (('f', 'force'), ('w', 'rate')):
         squares = ' + '.join(f'{letter}_{axis} ** 2' for axis in AXES)
-        yield squares, (name, name)
-        yield f'sqrt({squares})', (name,)
+        yield Product(squares, (name, name))
+        yield Product(f'sqrt({squares})', (name,))
 
 
-def _slow(thermal: bool, duration: float) -> Iterator:
+def _slow(thermal: bool, duration: float) -> Iterator[Product]:
     """Yield the formulas with temperature or time, alone and times motion."""
-    warm: Product = (TEMPERATURE_FACTOR, ('temperature',))
+    warm = Product(TEMPERATURE_FACTOR, ('temperature',))
     slow: list[Product] = []
     if thermal:
-        yield 'temperature_rate', ('temperature rate',)
+        yield Product('temperature_rate', ('temperature rate',))
         for power in (2, 3):
-            yield f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power
+            yield Product(f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power)
         slow.append(warm)
     for share in CONSTANTS:
-        slow.append((f'(1 - exp(-time / {share * duration:.3g}))', ()))
-    slow.append(('time', ('time',)))
+        slow.append(Product(f'(1 - exp(-time / {share * duration:.3g}))'))
+    slow.append(Product('time', ('time',)))
 
     for factor in slow:
         for entry in (*_monomials(1), *_monomials(2)):
             yield _times(factor, entry)
-        for text, factors in _atoms('f', 'w'):
-            yield _times(factor, (f'abs({text})', factors))
-            yield _times(factor, (_sense(text), ()))
+        for quantity in _atoms('f', 'w'):
+            yield _times(factor, Product(f'abs({quantity.text})', quantity.factors))
+            yield _times(factor, Product(_sense(quantity.text)))
     if thermal:
         for entry in _monomials(1):
             yield _times(warm, warm, entry)
@@ -215,14 +227,13 @@ def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
     """Yield cosine and sine of the angle of one joint, and their products for two joints."""
     joints = range(1, n_joints + 1)
     for joint, order in product(joints, JOINT_ORDERS):
-        prefixes = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))]
+        yield _harmonic(joint, order)
+        yield _harmonic(joint, order, Product(f'joint_rate_{joint}', ('joint rate',)))
         if thermal:
-            prefixes.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
+            yield _harmonic(joint, order, Product(TEMPERATURE_FACTOR, ('temperature',)))
         if order in FEW_ORDERS:
-            prefixes += [(f'{text} * ', factors) for text, factors in _atoms('f', 'w')]
-        for prefix, factors in prefixes:
-            cosine, sine, phased = _turn(joint, order, prefix)
-            yield Formula((cosine, sine), factors, phased)
+            for quantity in _atoms('f', 'w'):
+                yield _harmonic(joint, order, quantity)
 
     # cos a cos b, cos a sin b, sin a cos b, sin a sin b: any phase of both.
     for first, second in combinations(joints, 2):
@@ -232,17 +243,25 @@ def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
             yield Formula(tuple(f'{a} * {b}' for a, b in product(of_first, of_second)), ())
 
 
+def _harmonic(joint: int, order: int, factor: Product = Product('')) -> Formula:
+    """Return cosine and sine of an order of a joint, times a factor."""
+    before = f'{factor.text} * ' if factor.text else ''
+    cosine, sine, phased = _turn(joint, order, before)
+    return Formula((cosine, sine), factor.factors, phased)
+
+
 def _of_joint_rates(n_joints: int) -> Iterator[Formula]:
     """Yield magnitude, sign, signed square of a joint's rate, and products of up to two rates."""
-    rates = [(f'joint_rate_{joint}', ('joint rate',)) for joint in range(1, n_joints + 1)]
-    for text, factors in rates:
-        yield Formula((f'abs({text})',), factors)
-        yield Formula((SOFT_SIGN.format(text),), ())
-        yield Formula((f'{text} * abs({text})',), factors * 2)
+    joints = range(1, n_joints + 1)
+    rates = [Product(f'joint_rate_{joint}', ('joint rate',)) for joint in joints]
+    for rate in rates:
+        yield Formula((f'abs({rate.text})',), rate.factors)
+        yield Formula((SOFT_SIGN.format(rate.text),), ())
+        yield Formula((f'{rate.text} * abs({rate.text})',), rate.factors * 2)
     for degree in (1, 2):
         for parts in combinations_with_replacement(rates, degree):
-            text, factors = _times(*parts)
-            yield Formula((text,), factors)
+            rates_together = _times(*parts)
+            yield Formula((rates_together.text,), rates_together.factors)
 
 
 def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
@@ -250,13 +269,14 @@ def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
     joints = range(1, n_joints + 1)
     # The components of a level axis along the axes of the sensor: elements of the attitude.
     vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
-    prefixes: list[tuple[str, tuple[str, ...]]] = [('', ())]
+    prefixes = [Product('')]
     if thermal:
-        prefixes.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
+        prefixes.append(Product(f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
     for joint in joints:
-        prefixes.append((f'joint_rate_{joint} * ', ('joint rate',)))
-    for prefix, factors in prefixes:
-        yield Formula(tuple(_each_times(prefix, vector) for vector in vectors), factors)
+        prefixes.append(Product(f'joint_rate_{joint} * ', ('joint rate',)))
+    for prefix in prefixes:
+        columns = tuple(_each_times(prefix.text, vector) for vector in vectors)
+        yield Formula(columns, prefix.factors)
     for vector, joint, order in product(vectors, joints, FEW_ORDERS):
         cosine, sine, _ = _turn(joint, order)
         columns = (_each_times(f'{cosine} * ', vector), _each_times(f'{sine} * ', vector))

@@ -5,7 +5,7 @@ Search, test on held-out windows, description and a term for a model.
 """
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS
 from imu_calibration.references.turntable.residuals.formulas import (
     Column,
@@ -142,6 +143,17 @@ class Proposal:
             'confirming_motion': self.motion,
             'sentence': self.sentence,
         }
+
+
+def with_formulas(
+    model: SensorModel, values: np.ndarray, proposals: Iterable[Proposal]
+) -> tuple[SensorModel, np.ndarray]:
+    """Return a model and its parameters with the formulas of some proposals at their amplitudes."""
+    for proposal in proposals:
+        for effect, size in zip(proposal.effects, proposal.values):
+            known = replace(model, catalogue=model.catalogue.with_effects(effect))
+            model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
+    return model, values
 
 
 def find_formulas(blocks: RestBlocks, problem: LinearisedProblem) -> list[FormulaChoice]:

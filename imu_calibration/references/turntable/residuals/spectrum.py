@@ -10,7 +10,7 @@ from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, signif
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.turntable.residuals.proposals import Proposal
+from imu_calibration.references.turntable.residuals.proposals import Proposal, with_formulas
 from imu_calibration.references.turntable.residuals.residual_blocks import (
     BlockFits,
     RestBlocks,
@@ -306,10 +306,7 @@ def find_tones(
     """
     model = found.problem.recording.model
     values = found.problem.values(found.named)[: len(model.param_names)]
-    for formula in formulas:
-        for effect, size in zip(formula.effects, formula.values):
-            known = replace(model, catalogue=model.catalogue.with_effects(effect))
-            model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
+    model, values = with_formulas(model, values, formulas)
     edges = np.cumsum([len(window) for window in found.used])[:-1]
     residual_of = {}  # sensor -> residual of each window
     for sensor, residual in residuals(found.used, table, model, values=values).items():

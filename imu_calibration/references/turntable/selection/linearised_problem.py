@@ -42,6 +42,7 @@ from imu_calibration.selection.questions import (
     extended_model,
     smooth_parameters,
     time_constants,
+    with_exchanged,
 )
 from imu_calibration.selection.search import FAMILY_WISE, Search
 
@@ -254,11 +255,8 @@ class LinearisedProblem:
         losses = []
         for k in near:
             other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
-            losses.append(
-                self.evidence.loss(
-                    self.search.indices([*chosen[:place], other, *chosen[place + 1 :]])
-                )
-            )
+            used = self.search.indices(with_exchanged(chosen, place, other))
+            losses.append(self.evidence.loss(used))
         logs = np.log(self.constants[near])
         if len(near) < 3:
             return np.append(values[list(question.parameters)], self.constants[number])

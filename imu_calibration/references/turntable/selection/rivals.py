@@ -18,7 +18,7 @@ from imu_calibration.references.turntable.selection.linearised_problem import Li
 from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
 from imu_calibration.selection.explained_share import Explained, needed_share
 from imu_calibration.selection.gain import LEAST_REDUCTION
-from imu_calibration.selection.questions import Question
+from imu_calibration.selection.questions import Question, with_exchanged
 from imu_calibration.selection.search import PENALTY, TIE, Search
 
 MIN_CURVATURE_NATS = 0.1
@@ -148,7 +148,7 @@ def _swapped(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[lis
             continue
         for other, _ in problem.search.confounded(chosen, question, most=None):
             if other.effect.warp is not None:
-                swapped.append([*chosen[:place], other, *chosen[place + 1 :]])
+                swapped.append(with_exchanged(chosen, place, other))
     return swapped
 
 
