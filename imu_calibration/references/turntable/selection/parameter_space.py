@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -85,27 +86,23 @@ class ParameterSpace:
     def restricted(self, kept: np.ndarray) -> 'ParameterSpace':
         """Return the space of some of the parameters, in this order."""
         order = np.argsort(kept)
-        index: dict[str, list[np.ndarray]] = {}
-        join: dict[str, list[np.ndarray]] = {}
-        join_within: dict[str, list[np.ndarray]] = {}
+        joined: dict[str, list[_Joined]] = {}
         for sensor in self.sensors:
-            index[sensor], join[sensor], join_within[sensor] = [], [], []
+            joined[sensor] = []
             for axis, acting in enumerate(self.index[sensor]):
                 own = np.isin(acting, kept)
                 # The new number of a parameter is its place in `kept`.
                 place = np.searchsorted(kept, acting[own], sorter=order)
-                index[sensor].append(order[place])
                 columns = np.append(own, True)
-                join[sensor].append(self.join[sensor][axis][:, columns])
-                join_within[sensor].append(self.join_within[sensor][axis][:, columns])
+                join = self.join[sensor][axis][:, columns]
+                within = self.join_within[sensor][axis][:, columns]
+                joined[sensor].append(_Joined(order[place], join, within))
         return replace(
             self,
             names=tuple(self.names[k] for k in kept),
             prior_sd=self.prior_sd[kept],
             prior_mean=self.prior_mean[kept],
-            index=index,
-            join=join,
-            join_within=join_within,
+            **_matrices(joined),
         )
 
     @cached_property
@@ -231,27 +228,20 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
             smooth.append(np.full(len(entry.param_names), entry.effect.smooth))
             sds.append(entry.prior_sd)
 
-    index: dict[str, list[np.ndarray]] = {}
-    join: dict[str, list[np.ndarray]] = {}
-    join_within: dict[str, list[np.ndarray]] = {}
+    joined: dict[str, list[_Joined]] = {}
     for sensor in recording.sensors:
         jacobian = coefficient_jacobian(model, sensor, recording.values)
-        index[sensor], join[sensor], join_within[sensor] = [], [], []
+        joined[sensor] = []
         for axis in range(3):
-            joined = _join(
-                jacobian[:, axis], sensor, axis, recording, removed, np.concatenate(smooth)
+            joined[sensor].append(
+                _join(jacobian[:, axis], sensor, axis, recording, removed, np.concatenate(smooth))
             )
-            index[sensor].append(joined.used)
-            join[sensor].append(joined.columns)
-            join_within[sensor].append(joined.within)
     return ParameterSpace(
         recording,
         tuple(names),
         np.concatenate(sds),
         np.pad(shift, (0, len(names) - len(shift))),
-        index,
-        join,
-        join_within,
+        **_matrices(joined),
     )
 
 
@@ -277,6 +267,16 @@ class _Joined:
     """As in `ParameterSpace.join`, shape (p + 3, q_a + 1)."""
     within: np.ndarray
     """As in `ParameterSpace.join_within`, shape (p + 3, q_a + 1)."""
+
+
+def _matrices(joined: dict[str, list[_Joined]]) -> dict[str, Any]:
+    """Return `index`, `join` and `join_within` of a ParameterSpace."""
+    index, join, join_within = {}, {}, {}
+    for sensor, axes in joined.items():
+        index[sensor] = [each.used for each in axes]
+        join[sensor] = [each.columns for each in axes]
+        join_within[sensor] = [each.within for each in axes]
+    return {'index': index, 'join': join, 'join_within': join_within}
 
 
 def _join(
