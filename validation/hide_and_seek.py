@@ -6,7 +6,7 @@ time. Prints a confusion matrix and the figures, draws them into docs/, and list
 which the record in the repository tells another thing. ``--seeds``, ``--minutes 20``, ``--pairs
 100`` and ``--parts effects,none`` run less, and draw beside the record; what was run stands beside
 every figure. Rows are written as they come, so that ``--from-record`` counts what there is of a run
-that was stopped, or of several that ran apart.
+that was stopped, or of several that ran apart. The exit code is 1 if a session could not be run.
 """
 
 import argparse
@@ -117,7 +117,7 @@ def main(arguments=None):
     )
     if options.keep:
         record_kept.keep(rows)
-    return 0
+    return int(any(row['part'] == 'failed' for row in rows))
 
 
 def _work(tasks, options):

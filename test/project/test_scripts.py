@@ -44,6 +44,7 @@ RUN = {
 """Script -> arguments of its smallest size."""
 CANDIDATES = {
     'validation/closed_loop.py': 'gyro_g_sensitivity',
+    'validation/hide_and_seek.py': 'gyro_g_sensitivity',
     'validation/separating_worlds.py': 'accel_quadratic+accel_scale_asymmetry',
 }
 """Script -> candidates of its search for effects; none for the others."""
