@@ -183,7 +183,7 @@ def simpler(
         if not explained.rest_beside(kept, question):
             continue
         for other in _fewer(problem.search, kept, question):
-            instead = [*kept[:place], other, *kept[place + 1 :]]
+            instead = with_exchanged(kept, place, other)
             if not problem.search.allowed(instead, other):
                 continue
             if explained.share(instead, other) < needed_share(other):
