@@ -473,7 +473,7 @@ class _Pieces(PlainEquations):
         cls, held_out: HeldOut, model: SensorModel, sensor: str, plan: PlainEstimate
     ) -> '_Pieces':
         """Return the equations of the pieces of a sensor."""
-        width = len(coefficients(model, sensor, plan.values)) + 2 * N_AXES
+        width = model.layout(sensor).width + 2 * N_AXES
         blocks = []
         for block in held_out.blocks:
             pieces = [np.zeros((0, width))]
