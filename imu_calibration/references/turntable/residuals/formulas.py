@@ -55,6 +55,11 @@ class Product:
     factors: tuple[str, ...] = ()
     """Quantities that it is the product of, with repetition; functions have none."""
 
+    @property
+    def as_factor(self) -> str:
+        """The text in front of what it multiplies."""
+        return f'{self.text} * ' if self.text else ''
+
 
 @dataclass(frozen=True)
 class Formula:
@@ -245,8 +250,7 @@ def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
 
 def _harmonic(joint: int, order: int, factor: Product = Product('')) -> Formula:
     """Return cosine and sine of an order of a joint, times a factor."""
-    before = f'{factor.text} * ' if factor.text else ''
-    cosine, sine, phased = _turn(joint, order, before)
+    cosine, sine, phased = _turn(joint, order, factor.as_factor)
     return Formula((cosine, sine), factor.factors, phased)
 
 
@@ -269,14 +273,14 @@ def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
     joints = range(1, n_joints + 1)
     # The components of a level axis along the axes of the sensor: elements of the attitude.
     vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
-    prefixes = [Product('')]
+    factors = [Product('')]
     if thermal:
-        prefixes.append(Product(f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
+        factors.append(Product(TEMPERATURE_FACTOR, ('temperature',)))
     for joint in joints:
-        prefixes.append(Product(f'joint_rate_{joint} * ', ('joint rate',)))
-    for prefix in prefixes:
-        columns = tuple(_each_times(prefix.text, vector) for vector in vectors)
-        yield Formula(columns, prefix.factors)
+        factors.append(Product(f'joint_rate_{joint}', ('joint rate',)))
+    for factor in factors:
+        columns = tuple(_each_times(factor.as_factor, vector) for vector in vectors)
+        yield Formula(columns, factor.factors)
     for vector, joint, order in product(vectors, joints, FEW_ORDERS):
         cosine, sine, _ = _turn(joint, order)
         columns = (_each_times(f'{cosine} * ', vector), _each_times(f'{sine} * ', vector))
