@@ -191,6 +191,18 @@ class StoredWindows:
         self._file.seek(self._starts[number])
         return pickle.load(self._file)
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether all windows are stored: always."""
+        return True
+
+    def used(self) -> Iterator[Window]:
+        """Yield the windows that are not unused."""
+        for number in range(len(self)):
+            window = self[number]
+            if window.kind != 'unused':
+                yield window
+
     def clear(self) -> None:
         """Remove all windows."""
         self._file.truncate(0)

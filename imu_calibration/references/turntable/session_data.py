@@ -157,6 +157,10 @@ class KeptWindows:
         """Whether all used windows are kept."""
         return self.n_samples <= KEPT_IN_MEMORY
 
+    def used(self) -> Iterator[Window]:
+        """Yield the windows."""
+        yield from self.windows
+
     def clear(self) -> None:
         """Remove all windows."""
         self.windows, self.n_samples = [], 0

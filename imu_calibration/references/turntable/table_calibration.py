@@ -1,6 +1,6 @@
 """Calibration on a table."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -20,7 +20,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution, shrunk
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.window import StoredWindows, Window
+from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.turntable.accumulator import restrict
 from imu_calibration.references.turntable.collector import GatherStep, from_bytes
 from imu_calibration.references.turntable.estimation.solver import solve
@@ -174,39 +174,19 @@ class TableRecordings:
 
 
 @dataclass(frozen=True, eq=False)
-class StoredRecording(TableRecordings):
-    """A recording that is read once: later linearisations reduce its stored windows."""
+class RecordingReadOnce(TableRecordings):
+    """A recording of which later linearisations reduce the windows of the first pass."""
 
-    windows: StoredWindows = field(default_factory=StoredWindows)
-    """Its windows, unused ones too; empty before the first pass."""
-    first_pass: list[SessionData] = field(default_factory=list)
-    """The data of the first pass; empty before it."""
-
-    def reduced(self, step: GatherStep) -> list[SessionData]:
-        """Return the windows of the recording, reduced with the columns of a model."""
-        if not self.first_pass:
-            (source,) = self.sources
-            preflight = Preflight(step.table.gravity_value, one_sensor=True)
-            self.first_pass.append(step.read(source, 0, preflight, windows=self.windows))
-            return [*self.first_pass]
-        windows = (self.windows[number] for number in range(len(self.windows)))
-        used = (window for window in windows if window.kind != 'unused')
-        return [_reduced_again(self.first_pass[0], used, step)]
-
-
-@dataclass(frozen=True, eq=False)
-class KeptRecording(TableRecordings):
-    """A recording that is read once, unless it is long: then each pass reads it."""
-
-    windows: KeptWindows = field(default_factory=KeptWindows)
-    """Its used windows; empty before the first pass."""
+    windows: StoredWindows | KeptWindows = field(default_factory=StoredWindows)
+    """Its windows; empty before the first pass."""
     first_pass: list[SessionData] = field(default_factory=list)
     """The data of the first pass; empty before it."""
 
     def reduced(self, step: GatherStep) -> list[SessionData]:
         """Return the windows of the recording, reduced with the columns of a model."""
         if self.first_pass and self.windows.is_complete:
-            return [_reduced_again(self.first_pass[0], self.windows.windows, step)]
+            used = (reduce_window(window, step.model, step.table) for window in self.windows.used())
+            return [self.first_pass[0].anew(used, step.judged_from)]
         self.windows.clear()
         self.first_pass.clear()
         (source,) = self.sources
@@ -216,6 +196,22 @@ class KeptRecording(TableRecordings):
     def checks(self, step: GatherStep) -> Preflight:
         """Return the checks to which the recording is shown while it is read."""
         return Preflight(step.table.gravity_value, one_sensor=True)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRecording(RecordingReadOnce):
+    """A recording that is read once, with all windows in a temporary file."""
+
+    windows: StoredWindows = field(default_factory=StoredWindows)
+    """Its windows, unused ones too."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeptRecording(RecordingReadOnce):
+    """A recording that is read once, unless it is long: then each pass reads it."""
+
+    windows: KeptWindows = field(default_factory=KeptWindows)
+    """Its used windows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,14 +237,6 @@ def recordings_on_table(
     """Return recordings of one IMU; a single one is read once if it is not long."""
     kind = KeptRecording if len(sources) == 1 else TableRecordings
     return kind.of(sources, table, jobs=jobs, names=names, keep_windows=keep_windows)
-
-
-def _reduced_again(
-    first_pass: SessionData, windows: Iterable[Window], step: GatherStep
-) -> SessionData:
-    """Return the data of a recording with its used windows reduced with the columns of a model."""
-    reduced = (reduce_window(window, step.model, step.table) for window in windows)
-    return first_pass.anew(reduced, step.judged_from)
 
 
 def solve_in_passes(
