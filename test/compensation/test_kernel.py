@@ -136,7 +136,7 @@ def usual_recursion():
 
 @pytest.mark.usefixtures('usual_recursion')
 def test_a_sum_that_cannot_be_compiled_is_refused(monkeypatch):
-    """The compiler ends with an error of recursion: Python 3.11 at 3,000 terms, 3.13 at 10,000."""
+    """The compiler recurses too deep: Python 3.11 at 3,000 terms, 3.13 above 9,000."""
     long = 'def kernel(*x):\n    return ' + ' + '.join(['1.5'] * 20_000)
     monkeypatch.setattr(kernel, 'kernel_text', lambda *_: long)
     with refused(InputError, 'effects_cost', str(MAX_OPERATIONS)):
