@@ -56,7 +56,7 @@ explains the terms.
 `effects`         the catalogue of physical effects, and the sensor model made of it
 `preprocessing`   a stream becomes windows: static poses, spins, dynamic stretches; checks of a
                   recording
-`estimation`      what solutions have in common: noise, likelihood, least squares, observability
+`estimation`      what solutions have in common: noise, likelihood, least squares, model error
 `simulation`      the model run: profiles of motion, noise, sessions
 `compensation`    the model inverted: corrected samples with their covariance
 `selection`       choice of the effects that the data support, by evidence on held-out data

@@ -8,14 +8,26 @@ import numpy as np
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.document.outcome import parameter_count
+from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.standard_motions import (
-    ALL_MOTIONS,
-    DIRECTIONS,
-)
+from imu_calibration.kinematics.sphere import DIRECTIONS
 
 MIN_CELL_WORTH = 0.02
 """A cell with a gain below this share of the excess is not proposed for a pose."""
+
+
+def sd_excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
+    """
+    Return the excess of standard deviations over their tolerances.
+
+    ``sum log max(sd / tolerance, 1)``; leading axes are kept.
+    """
+    return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
+
+
+def share_gained(before: float | np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the share of the excess that is removed, 0 to 1."""
+    return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
 
 
 class Progress(StrEnum):

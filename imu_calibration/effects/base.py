@@ -139,7 +139,7 @@ class Effect:
     title: str = ''
     """Heading in a report; derived from the name where empty."""
     motion: tuple
-    """Standard motions (`estimation.observability`) that show it."""
+    """Standard motions (`effects.motions`) that show it."""
     compensation: str = 'exact'
     """
     'exact' (inverted), 'flagged' (cannot be inverted, output marked) or 'none' (belongs to the

@@ -230,6 +230,18 @@ _SOMIGLIANA = 0.00193185265241
 _ROTATION_RATIO = 0.00344978650684  # m = omega^2 a^2 b / GM
 
 
+def attitudes_with_vertical(up_s: np.ndarray) -> np.ndarray:
+    """
+    Return attitudes whose third column is the vertical, shape (n, 3, 3).
+
+    The heading is arbitrary.
+    """
+    other = np.eye(3)[np.argmin(np.abs(up_s), axis=1)]
+    first = np.cross(other, up_s)
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    return np.stack([first, np.cross(up_s, first), up_s], axis=2)
+
+
 def normal_gravity(latitude_deg: float, height: float = 0.0) -> float:
     """
     Return the normal gravity of the WGS 84 ellipsoid, m/s^2.

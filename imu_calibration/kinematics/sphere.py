@@ -1,10 +1,16 @@
-"""The sphere on which readings of gravity in many attitudes lie."""
+"""Directions, and the sphere on which readings of gravity in many attitudes lie."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
 from imu_calibration.kinematics.rotations import unit_rows
+
+DIRECTIONS = np.array(
+    [np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
+)
+"""Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
 
 
 @dataclass(frozen=True, eq=False)

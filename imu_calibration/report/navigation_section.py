@@ -13,9 +13,8 @@ from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.standard_motions import attitudes_with_vertical
 from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.rotations import Reference, lever_matrix
+from imu_calibration.kinematics.rotations import Reference, attitudes_with_vertical, lever_matrix
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors, strapdown
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
 

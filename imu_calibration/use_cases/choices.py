@@ -27,7 +27,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.estimation.standard_motions import MOTIONS
+from imu_calibration.effects.motions import SENSOR_MOTIONS
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
@@ -287,7 +287,7 @@ def effect_rows(added: str | PathLike | None = None) -> list[dict[str, Any]]:
 
 def _row(effect):
     units = (effect.unit,) if isinstance(effect.unit, str) else tuple(dict.fromkeys(effect.unit))
-    needs = [*effect.needs, *(motion.text for motion in MOTIONS if motion.name in effect.motion)]
+    motions = [text for name, text in SENSOR_MOTIONS.items() if name in effect.motion]
     return {
         'effect': effect.name,
         'sensor': effect.sensor,
@@ -296,7 +296,7 @@ def _row(effect):
         'compensation': effect.compensation,
         'text': effect.explanation,
         'equation': _equation(effect),
-        'needs': '; '.join(needs),
+        'needs': '; '.join([*effect.needs, *motions]),
     }
 
 

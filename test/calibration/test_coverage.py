@@ -30,7 +30,6 @@ from imu_calibration.estimation.solution import (
     REJECTED,
     REMEDIES,
 )
-from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
 from imu_calibration.references.gravity.advice import (
     WEIGHTS,
     HandStep,
@@ -46,6 +45,7 @@ from imu_calibration.references.gravity.live_poses import (
     hand_coverage,
     knowledge_of,
 )
+from imu_calibration.references.turntable.standard_motions import MOTIONS, motions_about
 from imu_calibration.references.turntable.table_coverage import table_coverage
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
@@ -194,8 +194,8 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
     """
     What they would add to the information is added, one after the other; the first is the next one.
     """
-    from imu_calibration.estimation.observability import added_information
     from imu_calibration.estimation.prior import make_prior
+    from imu_calibration.references.turntable.observability import added_information
 
     live, result = begun
     shown, solution = live.coverage(), result.solution

@@ -18,13 +18,11 @@ from imu_calibration.calibration.diagnosis.findings import (
     UNCERTAIN,
     candidates_of,
     finding,
-    motions_of_one_joint,
     sentence,
 )
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import OTHER_MOUNT
 from imu_calibration.selection import search as forward
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
@@ -248,17 +246,3 @@ def test_a_small_gain_is_not_told_as_none(after, words):
     assert sentence(
         FIRST.effect, {'accelerometer.accel_quadratic.x': (1e-5, 1e-6, '(m/s^2)^-1')}, gain
     ).endswith(f'{words}.')
-
-
-def test_a_single_joint_is_told_what_it_can_do_and_to_be_mounted_anew():
-    def question(sensor, name):
-        return Question(CATALOGUE.find(sensor, name), (0,), 1, name)
-
-    lags = motions_of_one_joint(
-        question('gyroscope', 'gyro_bandwidth'), question('gyroscope', 'gyro_delay')
-    )
-    assert 'oscillate at 1, 2 and 4 Hz' in lags and 'two axes' not in lags
-    assert OTHER_MOUNT in motions_of_one_joint(
-        question('accelerometer', 'accel_quadratic'),
-        question('accelerometer', 'accel_scale_asymmetry'),
-    )

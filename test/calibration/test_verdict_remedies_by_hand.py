@@ -16,13 +16,13 @@ from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.verdict import _step_of, unsteady
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.estimation.solution import (
     EXCESS_REMEDY,
     MOVED_REMEDY,
     REMEDY_KEYS,
     TURNS_REMEDY,
 )
-from imu_calibration.estimation.standard_motions import ALL_MOTIONS
 from imu_calibration.references.gravity.advice import _Excesses, _without_motion
 from imu_calibration.references.gravity.live_poses import _needs
 

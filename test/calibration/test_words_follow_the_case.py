@@ -24,9 +24,13 @@ from imu_calibration.estimation.solution import (
     WANDER_REMEDY,
     remedy,
 )
-from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.needs import motions_needed
+from imu_calibration.references.turntable.standard_motions import (
+    MOTIONS,
+    OTHER_MOUNT,
+    motions_about,
+)
 from imu_calibration.references.turntable.window_statistics import Regime
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.compensate import compensate_recording

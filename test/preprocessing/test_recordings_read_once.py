@@ -16,10 +16,10 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files, verdict
-from imu_calibration.estimation import observability
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
+from imu_calibration.references.turntable import needs
 from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.use_cases.inspect import inspect_recording
@@ -103,7 +103,7 @@ def counting(monkeypatch, module, name):
 def test_verdict_and_needed_motions_are_worked_out_once_per_solution(table, monkeypatch):
     judged, needed = (
         counting(monkeypatch, verdict, 'judge'),
-        counting(monkeypatch, observability, 'needed_motions'),
+        counting(monkeypatch, needs, 'needed_motions'),
     )
     result = calibrate_on_table(
         [source_of(BAG, Topics(), table.joint_names)],

@@ -6,8 +6,6 @@ The search is on a table or by hand. The findings are sentences, and the motions
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 
-import numpy as np
-
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
     Finding,
@@ -15,56 +13,12 @@ from imu_calibration.calibration.diagnosis.diagnosis_result import (
 )
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.document.calibration import beyond_known
-from imu_calibration.effects.base import SENSORS, Effect
-from imu_calibration.estimation.observability import added_information, coefficient_slopes
-from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.effects.base import Effect
+from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import ALL_MOTIONS, MOTIONS, ONE_JOINT, OTHER_MOUNT
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question, with_exchanged
 from imu_calibration.selection.search import FAMILY_WISE, Score, Search
-
-MIN_EVIDENCE_GROWTH = 9.0
-"""Least growth of the evidence that a motion must promise, in squared standard deviations."""
-
-
-def separating_motion(
-    solution: Solution, question: Question, mate: Question, *, gravity: float
-) -> str:
-    """
-    Return the standard motion that separates the mate from the effect found.
-
-    After this motion the mate could no longer pass for the effect that was found.
-
-    For each motion: its added information about the extended model and the mate, and from that the
-    part of the effect that is not collinear with the mate and the model, in squared standard
-    deviations.
-
-    Parameters
-    ----------
-    solution : Solution
-        Of the extended model.
-    question, mate : Question
-        The finding and an effect that would do as well.
-
-    """
-    best = MIN_EVIDENCE_GROWTH, motions_of(question, mate)
-    if not all(each.sensor in SENSORS and each.effect.groups for each in (question, mate)):
-        return best[1]
-    model = solution.model.with_effect(mate.sensor, mate.name)
-    values = model.start_from(solution.model, solution.values)
-    values = np.where(np.isfinite(values), values, 0.0)
-    prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
-    own = model.slices[question.sensor, question.name]
-    slopes = coefficient_slopes(model, values, solution.noise)
-    for motion in MOTIONS:
-        total = np.diag(1 / prior_sd**2) + added_information(
-            model, values, solution.noise, motion=motion, gravity=gravity, slopes=slopes
-        )
-        left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
-        if left > best[0]:
-            best = left, motion.text
-    return best[1]
 
 
 def motions_of(question: Question, mate: Question) -> str:
@@ -76,15 +30,6 @@ def motions_of(question: Question, mate: Question) -> str:
             if name in ALL_MOTIONS
         )
     )
-
-
-def motions_of_one_joint(question: Question, mate: Question) -> str:
-    """Return the same of a table that turns about one axis only, which cannot do most of them."""
-    own = dict.fromkeys(question.effect.motion + mate.effect.motion)
-    found = [ONE_JOINT[name] for name in own if name in ONE_JOINT]
-    if len(found) < len(own):
-        found.append(OTHER_MOUNT)
-    return '; '.join(found)
 
 
 LEAVES_MOST = 'rejected: most of the residual would remain'

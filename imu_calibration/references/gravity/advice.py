@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.coverage import sd_excess, share_gained
 from imu_calibration.core.units import DEG
 from imu_calibration.document.rest_noise import motions_at_rest
 from imu_calibration.effects.base import AXES, SENSORS, Role
-from imu_calibration.estimation.observability import sd_excess, share_gained
+from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY, TURNS_REMEDY, remedy
-from imu_calibration.estimation.standard_motions import ALL_MOTIONS, DIRECTIONS
 from imu_calibration.kinematics.rotations import cross, skew, unit_rows
+from imu_calibration.kinematics.sphere import DIRECTIONS
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses, tangent
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel

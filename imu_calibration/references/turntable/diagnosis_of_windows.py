@@ -8,9 +8,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Fi
 from imu_calibration.calibration.diagnosis.findings import (
     candidates_of,
     finding,
-    motions_of_one_joint,
     sentence,
-    separating_motion,
 )
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import Solution
@@ -25,6 +23,10 @@ from imu_calibration.references.turntable.selection.investigation import Investi
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.saturation import Saturation
 from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
+from imu_calibration.references.turntable.separating_motion import (
+    motions_of_one_joint,
+    separating_motion,
+)
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from imu_calibration.document.verdict import incomplete_windows
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import (
     AZIMUTH_REMEDY,
@@ -17,8 +16,13 @@ from imu_calibration.estimation.solution import (
     Solution,
     remedy,
 )
-from imu_calibration.estimation.standard_motions import Motion, motions_about
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.observability import (
+    needed_motions,
+    sd_of_data,
+    weak_directions,
+)
+from imu_calibration.references.turntable.standard_motions import Motion, motions_about
 
 
 def motions_needed(
@@ -41,14 +45,14 @@ def motions_needed(
 
     """
     prior_sd = make_prior(solution.model).sd
-    needed = observability.needed_motions(
+    needed = needed_motions(
         solution,
         tolerances,
         table.gravity_value,
         prior_sd=prior_sd,
         possible=possible_motions(table),
     )
-    data_sd = observability.sd_of_data(solution, prior_sd)
+    data_sd = sd_of_data(solution, prior_sd)
     of_bias_process = np.diag(solution.terms[BIAS_PROCESS])
     counted = _counted(solution)
     is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
@@ -116,7 +120,7 @@ def weak_on_table(
     """
     names = _counted(solution)
     present = np.isin(solution.param_names, names)
-    directions = observability.weak_directions(
+    directions = weak_directions(
         solution.covariance[np.ix_(present, present)], tolerances[present], names
     )
     others = _besides(directions, needed, dict(zip(solution.param_names, solution.sd / tolerances)))

@@ -5,20 +5,15 @@ from typing import cast
 
 import numpy as np
 
-from imu_calibration.calibration.coverage import Coverage, Step, is_done
+from imu_calibration.calibration.coverage import Coverage, Step, is_done, sd_excess, share_gained
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.observability import (
-    added_information,
-    coefficient_slopes,
-    sd_excess,
-    share_gained,
-)
 from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import LACKING, REMEDY_KEYS
-from imu_calibration.estimation.standard_motions import MOTIONS, REST_WITH_UP, Motion
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.references.turntable.needs import possible_motions
+from imu_calibration.references.turntable.observability import added_information, coefficient_slopes
+from imu_calibration.references.turntable.standard_motions import MOTIONS, REST_WITH_UP, Motion
 from imu_calibration.references.turntable.window_observations import TableResult, WindowObservations
 
 MAX_MOTIONS_AHEAD, MIN_MOTION_GAIN = 20, 0.01

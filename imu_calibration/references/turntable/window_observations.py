@@ -35,7 +35,6 @@ from imu_calibration.effects.forward_equations import (
 )
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import sessions_of
-from imu_calibration.estimation.observability import tolerance_scaled_singular_values
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import GRAVITY, Solution, common_scale, with_term
@@ -49,6 +48,7 @@ from imu_calibration.references.turntable import latitude_check, mount_check
 from imu_calibration.references.turntable.document_parts import gauge_of, statistics
 from imu_calibration.references.turntable.held_out_windows import HeldOutWindows, nominal_values
 from imu_calibration.references.turntable.needs import motions_needed, weak_on_table
+from imu_calibration.references.turntable.observability import tolerance_scaled_singular_values
 from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
 from imu_calibration.references.turntable.residuals.residual_blocks import residuals
 from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock, SessionData

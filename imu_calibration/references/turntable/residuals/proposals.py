@@ -13,8 +13,8 @@ import numpy as np
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
+from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.standard_motions import ALL_MOTIONS
 from imu_calibration.references.turntable.residuals.formulas import (
     Column,
     Formula,

@@ -13,7 +13,7 @@ from papers.linear_least_squares import (
 from refusal import refused
 
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.estimation.observability import tolerance_scaled_singular_values
+from imu_calibration.references.turntable.observability import tolerance_scaled_singular_values
 
 NAMES = ('bias', 'slope', 'curve')
 

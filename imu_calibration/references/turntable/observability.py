@@ -9,31 +9,18 @@ import scipy.linalg
 
 from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.effects.sensor_model import ColumnLayout, SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import ALL_MOTIONS, MOTIONS, OTHER_MOUNT, Motion
 from imu_calibration.kinematics.rotations import Reference
+from imu_calibration.references.turntable.standard_motions import MOTIONS, OTHER_MOUNT, Motion
 
 REST_SAMPLES = 500.0
 """Samples of a rest."""
 SAMPLES_PER_POINT = 2.0
 """Samples of a moving piece for each of its points in time: 100 Hz."""
-
-
-def sd_excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
-    """
-    Return the excess of standard deviations over their tolerances.
-
-    ``sum log max(sd / tolerance, 1)``; leading axes are kept.
-    """
-    return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
-
-
-def share_gained(before: float | np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the share of the excess that is removed, 0 to 1."""
-    return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
 
 
 def added_information(

@@ -7,18 +7,19 @@ import pytest
 
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.motions import SENSOR_MOTIONS, TABLE_MOTIONS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation import observability
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
-from imu_calibration.estimation.observability import (
+from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.references.turntable import observability
+from imu_calibration.references.turntable.observability import (
     added_information,
     needed_motions,
     tolerance_scaled_singular_values,
     weak_directions,
 )
-from imu_calibration.estimation.prior import make_prior
-from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+from imu_calibration.references.turntable.standard_motions import MOTIONS
 
 GRAVITY = 9.81
 MODEL = SensorModel()
@@ -164,6 +165,10 @@ def test_where_no_motion_of_the_sensor_helps_that_of_the_table_is_named():
     )
     assert {text for text, _ in needed.values()} == {TABLE_MOTIONS['turn_about_vertical']}
     assert all(np.isnan(sd) for _, sd in needed.values())
+
+
+def test_every_motion_of_the_sensor_has_its_instruction():
+    assert [motion.name for motion in MOTIONS] == list(SENSOR_MOTIONS)
 
 
 def test_standard_motions_are_what_they_say():

@@ -1,6 +1,5 @@
 """Standard motions of the sensor, for the prediction of their information."""
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -9,9 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.effects.motions import SENSOR_MOTIONS
 from imu_calibration.effects.sensor_effects import VIBRATION_VARIANCE
-from imu_calibration.kinematics.rotations import Reference, rotation
+from imu_calibration.kinematics.rotations import Reference, attitudes_with_vertical, rotation
 from imu_calibration.kinematics.signal_history import TemperatureSlope, ThermalBranch
+from imu_calibration.kinematics.sphere import DIRECTIONS
 
 REST, WAY = 5.0, 3.0
 """s; a rest, and the time from one rest to the next."""
@@ -34,12 +35,15 @@ class Motion:
 
     name: str
     """Short name."""
-    text: str
-    """Instruction."""
     make: 'Pieces'
     """Function of gravity that returns pieces of the motion, each a Reference."""
     axis: Axis | None = None
     """The sensor axis of the turn; None: several axes, or several attitudes."""
+
+    @property
+    def text(self) -> str:
+        """Instruction."""
+        return SENSOR_MOTIONS[self.name]
 
     @cached_property
     def seconds(self) -> float:
@@ -118,23 +122,7 @@ def _turn(
     )
 
 
-def attitudes_with_vertical(up_s: np.ndarray) -> np.ndarray:
-    """
-    Return attitudes whose third column is the vertical, shape (n, 3, 3).
-
-    The heading is arbitrary.
-    """
-    other = np.eye(3)[np.argmin(np.abs(up_s), axis=1)]
-    first = np.cross(other, up_s)
-    first /= np.linalg.norm(first, axis=1)[:, None]
-    return np.stack([first, np.cross(up_s, first), up_s], axis=2)
-
-
 MOTION_TIME = np.arange(0.0, 30.0, 0.02)
-DIRECTIONS = np.array(
-    [np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
-)
-"""Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
 FACES_UP = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
 """The six faces turned up, in the sensor frame, shape (6, 3)."""
 OSCILLATION_RATE, OSCILLATION_ANGLE = 2 * np.pi, 30 * DEG
@@ -294,62 +282,26 @@ AXIS_DIRECTIONS: tuple[Axis, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def _spins_about(axis: Axis, up: ArrayLike | None = None) -> Motion:
-    name = 'xyz'[axis.index(1)]
-    return Motion(
-        f'spin_{name}',
-        f"spin about the sensor's {name} axis at 100 and 200 deg/s in both senses",
-        _spin(axis, SPINS, up),
-        axis,
-    )
+    return Motion(f'spin_{"xyz"[axis.index(1)]}', _spin(axis, SPINS, up), axis)
 
 
 def _oscillates_about(axis: Axis, up: ArrayLike | None = None) -> Motion:
-    name = 'xyz'[axis.index(1)]
-    return Motion(
-        f'oscillate_{name}',
-        f"oscillate about the sensor's {name} axis, 30 deg at 1 Hz",
-        _oscillation(axis, up),
-        axis,
-    )
+    return Motion(f'oscillate_{"xyz"[axis.index(1)]}', _oscillation(axis, up), axis)
 
 
 MOTIONS = (
-    Motion(
-        'static_poses',
-        'rest in six faces and twelve edge positions, at several headings',
-        _poses(DIRECTIONS),
-    ),
-    Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_rings())),
+    Motion('static_poses', _poses(DIRECTIONS)),
+    Motion('static_dense', _poses(_rings())),
     *(_spins_about(axis) for axis in AXIS_DIRECTIONS),
-    Motion(
-        'three_speeds',
-        'spin about skewed axes at 50, 100 and 200 deg/s in both senses',
-        _three_speeds,
-    ),
+    Motion('three_speeds', _three_speeds),
     *(_oscillates_about(axis) for axis in AXIS_DIRECTIONS),
-    Motion(
-        'two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis
-    ),
-    Motion(
-        'centrifuge',
-        'spin at 300 deg/s on an arm of 0.3 m, about each axis',
-        _centrifuge,
-    ),
-    Motion('warm_up', 'rest in six faces, cold and warm', _poses(FACES_UP, (15.0, 25.0, 35.0))),
-    Motion(
-        'warm_and_cool',
-        'rest in six faces while it warms up by ten kelvins, and again while it cools',
-        _poses(FACES_UP, (20.0, 25.0, 30.0, 25.0, 20.0)),
-    ),
-    Motion(
-        'shake',
-        'rest in six faces, quiet and while a machine shakes the sensor along each axis',
-        _shaken,
-    ),
+    Motion('two_axis', _two_axis),
+    Motion('centrifuge', _centrifuge),
+    Motion('warm_up', _poses(FACES_UP, (15.0, 25.0, 35.0))),
+    Motion('warm_and_cool', _poses(FACES_UP, (20.0, 25.0, 30.0, 25.0, 20.0))),
+    Motion('shake', _shaken),
 )
-"""
-Standard motions of the sensor; motions of table joints are named by the effects that need them.
-"""
+"""Those of `effects.motions.SENSOR_MOTIONS`, in that order."""
 
 
 def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
@@ -381,31 +333,5 @@ def _motions_about(axis: Axis, up: tuple[float, ...]) -> tuple[Motion, ...]:
     return _spins_about(axis, up), _oscillates_about(axis, up)
 
 
-TABLE_MOTIONS = {
-    'turn_about_vertical': (
-        'turn slowly through a full circle about the vertical, resting at several headings'
-    ),
-    'slow_turn': (
-        'turn each joint slowly through full circles, with the sensor mounted at two attitudes'
-    ),
-    'oscillate_fast': 'oscillate at 1, 2 and 4 Hz about two axes, in both phases',
-    'fast_spin': 'spin slowly up to the fastest rate in both senses',
-}
-"""
-Motions that concern the table or the clock; their gain depends on the table and is not predicted.
-"""
-REST_WITH_UP = tuple(Motion('rest', 'rest', _poses([up])) for up in DIRECTIONS)
+REST_WITH_UP = tuple(Motion('rest', _poses([up])) for up in DIRECTIONS)
 """A rest with each of `DIRECTIONS` up."""
-ALL_MOTIONS = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
-"""Name -> instruction."""
-ONE_JOINT = {
-    'oscillate_fast': 'oscillate at 1, 2 and 4 Hz',
-    'fast_spin': TABLE_MOTIONS['fast_spin'],
-    'slow_turn': 'turn the joint slowly through full circles',
-    'warm_up': 'rest in several places, cold and warm',
-    'warm_and_cool': (
-        'rest in several places while it warms up by ten kelvins, and again while it cools'
-    ),
-    'shake': 'rest in several places, quiet and while a machine shakes the table',
-}
-"""The motions that a table of one joint can do; the other ones require a remounted IMU."""
