@@ -28,8 +28,6 @@ MOST_OF_IT = 0.8
 Least share of the excess that an offset in a regime removes, or that lies in a regime of larger
 scatter.
 """
-NEARLY_ALL = 0.95
-"""Share of the scatter of a range in its reported part."""
 REGIME_SHARE_TIE = 0.01
 """
 Difference of the shares of two regimes up to which the order of variables decides: joints before
@@ -40,18 +38,10 @@ SURE = 16.0
 Least advantage of a regime over a smooth curve or a formula, twice the difference of log
 likelihood, nats.
 """
-LOUDER = 1.5
-"""Least ratio of the variances inside and outside of a regime of larger scatter."""
 MAX_REGIME_SHARE = 0.6
 """Largest share of the blocks in a regime; a larger one does not localise the residual."""
 REPORTED = 4
 """Variables whose likeliest range is described, at most."""
-SCORINGS = 12
-"""Steps of the fit of a variance that is a smooth function of a variable."""
-MAX_VARIANCE_RATIO = 1e3
-"""
-Largest ratio of a square and its variance in a step, which limits the influence of few residuals.
-"""
 TINY = 1e-9
 """Keeps columns that a part of the recording does not have from making a system singular."""
 
@@ -195,7 +185,7 @@ class AxisResidual:
 
 
 @dataclass(frozen=True, eq=False)
-class _Ranges:
+class Ranges:
     """The ranges of a variable under test."""
 
     variable: Variable
@@ -223,9 +213,7 @@ class _RefinedRange:
 
 class RegimeSearch:
     """
-    Search for ranges of variables in which the residual of a sensor differs.
-
-    In such a range the residual has another offset or a larger scatter.
+    Search for ranges of variables in which the residual of a sensor has another offset.
 
     Parameters
     ----------
@@ -243,9 +231,9 @@ class RegimeSearch:
     ):
         self.sensor = sensor
         self.time = time
-        self._exchange = exchange
+        self.exchange = exchange
         # Ranges with neither too few nor too many of the blocks.
-        self._ranges: list[_Ranges] = []
+        self.ranges: list[Ranges] = []
         for variable in variables:
             marks = variable.marks
             member = variable.ranges
@@ -253,7 +241,7 @@ class RegimeSearch:
             allowed = n_inside >= min(FEWEST, len(marks) / 8)
             allowed &= n_inside <= MAX_REGIME_SHARE * len(marks)
             if allowed.any():
-                self._ranges.append(_Ranges(variable, marks, member[allowed]))
+                self.ranges.append(Ranges(variable, marks, member[allowed]))
 
     def offsets(
         self,
@@ -288,25 +276,25 @@ class RegimeSearch:
             Columns of a formula for the residual.
 
         """
-        exchanged = np.column_stack([rest.values, rest.free(rest.values[self._exchange].T)])
+        exchanged = np.column_stack([rest.values, rest.free(rest.values[self.exchange].T)])
         energy = (exchanged**2).sum(axis=0)
         shares = []
-        for each in self._ranges:
+        for each in self.ranges:
             marks = white(each.marks)
             products = marks.T @ rest.free(marks)  # of the bins; a range is a sum of bins
             size = np.einsum('rk,kl,rl->r', each.member, products, each.member)
             projection = each.member @ (marks.T @ exchanged)
             shares.append(projection**2 / np.maximum(size, TINY)[:, None] / energy)
-        p_value, likely = self._tested(shares)
+        p_value, likely = self.tested(shares)
         if p_value > level:
             return []
 
         # A regime must fit clearly better than any smooth curve of a variable, and the formula.
-        smooth = [each.variable.curves for each in self._ranges if len(each.variable.edges)]
+        smooth = [each.variable.curves for each in self.ranges if len(each.variable.edges)]
         if formula is not None:
             smooth.append(formula)
         least_energy = min([energy[0], *(rest.energy(white(columns)) for columns in smooth)])
-        limit = _cost(least_energy, len(self.time)) - SURE
+        limit = variance_cost(least_energy, len(self.time)) - SURE
         regimes = []
         for each, number in likely:
             refined = self._refined(rest, white, each, number)
@@ -314,7 +302,7 @@ class RegimeSearch:
             count = len(refined.inside)
             excess = max(energy[0] - count, TINY)
             share = 1.0 - max(refined.squares - count, 0.0) / excess
-            if share >= MOST_OF_IT and _cost(refined.squares, count) < limit:
+            if share >= MOST_OF_IT and variance_cost(refined.squares, count) < limit:
                 regimes.append(
                     RestRegime(
                         self.sensor,
@@ -331,10 +319,10 @@ class RegimeSearch:
                         each.variable.is_rate,
                     )
                 )
-        return _largest_share_first(regimes)
+        return largest_share_first(regimes)
 
     def _refined(
-        self, rest: AxisResidual, white: Callable, each: _Ranges, number: int
+        self, rest: AxisResidual, white: Callable, each: Ranges, number: int
     ) -> _RefinedRange:
         """Return a range with refined bounds."""
         variable = each.variable
@@ -360,124 +348,9 @@ class RegimeSearch:
         (size,), (after,) = rest.offsets(white(mark[:, None]))
         return _RefinedRange(mark, bounds, variable.words(chosen, bounds), size, after)
 
-    def scatters(
-        self, axis: str, rough: np.ndarray, weight: np.ndarray, *, level: float
-    ) -> list[RestRegime]:
+    def tested(self, gains: Sequence[np.ndarray]) -> tuple[float, list[tuple[Ranges, int]]]:
         """
-        Return the ranges with a larger variance within blocks, the likeliest first.
-
-        Arguments as `offsets`, and:
-
-        The statistic is the largest fall of minus twice the log likelihood by a separate variance
-        in a range.
-
-        Parameters
-        ----------
-        axis : str
-        rough : ndarray, shape (b,)
-            Variance within the blocks.
-        weight : ndarray, shape (b,)
-            Its degrees of freedom.
-        level : float
-            Largest probability of a regime by chance.
-
-        """
-        # In units of the median; without a louder range no exchange has to be computed.
-        median = float(np.median(rough))
-        if median <= 0:
-            return []
-        rough = rough / median
-        if not any(fall.any() for fall in self._falls(rough[:, None], weight)):
-            return []
-
-        # By chance: with the blocks exchanged.
-        exchanged = np.column_stack([rough, rough[self._exchange].T])
-        p_value, likely = self._tested(self._falls(exchanged, weight))
-        if p_value > level:
-            return []
-
-        # A regime must fit clearly better than a variance that follows a smooth curve.
-        smooth = []
-        for each in self._ranges:
-            if len(each.variable.edges):
-                smooth.append(_smooth_scatter(each.variable.curves, rough, weight))
-        one_variance = (_cost(weight @ rough, weight.sum()), 1.0)
-        smooth_cost, dispersion = min(smooth, default=one_variance)
-        regimes = []
-        for each, number in likely:
-            variable = each.variable
-            excess_of_bins = np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0)
-            chosen = _tightened(variable.chosen(each.member[number]), excess_of_bins)
-            inside = each.marks[:, chosen].sum(axis=1)
-            outside = 1.0 - inside
-
-            # Inside and outside: sums of squares, degrees of freedom, and their ratio.
-            squares = weight * rough
-            energy = np.array([(inside * squares).sum(), (outside * squares).sum()])
-            count = np.array([(inside * weight).sum(), (outside * weight).sum()])
-            variance = energy / np.maximum(count, 1.0)
-            excess = np.maximum(energy - count, 0.0)
-            share = excess[0] / max(excess.sum(), TINY)
-            cost = np.sum(_cost(energy, count))
-            if share >= MOST_OF_IT and cost < smooth_cost - SURE * dispersion:
-                bounds = variable.bounds(chosen)
-                regimes.append(
-                    RestRegime(
-                        self.sensor,
-                        axis,
-                        variable.name,
-                        variable.words(chosen, bounds) + ', by larger scatter',
-                        float(share),
-                        p_value,
-                        float(np.sqrt(median * max(variance[0] - variance[1], 0.0))),
-                        inside > 0.5,
-                        self.time,
-                        False,
-                        bounds,
-                        variable.is_rate,
-                    )
-                )
-        return _largest_share_first(regimes)
-
-    def _falls(self, rough: np.ndarray, weight: np.ndarray) -> list[np.ndarray]:
-        """
-        Return per variable the fall of the cost by a separate variance in each range.
-
-        It is zero where the variance is hardly larger, and the shape is (r, m). With the sums of
-        squares E and the degrees of freedom n of all blocks, and those inside the range::
-
-            fall = cost(E, n) - cost(E_in, n_in) - cost(E - E_in, n - n_in)
-            louder: E_in / n_in > LOUDER max((E - E_in) / (n - n_in), 1)
-
-        """
-        squares = rough * weight[:, None]
-        count = weight.sum()
-        energy = squares.sum(axis=0)
-        falls = []
-        for each in self._ranges:
-            count_inside = (each.member @ (each.marks.T @ weight))[:, None]
-            energy_inside = each.member @ (each.marks.T @ squares)
-            count_outside = count - count_inside
-            least_outside = np.maximum(energy - energy_inside, count_outside)
-            louder = energy_inside * count_outside > LOUDER * least_outside * count_inside
-
-            # Logarithms only where they are needed.
-            row, column = np.nonzero(louder)
-            whole = energy[column]
-            inside = energy_inside[louder]
-            n_inside = count_inside[row, 0]
-            fall = np.zeros(energy_inside.shape)
-            fall[louder] = (
-                _cost(whole, count)
-                - _cost(inside, n_inside)
-                - _cost(whole - inside, count - n_inside)
-            )
-            falls.append(fall)
-        return falls
-
-    def _tested(self, gains: Sequence[np.ndarray]) -> tuple[float, list[tuple[_Ranges, int]]]:
-        """
-        Return (p-value of the largest gain, the likeliest ranges (_Ranges, number)).
+        Return (p-value of the largest gain, the likeliest ranges (Ranges, number)).
 
         The gains have shape (r, 1 + m), and the ranges are in order of variables.
         """
@@ -488,60 +361,19 @@ class RegimeSearch:
         p_value = float((largest >= largest[0]).mean())
         of_recording = [gain[:, 0] for gain in gains]
         order = np.argsort([-gain.max() for gain in of_recording], kind='stable')[:REPORTED]
-        likeliest = [(self._ranges[k], int(np.argmax(of_recording[k]))) for k in sorted(order)]
+        likeliest = [(self.ranges[k], int(np.argmax(of_recording[k]))) for k in sorted(order)]
         return p_value, likeliest
 
 
-def _largest_share_first(found: Iterable[RestRegime]) -> list[RestRegime]:
+def largest_share_first(found: Iterable[RestRegime]) -> list[RestRegime]:
     """Return regimes in order of their shares; among nearly equal ones the order is kept."""
     alike = max((regime.share for regime in found), default=0.0) - REGIME_SHARE_TIE
     return sorted(found, key=lambda regime: -min(regime.share, alike))
 
 
-def _tightened(chosen: Sequence[int], excess: np.ndarray) -> Sequence[int]:
-    """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
-    sums = np.append(0.0, np.cumsum(excess[chosen]))
-    parts = []  # (length, minus the excess in it, first): the shortest, then the largest excess
-    for first in range(len(chosen)):
-        for last in range(first + 1, len(chosen) + 1):
-            inside = sums[last] - sums[first]
-            if inside >= NEARLY_ALL * sums[-1]:
-                parts.append((last - first, -inside, first))
-    length, _, first = min(parts)
-    return chosen[first : first + length]
-
-
-def _cost(energy: float | np.ndarray, count: float | np.ndarray) -> float | np.ndarray:
+def variance_cost(energy: float | np.ndarray, count: float | np.ndarray) -> float | np.ndarray:
     """
     Return minus twice the log likelihood of residuals with one variance, at least that of noise.
     """
     variance = np.maximum(energy / np.maximum(count, 1.0), 1.0)
     return count * np.log(variance) + energy / variance
-
-
-def _smooth_scatter(
-    columns: np.ndarray, variance: np.ndarray, weight: np.ndarray
-) -> tuple[float, float]:
-    """
-    Return (minus twice the log likelihood, dispersion) by Fisher scoring.
-
-    The variances are exp(a combination of columns).
-
-    The dispersion is 1 where the variances scatter about the curve as those of Gaussian noise with
-    `weight` degrees of freedom.
-    """
-    design = np.column_stack([np.ones(len(columns)), columns])
-    root = np.sqrt(weight)
-    values = np.zeros(design.shape[1])
-    for _ in range(SCORINGS):
-        # d(log likelihood) / d(log variance) = n (ratio - 1) / 2, information n / 2.
-        log_variance = np.maximum(design @ values, 0.0)
-        ratio = np.minimum(variance * np.exp(-log_variance), MAX_VARIANCE_RATIO)
-        step = np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]
-        values = values + step
-    log_variance = np.maximum(design @ values, 0.0)
-    ratio = variance * np.exp(-log_variance)
-    cost = float((weight * (log_variance + ratio)).sum())
-    # The variance of a ratio is 2 / n.
-    dispersion = float((weight * (ratio - 1.0) ** 2).mean()) / 2
-    return cost, max(dispersion, 1.0)

@@ -7,12 +7,12 @@ import numpy as np
 
 from imu_calibration.effects.base import AXES
 from imu_calibration.references.turntable.residuals.residual_blocks import BlockWhitener, RestBlocks
+from imu_calibration.references.turntable.residuals.scatter_regimes import ScatterSearch
 from imu_calibration.references.turntable.residuals.window_variables import variables_of
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.regimes import (
     REGIME_LEVEL,
     AxisResidual,
-    RegimeSearch,
     RestRegime,
     exchanges,
 )
@@ -49,7 +49,7 @@ def find_regimes(
         np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1),
     )
     search, level = (
-        RegimeSearch(
+        ScatterSearch(
             blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange
         ),
         REGIME_LEVEL / len(AXES),
