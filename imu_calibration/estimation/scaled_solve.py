@@ -1,7 +1,6 @@
 """Triangular factors, and least squares with scaled columns."""
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
@@ -66,31 +65,6 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
         factor[used[:done]] = reflected[:done]
         carried = reflected[done:]
     return factor
-
-
-def packed(factor: np.ndarray) -> np.ndarray:
-    """Return an upper triangular or trapezoidal factor without its zeros, row by row."""
-    return factor[np.triu_indices(len(factor), m=factor.shape[1])]
-
-
-def unpacked(factors: Sequence[np.ndarray], width: int) -> np.ndarray:
-    """
-    Return packed factors of `width` columns as one stack, shape (n_factors, n_rows, width).
-
-    Rows of zeros complete the shorter ones.
-    """
-    places, longest = _places(width), max(map(len, factors))
-    rows = places[longest - 1] // width + 1 if longest else 0
-    found = np.zeros((len(factors), rows * width))
-    for row, factor in zip(found, factors):
-        row[places[: len(factor)]] = factor
-    return found.reshape(len(factors), rows, width)
-
-
-@lru_cache(maxsize=8)
-def _places(width: int) -> np.ndarray:
-    """Return the places of the upper triangle among the elements of a square matrix, row by row."""
-    return np.flatnonzero(np.triu(np.ones((width, width), bool)))
 
 
 def _r_factor(stacked: np.ndarray) -> np.ndarray:

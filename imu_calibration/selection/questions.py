@@ -7,7 +7,6 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import Solution
 
 TEMPERATURE_SPAN = 1.0
 """Least span of temperature that can show a thermal effect, K."""
@@ -107,39 +106,6 @@ def time_constants(duration: float, number: int = N_TIME_CONSTANTS) -> np.ndarra
     return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, number)
 
 
-def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel:
-    """
-    Return the model with all these effects, except the ones tested differently.
-
-    The exceptions are warm-ups and saturation.
-    """
-    kept = [e for e in effects if e.warp is not None or not special(e)]
-    for effect in kept:
-        model = model.with_effect(effect.sensor, effect.name)
-    return model
-
-
-def point_with(
-    model: SensorModel, effects: Sequence[Effect], values: dict[str, float]
-) -> tuple[SensorModel, np.ndarray]:
-    """
-    Return (the model with all these effects linearised there, its parameters).
-
-    The linearisation is at the given values, else at the prior.
-    """
-    wide = extended_model(model, effects)
-    start = np.array(
-        [values.get(name, known) for name, known in zip(wide.param_names, wide.start())]
-    )
-    start = np.where(np.isfinite(start), start, 0.0)
-    return wide.at(start), start
-
-
-def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
-    """Return the effects that are tested by columns; a step has columns only at a known time."""
-    return [effect for effect in effects if effect.role is not Role.LIMIT and not effect.located]
-
-
 def special(effect: Effect) -> bool:
     """
     Return whether an effect has no columns of its own.
@@ -149,35 +115,11 @@ def special(effect: Effect) -> bool:
     return effect.role is Role.LIMIT or effect.timed
 
 
-MAX_TABLE_PASSES = 6
-"""Most passes over a recording with repeated linearisation."""
 STARTS = 6
 """
 Number of start values of the time constant, with a ratio of 2.3: the iteration converges from a
 start within this factor.
 """
-LINEAR_STEPS = 25
-"""
-Steps of a numerical derivative (5 ms of a delay) up to which a linearisation is valid in weakly
-determined directions.
-"""
-
-
-LEAST_TIME_CONSTANT = 0.3
-"""Least time constant after a step, as a share of that before it."""
-
-
-def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
-    """
-    Return the model linearised at a solution outside the validity of its linearisation, else None.
-    """
-    for effect in model.relinearised:
-        if effect.key in solution.model.slices:
-            part = solution.model.slices[effect.key]
-            moved = np.abs(solution.values[part] - model.point_of(effect))
-            if np.any(moved > np.maximum(3 * solution.sd[part], 5 * effect.step)):
-                return model.at(model.start_from(solution.model, _cautious(solution)))
-    return None
 
 
 def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> list[SensorModel]:
@@ -190,34 +132,3 @@ def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> li
         replace(model, point={**model.point, effect.name: effect.at_time_constant(constant)})
         for constant in time_constants(duration, STARTS)
     ]
-
-
-def _cautious(solution: Solution) -> np.ndarray:
-    """
-    Return values to linearise at: those of the solution, except along weakly determined directions.
-
-    At zero, lag and delay have the same first derivative. They are separable only at a point where
-    both are nonzero; a full step along their difference would be arbitrary. The step is therefore
-    regularised with LINEAR_STEPS towards the point. A time constant is positive: its step ends at
-    the share `LEAST_TIME_CONSTANT` of the point at the latest.
-    """
-    model, values = solution.model, solution.values.copy()
-    for effect in model.relinearised:
-        if effect.time_constant:
-            last = model.slices[effect.key].stop - 1
-            values[last] = max(values[last], LEAST_TIME_CONSTANT * model.point_of(effect)[-1])
-    move, pull = np.zeros(len(values)), np.zeros(len(values))
-    for effect in model.relinearised:
-        if effect.warp is not None:
-            part = model.slices[effect.key]
-            move[part], pull[part] = (
-                values[part] - model.point_of(effect),
-                (LINEAR_STEPS * effect.step) ** -2,
-            )
-    moving = np.flatnonzero(pull)
-    if not len(moving):
-        return values
-    known = np.linalg.inv(solution.covariance[np.ix_(moving, moving)])
-    kept = values.copy()
-    kept[moving] -= np.linalg.solve(known + np.diag(pull[moving]), pull[moving] * move[moving])
-    return kept

@@ -25,6 +25,7 @@ from imu_calibration.references.turntable.diagnosis_of_windows import build_diag
 from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
 from imu_calibration.references.turntable.selection import investigation, testable_effects
+from imu_calibration.references.turntable.selection.extended_model import without_saturation
 from imu_calibration.references.turntable.selection.extended_solution import extended_solution
 from imu_calibration.references.turntable.selection.investigation import investigate
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
@@ -37,7 +38,6 @@ from imu_calibration.references.turntable.session_data import DecimatedWindows
 from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.references.turntable.window_search import baseline_model
 from imu_calibration.report.diagnosis_page import diagnosis_report
-from imu_calibration.selection import questions
 from imu_calibration.selection.search import SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
@@ -191,7 +191,7 @@ def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
     windows, table = calibrated(late[0]).windows, late[1]
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     used = [window for window in windows if window.kind != 'unused']
-    effects = questions.without_saturation(testable_effects.testable_effects(model, table, used)[0])
+    effects = without_saturation(testable_effects.testable_effects(model, table, used)[0])
     linearised_at = partial(
         LinearisedProblem, used, table, model, effects=effects, locked=np.zeros(len(used), bool)
     )

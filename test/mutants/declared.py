@@ -155,28 +155,28 @@ COVARIANCE = _of(
         'implausible_parameters',
         '_1 > limit',
         '_1 < 0',
-        'test_believing.py::test_a_scale_that_only_misfit_gives_is_held_and_named',
+        'test_implausible_parameters.py::test_a_scale_that_only_misfit_gives_is_held_and_named',
     ),
     (
         'a wrong full scale is taken for misfit',
         'implausible_parameters',
         '_1[_2] & (_3 > limit) & (_3 < _4[_2] * _5)',
         '_1[_2] & (_3 > limit)',
-        'test_believing.py::test_a_wrong_full_scale_setting_is_no_misfit',
+        'test_implausible_parameters.py::test_a_wrong_full_scale_setting_is_no_misfit',
     ),
     (
         'unasked values do not shrink',
         'shrunk',
         '1.0',
         '0.0',
-        'test_believing.py::test_what_nobody_asked_for_shrinks_and_what_is_plain_stays',
+        'test_shrinkage.py::test_what_nobody_asked_for_shrinks_and_what_is_plain_stays',
     ),
     (
         'unasked values vanish',
         'shrunk',
         'min(1.0, _1.sum() / max(_2, 1e-300))',
         '1.0',
-        'test_believing.py::test_what_nobody_asked_for_shrinks_and_what_is_plain_stays',
+        'test_shrinkage.py::test_what_nobody_asked_for_shrinks_and_what_is_plain_stays',
     ),
 )
 SEARCH = _of(

@@ -13,7 +13,7 @@ import pytest
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_likelihood import FLICKER_MARK, NoiseLikelihood
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
 from imu_calibration.references.turntable.estimation.noise_search import BiasProcessSearch
@@ -43,7 +43,7 @@ from imu_calibration.selection import gain
 from imu_calibration.selection.evidence import MOST_FITS, Evidence
 from imu_calibration.selection.explained_share import SHOWS, Explained, pruned
 from imu_calibration.selection.order_of_tests import select_findings
-from imu_calibration.selection.questions import Question, linearise_again
+from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import MIN_GAIN_NATS, Search
 
 KINDS = np.array(['static'] * 20 + ['spin'] * 12)
@@ -1048,19 +1048,3 @@ def test_a_temperature_that_is_passed_once_is_that_of_the_moment(first, passed):
     for sign in (1.0, -1.0):
         found = _passed_once(sign * warmth, 1)
         assert found == (None if passed is None else sign * passed)
-
-
-@pytest.mark.parametrize(('constant', 'expected'), [(-0.09, 30.0), (0.0, 30.0), (250.0, 250.0)])
-def test_a_step_to_a_negative_time_constant_is_cut(constant, expected):
-    # A warm-up of 30 s: the first step ended at -0.09 s, and its columns were not finite.
-    model = SensorModel(BASE, (*BASE, 'gyro_bias_drift'))
-    effect = next(each for each in model.effects if each.time_constant)
-    model = replace(model, point={effect.name: effect.at_time_constant(100.0)})
-    values = model.start()
-    values[model.slices[effect.key].stop - 1] = constant
-    count = len(values)
-    solution = SimpleNamespace(
-        model=model, values=values, sd=np.full(count, 15.0), covariance=np.eye(count)
-    )
-    again = linearise_again(model, solution)
-    assert again.point_of(effect)[-1] == pytest.approx(expected)

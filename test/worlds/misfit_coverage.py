@@ -21,9 +21,12 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.repeated_linearisation import (
+    MAX_TABLE_PASSES,
+    linearise_again,
+)
 from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.references.turntable.window_statistics import reduce_windows
-from imu_calibration.selection.questions import MAX_TABLE_PASSES, linearise_again
 
 from worlds.misfit_worlds import CAUSES, make_pair
 

@@ -34,6 +34,7 @@ from imu_calibration.references.turntable.collector import (
     require_columns,
     to_bytes,
 )
+from imu_calibration.references.turntable.repeated_linearisation import linearise_again
 from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.references.turntable.session_data import SessionData, WindowStore, merge
 from imu_calibration.references.turntable.table_calibration import (
@@ -43,7 +44,6 @@ from imu_calibration.references.turntable.table_calibration import (
 )
 from imu_calibration.references.turntable.table_coverage import table_coverage
 from imu_calibration.references.turntable.window_observations import TableResult, WindowObservations
-from imu_calibration.selection.questions import linearise_again
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,19 +17,24 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import judged_from_of, latest_settling
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import Solution, shrunk
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.turntable.accumulator import restrict
 from imu_calibration.references.turntable.collector import GatherStep, from_bytes
 from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.repeated_linearisation import (
+    MAX_TABLE_PASSES,
+    linearise_again,
+)
 from imu_calibration.references.turntable.requested_model import choose_model, settle_model
 from imu_calibration.references.turntable.session_data import KeptWindows, SessionData, join
+from imu_calibration.references.turntable.shrinkage import shrunk
 from imu_calibration.references.turntable.uncorrected_windows import end_of
 from imu_calibration.references.turntable.window_observations import TableResult, WindowObservations
 from imu_calibration.references.turntable.window_statistics import reduce_window
-from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
+from imu_calibration.selection.questions import at_time_constants
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
     from typing_extensions import Self

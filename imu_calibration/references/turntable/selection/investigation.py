@@ -19,6 +19,10 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.residuals.find_onset import find_onset
 from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
+from imu_calibration.references.turntable.selection.extended_model import (
+    point_with,
+    without_saturation,
+)
 from imu_calibration.references.turntable.selection.extended_solution import extended_solution
 from imu_calibration.references.turntable.selection.lag_explanations import (
     LagExplanations,
@@ -40,7 +44,7 @@ from imu_calibration.selection.explained_share import pruned
 from imu_calibration.selection.gain import LEAST_REDUCTION
 from imu_calibration.selection.onset import Onset
 from imu_calibration.selection.order_of_tests import select_findings, without_weakest
-from imu_calibration.selection.questions import Question, point_with, without_saturation
+from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import SelectedEffects
 
 LINEARISATIONS = 5

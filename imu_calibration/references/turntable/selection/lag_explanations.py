@@ -19,13 +19,14 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag_name
+from imu_calibration.references.turntable.selection.extended_model import point_with
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.rivals import (
     MIN_CURVATURE_NATS,
     Rival,
     same_questions,
 )
-from imu_calibration.selection.questions import Question, point_with
+from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import PENALTY, TIE
 
 LAG_KINDS = (('delay',), ('bandwidth',), ('filter',), ('delay', 'bandwidth'))

@@ -18,6 +18,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.selection.extended_model import extended_model
 from imu_calibration.references.turntable.selection.noise_beside_effects import (
     in_trusted_band,
     noise_before_fit,
@@ -39,7 +40,6 @@ from imu_calibration.references.turntable.selection.reduced_recording import (
 from imu_calibration.references.turntable.selection.window_evidence import WindowEvidence, folds_of
 from imu_calibration.selection.questions import (
     Question,
-    extended_model,
     smooth_parameters,
     time_constants,
     with_exchanged,

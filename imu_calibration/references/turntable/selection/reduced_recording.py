@@ -20,7 +20,6 @@ from imu_calibration.effects.forward_equations import (
 )
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import sessions_of
-from imu_calibration.estimation.scaled_solve import packed, unpacked
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, chunks, sensors_of
@@ -29,6 +28,7 @@ from imu_calibration.references.turntable.accumulator import (
     restricted_window,
     selected_columns,
 )
+from imu_calibration.references.turntable.packed_factors import packed, unpacked
 from imu_calibration.references.turntable.window_statistics import WindowStatistics, reduce_windows
 from imu_calibration.selection.evidence import Recent
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from imu_calibration.estimation.scaled_solve import packed, triangular, unpacked
+from imu_calibration.estimation.scaled_solve import triangular
+from imu_calibration.references.turntable.packed_factors import packed, unpacked
 
 
 def test_packed_factors_come_back_bit_by_bit():
