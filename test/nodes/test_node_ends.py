@@ -19,7 +19,13 @@ from ros.live_station import TABLE
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.live
-SLOW_IMPORT = 'import pathlib, time\npathlib.Path({mark!r}).touch()\ntime.sleep(60)\n'
+# Short sleeps: the handler of a signal that arrives just before a sleep runs after it.
+SLOW_IMPORT = """
+import pathlib, time
+pathlib.Path({mark!r}).touch()
+for _ in range(600):
+    time.sleep(0.1)
+"""
 EARLY = """
 import os, signal, sys
 import rclpy
