@@ -242,11 +242,9 @@ class Recording:
     ):
         self.path = path
         self.topics = topics
-        self.imu_topic, self.joint_topic, self.temperature_topic = (
-            imu_topic,
-            joint_topic,
-            temperature_topic,
-        )
+        self.imu_topic = imu_topic
+        self.joint_topic = joint_topic
+        self.temperature_topic = temperature_topic
         self.source, self.frame_id = source, frame_id
 
     @property

@@ -48,7 +48,8 @@ class BagWriter:
                 code='storage_unknown',
             )
         self.path = Path(path)
-        self.topics, self.counts = {}, Counter()
+        self.topics = {}
+        self.counts = Counter()
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.kind = STORAGES[identifiers().index(storage)]
@@ -80,7 +81,8 @@ class BagWriter:
         self.storage.write(topic_ids, received_ns, messages)
         for topic_id, count in zip(*np.unique(topic_ids, return_counts=True), strict=True):
             self.counts[int(topic_id)] += int(count)
-        first, last = int(received_ns.min()), int(received_ns.max())
+        first = int(received_ns.min())
+        last = int(received_ns.max())
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
         self.last_ns = last if self.last_ns is None else max(last, self.last_ns)
 

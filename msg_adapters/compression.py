@@ -89,7 +89,9 @@ def decompress(compression: str, packed: bytes | memoryview, limit: int) -> byte
         For another compression; `decompression_errors` for damaged data.
 
     """
-    make, parts, n_bytes = _decompressor(compression), [], 0
+    make = _decompressor(compression)
+    parts = []
+    n_bytes = 0
     for _ in range(MOST_FRAMES):
         decompressor = make()
         parts.append(decompressor.decompress(packed, limit - n_bytes))
@@ -164,22 +166,24 @@ def decompress_file(source: Path, target: Path) -> str | None:
         When it is much larger than a recording would be, or than the free space.
 
     """
-    module, source = zstd(), Path(source)
+    module = zstd()
+    source = Path(source)
     limit = min(
         largest_content(source.stat().st_size), shutil.disk_usage(target.parent).free * 9 // 10
     )
     with source.open('rb') as packed, Path(target).open('wb') as plain:
-        decompressor, n_frames, data, started = module.ZstdDecompressor(), 0, b'', True
+        decompressor = module.ZstdDecompressor()
+        n_frames = 0
+        data = b''
+        started = True
         try:
             while data or not decompressor.needs_input or (data := packed.read(PACKED_PIECE_BYTES)):
                 plain.write(decompressor.decompress(data, PACKED_PIECE_BYTES))
                 data, started = b'', True
                 if decompressor.eof:  # a file may hold several frames
-                    data, decompressor, n_frames = (
-                        decompressor.unused_data,
-                        module.ZstdDecompressor(),
-                        n_frames + 1,
-                    )
+                    data = decompressor.unused_data
+                    decompressor = module.ZstdDecompressor()
+                    n_frames = n_frames + 1
                     started = bool(data)
                 if plain.tell() > limit or n_frames > MOST_FRAMES:
                     raise ValueError(

@@ -162,13 +162,12 @@ class _Patch:
     def __init__(
         self, correct, propagate, frame_id, mat_ts, late_ns, choice, *, keep=None, other=None
     ):
-        self.correct, self.propagate, self.late_ns, self.choice = (
-            correct,
-            propagate,
-            late_ns,
-            choice,
-        )
-        self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
+        self.correct = correct
+        self.propagate = propagate
+        self.late_ns = late_ns
+        self.choice = choice
+        self.frame_id = frame_id
+        self.mat_st = None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
         self.keep, self.other = keep, other
 
@@ -196,7 +195,8 @@ class _Patch:
                 _selected(layout, index, group, kept[np.searchsorted(done, index)])
                 for layout, index, group in groups
             ]
-            done, samples = done[kept], samples.select(kept)
+            done = done[kept]
+            samples = samples.select(kept)
         order = np.argsort(np.concatenate([index for _, index, _ in groups]))
         if self.other is not None:
             samples = self.other.added_to(samples)

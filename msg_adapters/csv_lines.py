@@ -73,7 +73,8 @@ def _with_serial_column(lines):
         match = SERIAL_STAMP.fullmatch(line)
         time, text = 'time', line
         if match:
-            time, text = match[1], match[2]
+            time = match[1]
+            text = match[2]
         # The time of the header is its name.
         if not any(character.isdigit() for character in text):
             time = 'time'

@@ -319,7 +319,9 @@ def read_csv(
     time, counted = _times(table, by_quantity['time'])
     stamp_ns = counted.stamp_ns
     readings = _sensors(table, by_quantity, stamp_ns, time)
-    used, temperature, joints = [time, *readings.columns], None, []
+    used = [time, *readings.columns]
+    temperature = None
+    joints = []
     for each in found:
         if each.quantity == 'temperature':
             used.append(_with_unit(each, lambda: 'C', path))
@@ -654,7 +656,8 @@ def _read_sensor_rows(path, rows, columns, where, *, raw):
                 key='where',
                 code='sensor_rows',
             )
-    force, rate = found['force'][0], found['rate'][0]
+    force = found['force'][0]
+    rate = found['rate'][0]
     return replace(_log_of_two(force, rate), row_names=(force.condition, rate.condition))
 
 
@@ -664,7 +667,8 @@ def _text_of_two(force, rate, joined):
     if joined.slower == 'gyroscope':
         slow, other = rate, force
     text = _text_of(slow.table, (slow.time, slow.columns), slow.counted.stamp_ns, joined)
-    sensor, width = SENSOR_OF[other.columns.quantity], len(text.names)
+    sensor = SENSOR_OF[other.columns.quantity]
+    width = len(text.names)
     return replace(
         text,
         names=(*text.names, *(f'{sensor}_{axis}' for axis in 'xyz')),
@@ -813,7 +817,9 @@ def _parse(text):
     # units with a colon of their own
     scaled = re.fullmatch(r'(.*?):((counts|increments):.*)', rest)
     if scaled:
-        names, colon, unit = scaled[1], ':', scaled[2]
+        names = scaled[1]
+        colon = ':'
+        unit = scaled[2]
     else:
         names, colon, unit = rest.rpartition(':')
     if not colon:
@@ -953,7 +959,8 @@ class _Table:
                 f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces,'
                 ' got none; check the file'
             )
-        self.first, self.first_row = first, rows[first]
+        self.first = first
+        self.first_row = rows[first]
         self.decimal_comma = any(
             re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', cell)
             and (self.delimiter != ',' or not GROUPED_NUMBER.fullmatch(cell))
@@ -1080,7 +1087,8 @@ class _Table:
 
     def values_of(self, name, where):
         """Return the different cells of a column in the rows that fulfil `where`, sorted."""
-        column, found = self.column(name), set()
+        column = self.column(name)
+        found = set()
         for line in self._selected(self._rows, where):
             cells = self._cells(line) if '"' in line else line.split(self.delimiter)
             if len(cells) > column:
@@ -1130,7 +1138,10 @@ class _Table:
                     f'a condition must be COLUMN=VALUE, got {condition!r}; correct it',
                     code='where',
                 )
-            column, value, kept, seen = self.column(name.strip()), value.strip(), [], Counter()
+            column = self.column(name.strip())
+            value = value.strip()
+            kept = []
+            seen = Counter()
             for line in lines:
                 cells = self._cells(line)
                 if column >= len(cells):
@@ -1308,7 +1319,8 @@ def _numeric(cell):
 
 def _guess(table, stated=frozenset()):
     """Return the Columns that the header names; sets of a `stated` quantity may be several."""
-    axes, found = {'force': {}, 'rate': {}}, []
+    axes = {'force': {}, 'rate': {}}
+    found = []
     sensor_of_file = _words(table.path.stem)[0]
     for name in table.names:
         words, unit_text = _words(name)
@@ -1390,7 +1402,8 @@ def _reading_of(words):
     inner = re.fullmatch(r'(?:shimmer \w+ )?(.*) (ln|wr) ([xyz])', bare)
     range_name = ''
     if inner:
-        bare, range_name = f'{inner[1]} {inner[3]}', inner[2]
+        bare = f'{inner[1]} {inner[3]}'
+        range_name = inner[2]
     bare = re.sub(r'^shimmer \w+ ', '', bare)
     # The axis in front: x acc, xacc, x ang rate, behind the name of a message.
     bare = re.sub(r'^(?:(?:.* )?imu\d? )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\2 \1', bare)
@@ -1400,7 +1413,8 @@ def _reading_of(words):
     of_imu = ''
     device = re.fullmatch(r'((?:imu|sensor|mpu|device) ?\d+) (.*)', bare)
     if device:
-        of_imu, bare = device[1], device[2]
+        of_imu = device[1]
+        bare = device[2]
     numbered = re.fullmatch(r'(\D+?) ?(\d+) ?([xyz]?)', bare)
     if numbered:
         bare = f'{numbered[1]} {numbered[3]}'.strip()
@@ -1514,7 +1528,8 @@ def _without_unit(name):
             re.IGNORECASE,
         )
         if suffix:
-            unit, text = suffix.group().removeprefix('_'), text[: suffix.start()]
+            unit = suffix.group().removeprefix('_')
+            text = text[: suffix.start()]
     if not unit and text.lower() in ('millis', 'micros', 'nanos', 'ms', 'us', 'ns'):
         unit = text
     return text, unit
@@ -1753,7 +1768,8 @@ class ConvertedLog:
     """
 
     def __init__(self, path: Path, options: LogOptions):
-        log, folder = read_directly(path, options), mkdtemp(prefix='imu_calibration_')
+        log = read_directly(path, options)
+        folder = mkdtemp(prefix='imu_calibration_')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.bag = Path(folder, 'log')
         write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')

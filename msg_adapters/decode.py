@@ -50,13 +50,12 @@ class Decoder:
     """
 
     def __init__(self, message_type: str, deserialize: Callable | None = None, choice: Any = None):
-        self.message_type, self.name, self.deserialize, self.choice = (
-            message_type,
-            message_type.rpartition('/')[2],
-            deserialize,
-            choice,
-        )
-        self.dropped, self.notes = Counter(), Counter()
+        self.message_type = message_type
+        self.name = message_type.rpartition('/')[2]
+        self.deserialize = deserialize
+        self.choice = choice
+        self.dropped = Counter()
+        self.notes = Counter()
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """
@@ -138,7 +137,9 @@ class FrameChoice:
     """
 
     def __init__(self, topic: str, frame_id: str | None = None):
-        self.topic, self.frame_id, self.counts = topic, frame_id, Counter()
+        self.topic = topic
+        self.frame_id = frame_id
+        self.counts = Counter()
         self._n_frequent = 0
 
     def wants(self, frame_id: str, n_messages: int = 1) -> bool:

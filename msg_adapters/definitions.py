@@ -244,7 +244,8 @@ def standard_bytes(message: Any, message_type: str) -> bytes:
 
 
 def _standard(message, message_type):
-    store, fields = standard_store(), []
+    store = standard_store()
+    fields = []
     for name, (kind, content) in store.fielddefs[message_type][1]:
         value = getattr(message, name)
         if kind.name == 'NAME':

@@ -35,13 +35,11 @@ class ImuStream:
 
     def __init__(self, frame_id: str | None = None, late_ns: int = 0):
         self._frame_out, self._late_ns = frame_id, late_ns
-        self._size, self._order, self._head, self._head_end, self._head_out = (
-            -1,
-            b'',
-            b'',
-            HEAD_AT,
-            b'',
-        )
+        self._size = -1
+        self._order = b''
+        self._head = b''
+        self._head_end = HEAD_AT
+        self._head_out = b''
         self._body = self._rate_at = self._force_at = 0
         self._rate_cov = self._force_cov = b''
         self._use('<')
@@ -175,7 +173,8 @@ class ImuHeads:
     """
 
     def __init__(self) -> None:
-        self._stream, self._frame_ids = ImuStream(), Counter[str]()
+        self._stream = ImuStream()
+        self._frame_ids = Counter[str]()
         self._last, self._frame_id = b'', ''
         self._age: list[float] = []
 

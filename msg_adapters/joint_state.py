@@ -192,7 +192,8 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
         When a position is missing, or the points are none that a controller would follow.
 
     """
-    names, points = tuple(message.joint_names), message.points
+    names = tuple(message.joint_names)
+    points = message.points
     time = np.array(
         [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in points],
         float,

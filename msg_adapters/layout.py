@@ -160,7 +160,8 @@ class MessageLayout:
     def stamp_ns(self, packed: Packed) -> np.ndarray:
         """Return the header stamps of messages that have this layout, int64, shape (n,)."""
         pairs = np.ascontiguousarray(packed.items_at(ENCAPSULATION_SIZE, 'V8'))
-        sec, nanosec = pairs.view(self.order + 'i4')[::2], pairs.view(self.order + 'u4')[1::2]
+        sec = pairs.view(self.order + 'i4')[::2]
+        nanosec = pairs.view(self.order + 'u4')[1::2]
         return sec.astype(np.int64) * NS_PER_S + nanosec
 
     def column(self, packed: Packed, name: str, count: int | None = None) -> np.ndarray:

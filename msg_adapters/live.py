@@ -88,7 +88,9 @@ class _Topic:
 
     def __init__(self, decoder, max_messages):
         self.decoder, self.max_messages = decoder, max_messages
-        self.lock, self.waiting, self.n_lost = threading.Lock(), deque(), 0
+        self.lock = threading.Lock()
+        self.waiting = deque()
+        self.n_lost = 0
 
     def add(self, message: bytes, sent_ns: int = 0) -> None:
         with self.lock:

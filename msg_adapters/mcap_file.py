@@ -149,7 +149,8 @@ def indexed_messages(
     offset = np.concatenate([offsets for _, offsets in indexes])
     channel = np.repeat([number for number, _ in indexes], [len(offsets) for _, offsets in indexes])
     order = np.argsort(offset, kind='stable')
-    offset, channel = offset[order], channel[order]
+    offset = offset[order]
+    channel = channel[order]
     if not len(offset) or offset[0] < 0 or offset[-1] + MESSAGE_PREFIX > len(buffer):
         return None
     length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
@@ -181,8 +182,13 @@ def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int,
         Where the next record would start.
 
     """
-    view, offsets, others = buffer.data, [], []
-    position, previous, run, end = 0, -1, 0, len(buffer)
+    view = buffer.data
+    offsets = []
+    others = []
+    position = 0
+    previous = -1
+    run = 0
+    end = len(buffer)
     while position + PREFIX.size <= end:
         opcode, length = PREFIX.unpack_from(view, position)
         behind = position + PREFIX.size + length
@@ -276,10 +282,13 @@ class McapFile(StorageFile):
     """
 
     def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
-        self.path, self.unpack = Path(path), unpack
+        self.path = Path(path)
+        self.unpack = unpack
         self.file = open_regular(path)
         self.size = os.fstat(self.file.fileno()).st_size
-        self.schemas, self.channels, self.lost = {}, {}, {}
+        self.schemas = {}
+        self.channels = {}
+        self.lost = {}
         self.chunk_starts, self.n_unpacked = [], 0
         self.statistics: Any = None
         try:

@@ -43,7 +43,8 @@ class McapWriter:
 
     def __init__(self, path: Path, _ros_distro: str, compression: str = ''):
         self.file = open(path, 'xb')
-        self.compression, self.compress = compression, compressor(compression)
+        self.compression = compression
+        self.compress = compressor(compression)
         self.file.write(
             MAGIC + record(0x01, prefixed_string('ros2'), prefixed_string('imu_calibration'))
         )
@@ -81,7 +82,8 @@ class McapWriter:
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
-        headers, head = np.zeros(len(messages), dtype=MESSAGE_HEADER), MESSAGE_HEADER.itemsize
+        headers = np.zeros(len(messages), dtype=MESSAGE_HEADER)
+        head = MESSAGE_HEADER.itemsize
         headers['opcode'], headers['length'], headers['channel'] = (
             0x05,
             messages.size + 22,

@@ -74,7 +74,8 @@ class SqliteFile(StorageFile):
     """
 
     def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
-        self.path, self.unpack = Path(path), unpack
+        self.path = Path(path)
+        self.unpack = unpack
         self.lost = {}
         log = Path(f'{path}-wal')
         self.logged = log.exists() and log.stat().st_size > 0
@@ -216,7 +217,9 @@ class SqliteFile(StorageFile):
             n_bytes += len(part.messages)
             if n_rows >= enough_rows or n_bytes >= STRETCH_BYTES:
                 yield _stretch(parts)
-                parts, n_rows, n_bytes = [], 0, 0
+                parts = []
+                n_rows = 0
+                n_bytes = 0
         if parts:
             yield _stretch(parts)
 
@@ -270,7 +273,8 @@ class SqliteFile(StorageFile):
             until = FIRST_ID if first is None else max(first - 1, FIRST_ID)
             count = RANGE_IDS
             while count >= FEWEST_ROWS:
-                after, until = until, min(until + RANGE_IDS, LAST_ID)
+                after = until
+                until = min(until + RANGE_IDS, LAST_ID)
                 ids = (after, until)
                 count, size, messages = self.connection.execute(statement, ids).fetchone()
                 if size is None or len(messages) != count * size:
@@ -332,7 +336,9 @@ class SqliteFile(StorageFile):
         if joined is not None:
             yield Part(joined, _sizes(messages), np.array(topic_ids), lambda: times)
             return
-        kept, messages, n_bytes = [], [], 0
+        kept = []
+        messages = []
+        n_bytes = 0
         for row_id, topic_id, received_ns, message in rows:
             if message is None and topic_id in wanted:
                 message = self._large(row_id)
@@ -347,7 +353,9 @@ class SqliteFile(StorageFile):
             n_bytes += len(message)
             if n_bytes >= STRETCH_BYTES:
                 yield _part(kept, messages)
-                kept, messages, n_bytes = [], [], 0
+                kept = []
+                messages = []
+                n_bytes = 0
         if kept:
             yield _part(kept, messages)
 
@@ -373,7 +381,8 @@ class SqliteFile(StorageFile):
         """
         if self._cut_page is None:
             return False
-        present, overflow = message.rstrip(b'\0'), self._cut_page[4:]
+        present = message.rstrip(b'\0')
+        overflow = self._cut_page[4:]
         return self._cut_page.endswith(present) or (overflow and present.endswith(overflow))
 
 

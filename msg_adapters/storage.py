@@ -129,7 +129,9 @@ class StorageFile:
         mine, packed = stretch.pack(mine)
         if self.unpack is None:
             return mine, packed
-        kept, messages, n_bytes = [], [], 0
+        kept = []
+        messages = []
+        n_bytes = 0
         for k in range(len(packed)):
             message = self._unpacked(packed.message(k), n_bytes)
             if message is not None:

@@ -276,7 +276,8 @@ def spread(values: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarra
     place = np.cumsum(steps) - 1
     if place[-1] == len(values) - 1:
         return values, np.ones(len(values), bool)
-    grid, present = np.zeros((place[-1] + 1, values.shape[1])), np.zeros(place[-1] + 1, bool)
+    grid = np.zeros((place[-1] + 1, values.shape[1]))
+    present = np.zeros(place[-1] + 1, bool)
     grid[place], present[place] = values, True
     return grid, present
 
@@ -373,10 +374,8 @@ class RestReader:
             grid = SampleGrid(self.period)
             for *_, imu in pieces:
                 values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
-                steps, trend = (
-                    grid.steps(imu.stamp_ns),
-                    self.detrending.at(self.time_of(epoch, imu.stamp_ns)),
-                )
+                steps = grid.steps(imu.stamp_ns)
+                trend = self.detrending.at(self.time_of(epoch, imu.stamp_ns))
                 flat = spread(values if trend is None else values - trend, steps)
                 for sink in bare:
                     sink.push(*flat)
@@ -405,7 +404,8 @@ class RestReader:
         """Return the Allan variances of the parts."""
         longest = max(part.seconds for part in chain.from_iterable(self.parts))
         factors = averaging_factors(round(longest / self.period))
-        bare, faults = AllanSums(factors, 6), FaultSearch()
+        bare = AllanSums(factors, 6)
+        faults = FaultSearch()
         raw = AllanSums(factors, 6) if any(self.detrending.trends) else None
         outliers = self.read(bare, raw=(faults,) if raw is None else (raw, faults))
         usable = bare.terms > 0

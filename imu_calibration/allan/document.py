@@ -340,7 +340,8 @@ def _axis(section, k, deviation):
 
 
 def _term(name, entry, k):
-    value, status = entry['value'][k], entry['status'][k]
+    value = entry['value'][k]
+    status = entry['status'][k]
     lower, upper = entry['interval95'][k]
     interval = (math.inf if lower is None else lower, math.inf if upper is None else upper)
     if status is None or interval[0] > interval[1]:
@@ -501,7 +502,8 @@ def _row(sensor, letter, axis, term):
     factor, unit = for_people(NOISE_UNITS[sensor][term.name], NOISE_QUANTITY)
     lower, upper = (end * factor for end in term.interval)
     if term.value is None:
-        value, interval = f'< {significant(upper)}' if np.isfinite(upper) else NO_BOUND, ''
+        value = f'< {significant(upper)}' if np.isfinite(upper) else NO_BOUND
+        interval = ''
     else:
         value = _digits(term.value * factor, upper - lower)
         interval = f'{_digits(lower, upper - lower)} … {_digits(upper, upper - lower)}'
@@ -581,7 +583,8 @@ def noise_exit_code(figures: NoiseFigures) -> int:
 
 def noise_shortcomings(figures: NoiseFigures) -> list[str]:
     """Return why the exit code is 3, a line each; empty for 0."""
-    found, lines = counts(figures), []
+    found = counts(figures)
+    lines = []
     if lacking := found[WEAK] + found[HELD]:
         lines.append(f'{lacking} of {sum(found.values())} noise figures are not determined')
     for sensor, why in (figures.recording.get('unusable') or {}).items():

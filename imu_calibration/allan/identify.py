@@ -80,7 +80,9 @@ class ToneSearch:
             if longest * frequency >= FEWEST_CYCLES
             else 0
         )
-        self._power, self._count, self._samples = np.zeros(self._size // 2 + 1), 0, np.zeros(0)
+        self._power = np.zeros(self._size // 2 + 1)
+        self._count = 0
+        self._samples = np.zeros(0)
 
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
         """Add the next samples of a rest, shape (n, 6); missing ones are replaced by the mean."""
@@ -203,7 +205,8 @@ class RecordingTimes:
         From one recording at rest of this length.
         """
         moments = self._moments(seconds)
-        design, tensor = moments.design(processes), moments.tensor(processes)
+        design = moments.design(processes)
+        tensor = moments.tensor(processes)
         columns = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))(
             design * coefficients
         )
@@ -330,7 +333,8 @@ def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> Restin
             f' {found.period:g} s; record at its full rate',
             code='rate_too_low',
         )
-    parts, left_out = [], dict.fromkeys(LEFT_OUT, 0.0)
+    parts = []
+    left_out = dict.fromkeys(LEFT_OUT, 0.0)
     for chunks in found.epochs:
         still, left = still_parts(chunks, found.period, found.resolution)
         parts.append(still)
@@ -436,7 +440,8 @@ def _without_scatter(curve, skipped):
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
     """Return what is written to noise.yaml: the figures of all axes and the excluded parts."""
-    record, times = result.record, RecordingTimes(result.record.curve.period)
+    record = result.record
+    times = RecordingTimes(result.record.curve.period)
     axes_of_sensor: dict[str, list[AxisFigures]] = {sensor: [] for sensor in SENSORS}
     for number, axis in enumerate(result.axes):
         if axis is None:
@@ -508,7 +513,8 @@ def _record_for(axis, times):
             or not np.isfinite(term.interval[1])
         ):
             continue
-        processes, coefficients = list(axis.fit.processes), list(axis.fit.coefficients)
+        processes = list(axis.fit.processes)
+        coefficients = list(axis.fit.coefficients)
         if name not in axis.fit.names:
             processes.insert(0, PROCESSES[name])
             coefficients.insert(0, 0.0)
@@ -552,7 +558,10 @@ def _blocks(found, parts, clock):
     """Return the means of equal numbers of chunks within the parts."""
     total = sum(part.chunks.stop - part.chunks.start for part in chain.from_iterable(parts))
     size = max(int(np.ceil(total / MAX_TREND_BLOCKS)), 1)
-    time, mean, number, seconds = [], [], [], 0.0
+    time = []
+    mean = []
+    number = []
+    seconds = 0.0
     for epoch, (chunks, of_epoch) in enumerate(zip(found.epochs, parts)):
         for part in of_epoch:
             inside = part.chunks

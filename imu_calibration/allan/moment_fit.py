@@ -162,7 +162,9 @@ def fit_processes(
     """
     from scipy.optimize import nnls  # here, because its import is slow
 
-    design, tensor, target = moments.design(processes), moments.tensor(processes), moments.target
+    design = moments.design(processes)
+    tensor = moments.tensor(processes)
+    target = moments.target
     free = np.array([k for k in range(len(processes)) if k not in (fixed or {})], int)
     values = _first_guess(design, target, moments) if start is None else np.array(start, float)
     for k, value in (fixed or {}).items():
@@ -256,7 +258,8 @@ def fit_with_time(
     until the time converges.
     """
     whitener = Whitener(np.diag((moments.target**2 * moments.scales.tau[moments.used])))
-    fit, seen = None, set()
+    fit = None
+    seen = set()
     while True:
         best = _best_time(moments, processes, whitener, fixed or {})
         if fit is not None and best in seen:
@@ -275,7 +278,8 @@ def _best_time(moments, processes, whitener, fixed):
     """
     last = len(processes)
     known = whitener(moments.design(processes))
-    wander, times = whitener(moments.wander), moments.times
+    wander = whitener(moments.wander)
+    times = moments.times
     target = whitener(moments.target) - sum(
         (known[:, k] * value for k, value in fixed.items() if k < last), np.zeros(len(known))
     )
@@ -348,7 +352,8 @@ def coefficient_interval(
         Factor on all covariances, for a curve whose misfit exceeds the sampling error.
 
     """
-    first, index = fits[0], fits[0].names.index(name)
+    first = fits[0]
+    index = fits[0].names.index(name)
     members = [_ScoreOfCoefficient(moments, fit, excess, fit.names.index(name)) for fit in fits]
     tails = partial(_averaged, members, np.asarray(weights, float) / np.sum(weights))
     limit = float(np.min(moments.target / moments.design((first.processes[index],))[:, 0]))
@@ -387,11 +392,14 @@ def _first(values, refused):
     """Return the first of the values that is refused, None without; from one that is, all are."""
     if not len(values):
         return None
-    near, far, last = -1, 0, len(values) - 1
+    near = -1
+    far = 0
+    last = len(values) - 1
     while not refused(values[far]):
         if far == last:
             return None
-        near, far = far, min(2 * far + 1, last)
+        near = far
+        far = min(2 * far + 1, last)
     while far - near > 1:
         middle = (near + far) // 2
         near, far = (near, middle) if refused(values[middle]) else (middle, far)
@@ -413,7 +421,10 @@ class _Score:
     """
 
     def __init__(self, moments, fit, excess):
-        self.moments, self.fit, self._excess, self._tails = moments, fit, excess, {}
+        self.moments = moments
+        self.fit = fit
+        self._excess = excess
+        self._tails = {}
 
     def at(self, value: float) -> tuple[Any, np.ndarray, list[np.ndarray]]:
         """Return the fit with the parameter fixed, its direction, and those of the free ones."""
@@ -571,7 +582,8 @@ def _crossing(function, start, step):
 
     if not function(start) > 0:
         return start
-    near, far = np.log(start), np.log(start) + 2.0 * step
+    near = np.log(start)
+    far = np.log(start) + 2.0 * step
     while function(np.exp(far)) > 0:
         near, far = far, far + 1.6 * (far - near)
         if abs(far - np.log(start)) > MAX_LOG_RATIO:

@@ -138,7 +138,8 @@ class ScaleCovariance:
     """
 
     def __init__(self, factors: np.ndarray, lengths: list[int], period: float):
-        self.factors, self.period = np.asarray(factors, np.int64), period
+        self.factors = np.asarray(factors, np.int64)
+        self.period = period
         self.tau = self.factors * period
         self.longest = float(np.max(lengths)) * period
         self._first, self._second = np.triu_indices(len(self.factors))
@@ -192,7 +193,8 @@ class ScaleCovariance:
         """
         Return the products of all pairs, shape (n_processes, n_processes, n_scales, n_scales).
         """
-        scales, count = len(self.factors), len(processes)
+        scales = len(self.factors)
+        count = len(processes)
         products = np.empty((count, count, scales, scales))
         for i, one in enumerate(processes):
             for j, other in enumerate(processes):
@@ -209,8 +211,10 @@ class ScaleCovariance:
             sum_k (a + (b - a) k / h) (c + (d - c) k / h),   k = 0 ... h, ends with weight 1/2
             = h (2 a c + a d + b c + 2 b d) / 6 + (b - a) (d - c) / (6 h)
         """
-        a, b = first[:, :-1], first[:, 1:]
-        c, d = second[:, :-1], second[:, 1:]
+        a = first[:, :-1]
+        b = first[:, 1:]
+        c = second[:, :-1]
+        d = second[:, 1:]
         inside = self._step * (2 * a * c + a * d + b * c + 2 * b * d) / 6
         corners = (b - a) * (d - c) / (6 * np.maximum(self._step, 1.0))
         return np.einsum('pg,pg->p', self._weight, inside + corners)
@@ -275,7 +279,8 @@ class ScaleCovariance:
         else:
             values = (process.kernel(shifted * self.period) for shifted in self._shifted(lag))
         weights = np.outer(SECOND_DIFFERENCE, SECOND_DIFFERENCE).ravel()
-        total, size = np.zeros(lag.shape), np.zeros(lag.shape)
+        total = np.zeros(lag.shape)
+        size = np.zeros(lag.shape)
         for weight, kernel_here in zip(weights, values):
             term = weight * kernel_here
             total += term

@@ -173,7 +173,8 @@ def _stepping(mean, still, width):
     )
     whole = (count[width:] - count[:-width])[:, 0] == width
     means = (sums[width:] - sums[:-width]) / width
-    step, rests = np.abs(means[width:] - means[:-width]), whole[width:] & whole[:-width]
+    step = np.abs(means[width:] - means[:-width])
+    rests = whole[width:] & whole[:-width]
     found = np.zeros(len(still), bool)
     if rests.sum() < 4 * width:
         return found
@@ -246,7 +247,8 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
     preflight = Preflight(one_sensor=True)
     cleaner = BlockCleaner(nominal=nominal, watchers=[preflight], one_sensor=True)
     series: dict[int, ChunkSeries] = {}
-    temperature, frame_id = _Thinned(), ''
+    temperature = _Thinned()
+    frame_id = ''
     outliers = RestOutliers()
     for cleaned in without_outliers(cleaner.all_of(blocks), outliers):
         for epoch, imu in cleaned.imu:
@@ -307,7 +309,9 @@ class _Thinned:
     """Temperatures not closer than a chunk."""
 
     def __init__(self):
-        self._stamps, self._values, self._last = [], [], -np.inf
+        self._stamps = []
+        self._values = []
+        self._last = -np.inf
 
     def push(self, samples):
         keep = []

@@ -412,7 +412,8 @@ def _fit_range(moments):
             > WHITE_SHARE * trial.target[0]
         )
         if not count or (seen and fit.misfit / freedom < least):
-            least, kept = fit.misfit / freedom, trial
+            least = fit.misfit / freedom
+            kept = trial
     return kept, max(float(least), 1.0)
 
 

@@ -107,7 +107,8 @@ def excess_of_torn_reads(readings: np.ndarray, step: float) -> Excess:
     # Does tearing differ from a filter, and how well is its share known?
     if pages.sensitivity < LEAST_SENSITIVITY:
         return NO_EXCESS
-    chance, cubes = pages.chance, np.sum(pages.probabilities**3)
+    chance = pages.chance
+    cubes = np.sum(pages.probabilities**3)
     same_variance = max(chance + chance**2 - 2.0 * cubes - pages.coefficients[0] ** 2, 0.0)
     share_sd = np.sqrt(same_variance / len(counts)) / pages.sensitivity
     share = _torn_share(pages)
@@ -148,7 +149,9 @@ def _pages(page, counts):
     first_step = HIGH_BYTE * (page - page.mean())
     # Hermite polynomials He_j: He_0 = 1, He_1 = z, He_{j+1} = z He_j - j He_{j-1}.
     coefficients = np.zeros(MOST_ORDER)
-    before, polynomial, factorial = np.ones(n), z, 1.0
+    before = np.ones(n)
+    polynomial = z
+    factorial = 1.0
     for order in range(1, MOST_ORDER + 1):
         factorial *= order
         moments = np.bincount(index, polynomial) / n

@@ -133,7 +133,8 @@ class TrendSearch:
         factors = np.linalg.cholesky(
             np.eye(len(lag)) + WALK_VARIANCE_RATIOS[:, None, None] / self._scale * change
         )
-        self._inverses, self._logs = np.linalg.inv(factors), _log_determinants(factors)
+        self._inverses = np.linalg.inv(factors)
+        self._logs = _log_determinants(factors)
 
     @property
     def usable(self) -> bool:
@@ -213,25 +214,22 @@ class TrendSearch:
 
         The index is that of the likeliest ratio of `WALK_VARIANCE_RATIOS`.
         """
-        design, target = (
-            np.column_stack([self._constants, self.columns(trends)]),
-            self.blocks.mean[:, axis],
-        )
+        design = np.column_stack([self._constants, self.columns(trends)])
+        target = self.blocks.mean[:, axis]
         size = np.linalg.norm(design, axis=0)
         basis, triangle = np.linalg.qr(self._inverses @ (design / size))
         rest = self._inverses @ target
         along = np.einsum('rnk,rn->rk', basis, rest)
-        total, freedom = np.sum(rest**2, axis=1), len(target) - design.shape[1]
+        total = np.sum(rest**2, axis=1)
+        freedom = len(target) - design.shape[1]
         # The residual of an axis with constant readings is a rounding error.
         squares = np.maximum(
             total - np.sum(along**2, axis=1), np.finfo(float).eps * total + np.finfo(float).tiny
         )
         best = int(np.argmin(self._logs + _log_determinants(triangle) + freedom * np.log(squares)))
         root = np.linalg.inv(triangle[best])
-        values, sd = (
-            root @ along[best] / size,
-            np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / size,
-        )
+        values = root @ along[best] / size
+        sd = np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / size
         return values[-len(trends) :], sd[-len(trends) :], best
 
     def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
@@ -332,8 +330,10 @@ class Parts:
         """
         if len(self.terms) < 2:
             return 0.0
-        terms, variance = self.terms[:, used], self.variance[:, used]
-        total, freedom = terms.sum(axis=0), (terms > 0).sum(axis=0) - 1
+        terms = self.terms[:, used]
+        variance = self.variance[:, used]
+        total = terms.sum(axis=0)
+        freedom = (terms > 0).sum(axis=0) - 1
         level = (terms * variance).sum(axis=0) / total
         squares = (terms * (variance / level - 1.0) ** 2).sum(axis=0)
         spread = total - (terms**2).sum(axis=0) / total

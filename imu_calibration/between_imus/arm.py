@@ -95,7 +95,8 @@ class Fit:
 
         For some windows, shape (n, p, 3).
         """
-        turned, residual = np.swapaxes(self.design[index], 1, 2), self.residual[index]
+        turned = np.swapaxes(self.design[index], 1, 2)
+        residual = self.residual[index]
         along = np.einsum('npi,ni->np', turned, residual) * self.weight_fall[index, None]
         return turned * self.weights[index, None, None] - along[:, :, None] * residual[:, None, :]
 
@@ -123,18 +124,18 @@ def _fit_arm(rows):
         When the motion is the same in all windows, or about one axis only and free of noise.
 
     """
-    lever, lever_slope = (
-        _lever_rows(rows.alpha, rows.products),
-        _lever_rows(rows.jerk, rows.products_slope),
-    )
-    count, arm = len(lever), np.zeros(3)
+    lever = _lever_rows(rows.alpha, rows.products)
+    lever_slope = _lever_rows(rows.jerk, rows.products_slope)
+    count = len(lever)
+    arm = np.zeros(3)
     for number in range(3):  # the delay column needs the arm
         clocks = [-rows.force_slope[:, :, None], (lever_slope @ arm)[:, :, None]]
         design = np.concatenate([lever, np.tile(np.eye(3), (count, 1, 1)), *clocks], axis=2)
         used = design if number else design[:, :, :-1]
         values, weights, weight_fall, excess = _robust_fit(used, rows.difference, rows.alpha_noise)
         arm = values[:3]
-    normal, raw = _normal(design, weights, excess), _normal(design, weights, 0.0)
+    normal = _normal(design, weights, excess)
+    raw = _normal(design, weights, 0.0)
     try:
         seen = scipy.linalg.eigh(_reduced(normal), _reduced(raw))
     except np.linalg.LinAlgError as error:
@@ -177,12 +178,16 @@ def _robust_fit(design, target, alpha_noise):
     its weight: ``weight - weight_fall residual^2``. The noise in the columns biases the values in
     this proportion.
     """
-    weights, weight_fall, size = np.ones(len(design)), np.zeros(len(design)), np.zeros(len(design))
-    flat, values = design.reshape(-1, design.shape[2]), np.full(design.shape[2], np.inf)
+    weights = np.ones(len(design))
+    weight_fall = np.zeros(len(design))
+    size = np.zeros(len(design))
+    flat = design.reshape(-1, design.shape[2])
+    values = np.full(design.shape[2], np.inf)
     for _ in range(30):
         excess = 2 * alpha_noise * np.sum(weights - weight_fall * size / 3)
         right = flat.T @ (target * weights[:, None]).ravel()
-        before, values = values, np.linalg.solve(_normal(design, weights, excess), right)
+        before = values
+        values = np.linalg.solve(_normal(design, weights, excess), right)
         size = np.sum((target.ravel() - flat @ values).reshape(-1, 3) ** 2, axis=1)
         # The median of chi-square with three degrees of freedom.
         scale = np.median(size) / 2.366 + 1e-300
@@ -429,10 +434,8 @@ def _matrix_covariance(calibration):
 def _result(rows, fit, delay, rotation, streams):
     motion = _jackknife_covariance(fit, rows.centres)[:3, :3]
     shift = response(fit, -skew(rows.force))
-    calibration, turned = (
-        _calibration_covariance(fit, rows, *streams),
-        (shift @ rotation.cov @ shift.T)[:3, :3],
-    )
+    calibration = _calibration_covariance(fit, rows, *streams)
+    turned = (shift @ rotation.cov @ shift.T)[:3, :3]
     total = motion + calibration + turned
     sd = np.sqrt(np.diag(total))
     _require_seen(fit.seen, sd)

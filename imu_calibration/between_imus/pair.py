@@ -91,7 +91,8 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
     index = np.minimum(first[:, None] + offset, len(time) - 1)
     inside = offset < (last - first)[:, None]
     phase = np.pi * ((time[index] - centres[:, None]) / length + 0.5)
-    sine, share = np.sin(phase), np.gradient(time)[index] / length
+    sine = np.sin(phase)
+    share = np.gradient(time)[index] / length
     norm = 1 / 0.3125  # the mean of sin^6 over its half period is 5/16
     weight = np.where(inside, norm * sine**SINE_POWER * share, 0.0)
     slope = np.where(
@@ -139,7 +140,8 @@ class PairedImu:
         """Compensate the samples of one IMU with a calibration from their own poses."""
         time = 1e-9 * (imu.stamp_ns - start_ns)
         keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps add no new time
-        imu, time = imu.select(keep), time[keep]
+        imu = imu.select(keep)
+        time = time[keep]
         period = float(np.median(np.diff(time)))
         flagged = (
             clipped(imu.force_s)
@@ -152,7 +154,9 @@ class PairedImu:
             force, rate = calibration.compensate(imu.force_s, imu.rate_s)
         except NotObservableError:
             bias = np.mean([imu.rate_s[s].mean(0) for s in still], axis=0) if still else np.zeros(3)
-            calibration, force, rate = None, imu.force_s, imu.rate_s - bias
+            calibration = None
+            force = imu.force_s
+            rate = imu.rate_s - bias
         return cls(time, force, rate, flagged, calibration, period)
 
 
@@ -198,7 +202,8 @@ def window_length(a: PairedImu, b: PairedImu) -> float:
 
 def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) -> np.ndarray:
     """Return the middles of the windows, s on A's clock: on A's samples where these are even."""
-    step, margin = max(a.period, length / SAMPLES_LEAST), 0.51 * length + 0.1
+    step = max(a.period, length / SAMPLES_LEAST)
+    margin = 0.51 * length + 0.1
     begin = max(a.time[0], b.time[0] - offset) + margin
     end = min(a.time[-1], b.time[-1] - offset) - margin
     if end - begin < step:
@@ -229,16 +234,18 @@ def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
     The rotation is from the directions at rest if both were calibrated, otherwise from the rates.
     The offset is from the rates.
     """
-    offset, length = 0.0, window_length(a, b)
+    offset = 0.0
+    length = window_length(a, b)
     for _ in range(OFFSET_ROUNDS):
         centres = window_centres(a, b, offset=offset, length=length)
-        over_a, over_b = (
-            make_windows(a.time, centres, length),
-            make_windows(b.time, centres + offset, length),
-        )
+        over_a = make_windows(a.time, centres, length)
+        over_b = make_windows(b.time, centres + offset, length)
         free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
-        over_a, over_b = over_a.select(free), over_b.select(free)
-        rate_a, rate_b, alpha = over_a.mean(a.rate), over_b.mean(b.rate), over_a.slope(a.rate)
+        over_a = over_a.select(free)
+        over_b = over_b.select(free)
+        rate_a = over_a.mean(a.rate)
+        rate_b = over_b.mean(b.rate)
+        alpha = over_a.slope(a.rate)
         mat_ab = nearest_rotation(rate_a.T @ rate_b)
         offset -= float(
             np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300)
@@ -264,7 +271,8 @@ def _directions_at_rest(a, b, offset):
         return None
     pairs = []
     for first, last in zip(a.calibration.poses.start, a.calibration.poses.stop):
-        begin, end = a.time[first], a.time[last - 1]
+        begin = a.time[first]
+        end = a.time[last - 1]
         in_b = slice(*np.searchsorted(b.time, (begin + offset, end + offset)))
         if in_b.stop - in_b.start >= 2:
             pairs.append((a.force[first:last].mean(0), b.force[in_b].mean(0)))

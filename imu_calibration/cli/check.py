@@ -53,7 +53,8 @@ def run(options: Options) -> VerbResult:
         **options.choices(),
     )
     warn([finding.to_mapping() for finding in visible_findings(found.findings)])
-    out, table = Terminal.of(), _table(found)
+    out = Terminal.of()
+    table = _table(found)
     show_table(out, table.columns, list(table.rows), numbers=table.numbers)
     out.print(str(found))
     if page is not None:

@@ -65,7 +65,8 @@ def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
         When the folder does not exist or holds no unit.
 
     """
-    folder, output = Path(folder), Path(output).resolve()
+    folder = Path(folder)
+    output = Path(output).resolve()
     if not folder.is_dir():
         raise InputError(
             f'the folder of units {folder} must exist, there is none; correct the path'
@@ -226,7 +227,8 @@ def _table(options, bags):
     """
     Return the chain of joints; a description in recordings is read from the first readable one.
     """
-    stand, topics = options.stand(), topics_of(options.choices())
+    stand = options.stand()
+    topics = topics_of(options.choices())
     purpose = 'a fleet is calibrated on a table or an arm'
     for bag in bags[:-1]:
         try:

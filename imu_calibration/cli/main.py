@@ -28,9 +28,12 @@ class ProgressBars:
     """
 
     def __init__(self, *, verbose: bool = False):
-        self._verbose, self._ended = verbose, threading.Event()
+        self._verbose = verbose
+        self._ended = threading.Event()
         self._bar: Any = None
-        self._phase, self._since, self._removed = '', time.monotonic(), False
+        self._phase = ''
+        self._since = time.monotonic()
+        self._removed = False
 
     def __enter__(self):
         self._streams = sys.stdout, sys.stderr
@@ -135,7 +138,8 @@ def run(options: Namespace) -> int:
     from imu_calibration.core.errors import ImuCalibrationError, printable
     from imu_calibration.core.progress import listening, reading_remarks
 
-    prog, reasons = f'imu_calibration {options.verb}', ()
+    prog = f'imu_calibration {options.verb}'
+    reasons = ()
     try:
         with contextlib.ExitStack() as stack:
             if options.json or options.quiet:
@@ -151,18 +155,19 @@ def run(options: Namespace) -> int:
         return 1
     except (ImuCalibrationError, OSError, MemoryError, RecursionError) as error:
         if isinstance(error, ImuCalibrationError):
-            text, key, name = error.with_hint(options.hints()), error.key, error.code
+            text = error.with_hint(options.hints())
+            key = error.key
+            name = error.code
         else:
-            text, key, name = (
-                printable(
-                    f'{type(error).__name__}: {error}; check disk space, memory, permissions and'
-                    ' the input'
-                ),
-                None,
-                '',
+            text = printable(
+                f'{type(error).__name__}: {error}; check disk space, memory, permissions and'
+                ' the input'
             )
+            key = None
+            name = ''
         complain(f'{prog}: {text}')
-        code, document = 1, {'error': text, 'key': key, 'code': name}
+        code = 1
+        document = {'error': text, 'key': key, 'code': name}
     except KeyboardInterrupt:
         return _interrupted(prog)
     if options.quiet:

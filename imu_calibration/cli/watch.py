@@ -127,13 +127,11 @@ class NodeWatcher:
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from visualization_msgs.msg import MarkerArray
 
-        self.name, self.statuses, self.others, self.picture, self.heard = (
-            name,
-            {},
-            set(),
-            '',
-            time.monotonic(),
-        )
+        self.name = name
+        self.statuses = {}
+        self.others = set()
+        self.picture = ''
+        self.heard = time.monotonic()
         self._node = rclpy.create_node('imu_calibration_watch', context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self._node)

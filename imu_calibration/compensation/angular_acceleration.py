@@ -152,7 +152,8 @@ class StampedDerivative:
             self.alpha = NO_SLOPE
         else:
             sx, sy, sz, px, py, pz = self._sums
-            middle, scale = 0.5 * (n - 1), self._scale[n]
+            middle = 0.5 * (n - 1)
+            scale = self._scale[n]
             self.alpha = (
                 (px - middle * sx) * scale,
                 (py - middle * sy) * scale,
@@ -167,8 +168,13 @@ class StampedDerivative:
         n = len(window)
         if n == self.taps:
             ox, oy, oz = window.popleft()
-            sx, sy, sz, n = sx - ox, sy - oy, sz - oz, n - 1
-            px, py, pz = px - sx, py - sy, pz - sz
+            sx = sx - ox
+            sy = sy - oy
+            sz = sz - oz
+            n = n - 1
+            px = px - sx
+            py = py - sy
+            pz = pz - sz
         window.append((x, y, z))
         self._sums = (sx + x, sy + y, sz + z, px + n * x, py + n * y, pz + n * z)
         self._age += 1

@@ -337,7 +337,8 @@ def outside_conditions(
         )
     limits = calibration.conditions.get('temperature_range_c')
     if limits and temperature_c:
-        low, high = min(temperature_c), max(temperature_c)
+        low = min(temperature_c)
+        high = max(temperature_c)
         if low < limits[0] - 5 or high > limits[1] + 5:
             lines.append(
                 f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw'

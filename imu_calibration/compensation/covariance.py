@@ -64,7 +64,8 @@ class Sensitivity:
         weights = slope_error.weights
         if weights is None:
             return replace(self, slope_error=slope_error)
-        newest, earlier = float(weights[0]), float(weights[1:] @ weights[1:])
+        newest = float(weights[0])
+        earlier = float(weights[1:] @ weights[1:])
         return replace(self, newest=newest, earlier=earlier, slope_error=slope_error)
 
     def covariances(
@@ -77,7 +78,8 @@ class Sensitivity:
         force, rate and derivative, w the newest weight, v the earlier ones, and E the covariance of
         the derivative's error (its delay); plus the parameters' share.
         """
-        results, error_cov = [], self.slope_error.covariance(rate_cov)
+        results = []
+        error_cov = self.slope_error.covariance(rate_cov)
         for k in (0, 3):
             by_force, by_rate, by_derivative = (self.gain[k : k + 3, j : j + 3] for j in (0, 3, 6))
             now = by_rate + self.newest * by_derivative
@@ -102,7 +104,8 @@ class Uncertainty:
 
     def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None):
         self._model, self._values = invertible_values(calibration)
-        self._kernel, self._inside = make_kernel(calibration, transfer), make_kernel(calibration)
+        self._kernel = make_kernel(calibration, transfer)
+        self._inside = make_kernel(calibration)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
         index = np.concatenate(
             [
@@ -162,10 +165,8 @@ class Uncertainty:
             Error of the derivative; None: noise only.
 
         """
-        sample, beside = (
-            np.concatenate([force, rate, derivative]),
-            (warming, branch, *vibration),
-        )
+        sample = np.concatenate([force, rate, derivative])
+        beside = (warming, branch, *vibration)
         gain = np.stack(
             [self._slope(sample, step, beside) for step in np.diag(DIFFERENCE_STEPS)], axis=1
         )
@@ -183,10 +184,8 @@ class Uncertainty:
         return sensitivity.with_slope_error(slope_error or SlopeError())
 
     def _slope(self, sample, step, beside):
-        above, below = (
-            self._kernel(*(sample + step).tolist(), *beside),
-            self._kernel(*(sample - step).tolist(), *beside),
-        )
+        above = self._kernel(*(sample + step).tolist(), *beside)
+        below = self._kernel(*(sample - step).tolist(), *beside)
         return (np.array(above) - below) / (2 * step.sum())
 
     def _parameter_slopes(self, true, alpha, beside):

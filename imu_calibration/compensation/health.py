@@ -203,7 +203,9 @@ class GyroBiasUpdate:
 
     def __init__(self, prior_sd: np.ndarray, time: float):
         prior = np.asarray(prior_sd, float) ** 2
-        self._time, self._stop, self.n_stops = time, float('nan'), 0
+        self._time = time
+        self._stop = float('nan')
+        self.n_stops = 0
         self._now = self._before = _State(np.zeros(3), prior, prior, np.zeros(3))
 
     def predict(self, now: float) -> tuple[np.ndarray, np.ndarray]:
@@ -230,7 +232,8 @@ class GyroBiasUpdate:
             self._stop, self._before, self.n_stops = start, self._now, self.n_stops + 1
         variance = variance + EARTH_RATE**2 / 3  # about axes that are unknown here
         bias, spread, seen, weight = self._before.after(now, self._time)
-        seen, weight = seen + rate**2, weight + 1
+        seen = seen + rate**2
+        weight = weight + 1
         stationary = np.maximum(self._before.stationary, seen / weight)
         # It has been as wide before anybody saw it.
         spread = spread + np.maximum(stationary - self._before.stationary, 0)
@@ -396,7 +399,8 @@ class CalibrationHealth:
         along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
         rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])
         gravity_sd = float(np.sqrt(along @ total[:3, :3] @ along))
-        rate, length = stop.mean[3:], float(np.linalg.norm(stop.mean[:3]))
+        rate = stop.mean[3:]
+        length = float(np.linalg.norm(stop.mean[:3]))
         force_off = max(abs(length - self._gravity) - self._place * self._gravity, 0) / gravity_sd
         axis = int(np.argmax(rate_off))
         values = {
@@ -486,7 +490,8 @@ class StopWatch:
     """
 
     def __init__(self, health: CalibrationHealth):
-        self.health, self._detector = health, StopDetector(health.noise_sd)
+        self.health = health
+        self._detector = StopDetector(health.noise_sd)
         self._waiting: list[SIX] = []
         self._first_ns = self._look = 0
         self._offset: tuple[float, float, float] | None = None

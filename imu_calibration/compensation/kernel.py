@@ -124,9 +124,11 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     accel = _Part(model, 'accelerometer', values, known)
     gyro = _Part(model, 'gyroscope', values, known)
 
-    mat_ts, arm_s = np.eye(3), np.zeros(3)
+    mat_ts = np.eye(3)
+    arm_s = np.zeros(3)
     if transfer is not None:
-        mat_ts, arm_s = transfer.mat_ts, transfer.mat_ts.T @ transfer.arm_t
+        mat_ts = transfer.mat_ts
+        arm_s = transfer.mat_ts.T @ transfer.arm_t
     lever = LEVER.products(known)
     force_of_arm = [_sum(arm_s, lever[start : start + 3]) for start in (0, 3, 6)]
 
@@ -277,7 +279,9 @@ def _assigned(letter, rows, indent):
 
 def _worked_out(rows, indent):
     """Return (lines that work each function and product out once, the sums as texts)."""
-    names, lines, sums = {}, [], []
+    names = {}
+    lines = []
+    sums = []
 
     def name_of(text):
         if text not in names:

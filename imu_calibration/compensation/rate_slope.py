@@ -212,7 +212,9 @@ class RateSlope:
         self._newest: int | None = None
         self._reading: tuple = NO_SLOPE
         self._slope: tuple = NO_SLOPE
-        self._count, self._longest_ns, self._young = 0, 0.0, True
+        self._count = 0
+        self._longest_ns = 0.0
+        self._young = True
         self._agreeing, self._ahead_ns = 0, 0
         self._doubtful: list[tuple] = []
         self._recent: deque[tuple] = deque(maxlen=RECENT_SPAN[1])
@@ -279,7 +281,8 @@ class RateSlope:
 
         The same as `push` one by one.
         """
-        out, start = np.empty(values.shape), 0
+        out = np.empty(values.shape)
+        start = 0
         while start < len(values):
             stop = self._usual_until(stamp_ns, values, start)
             if stop > start:
@@ -335,7 +338,8 @@ class RateSlope:
             self._all_of_it = self._size_at_start()
         else:
             self._all_of_it = self._size_of_all(np.array(self._recent).reshape(-1, 3))
-        stamps, readings = list(self._stamps)[:-1], list(self._recent)
+        stamps = list(self._stamps)[:-1]
+        readings = list(self._recent)
         self.derivative = self._tracker = None
         if not _stand_still(line):
             self.derivative = self._choose(line.period_ns * 1e-9)
@@ -469,7 +473,8 @@ class RateSlope:
         readings = np.array(list(self._recent)[len(self._recent) - n :]).reshape(-1, 3)
         if n:
             age = (stamps.max() - stamps) * 1e-9
-            stamps, readings = stamps[age <= most], readings[age <= most]
+            stamps = stamps[age <= most]
+            readings = readings[age <= most]
         if not len(stamps) or not np.ptp(stamps):
             return FirstSlope(np.zeros(3), 0.0, 0.0)
         time = (stamps - stamps[0]) * 1e-9

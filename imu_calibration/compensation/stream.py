@@ -57,7 +57,9 @@ class CompensationStream:
         temperature: TemperatureSamples | None = None,
         transfer: Transfer | None = None,
     ):
-        self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
+        self.calibration = calibration
+        self.transfer = transfer
+        self.temperature = temperature
         model = invertible(calibration.model)
         if model.needs_temperature and temperature is None:
             raise InputError(
@@ -70,7 +72,9 @@ class CompensationStream:
                 temperature, branch=ThermalBranch().of(temperature.temperature_c)
             )
         self._vibration = BandVariance() if model.uses('vibration') else None
-        self.count, self.flagged, self.frame_id = 0, 0, ''
+        self.count = 0
+        self.flagged = 0
+        self.frame_id = ''
         self.slope = RateSlope(
             partial(derivative_for, calibration, transfer=transfer),
             bias=calibration.of('gyroscope', Role.OFFSET),
@@ -163,7 +167,8 @@ class CompensationStream:
         if self.temperature is None or not len(self.temperature):
             return None, None
         origin = self.temperature.stamp_ns[0]
-        at, known = (stamp_ns - origin) * 1e-9, (self.temperature.stamp_ns - origin) * 1e-9
+        at = (stamp_ns - origin) * 1e-9
+        known = (self.temperature.stamp_ns - origin) * 1e-9
         values = np.interp(at, known, self.temperature.temperature_c)
         if len(values):
             self._temperatures += [float(values.min()), float(values.max())]
@@ -392,16 +397,17 @@ class SampleCompensation:
         transfer: Transfer | None = None,
         with_parameters: bool = True,
     ):
-        self.calibration, self.transfer, self.with_parameters = (
-            calibration,
-            transfer,
-            with_parameters,
-        )
-        self.counts, self.corrected, self.fastest_squared = Counter(), 0, 0.0
+        self.calibration = calibration
+        self.transfer = transfer
+        self.with_parameters = with_parameters
+        self.counts = Counter()
+        self.corrected = 0
+        self.fastest_squared = 0.0
         model = invertible(calibration.model)
         self.needs_temperature = model.needs_temperature
         self.warming = None if self.needs_temperature else 0.0
-        self.branch, self.vibration = ThermalBranch(), BandVariance()
+        self.branch = ThermalBranch()
+        self.vibration = BandVariance()
         self._shakes = model.uses('vibration')
         self.at_zero = {
             sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS
@@ -446,7 +452,8 @@ class SampleCompensation:
 
         `counts` has the reason.
         """
-        total, warming = wx + wy + wz + fx + fy + fz, self.warming
+        total = wx + wy + wz + fx + fy + fz
+        warming = self.warming
         if total - total != 0.0 or warming is None:
             self.counts['no temperature yet' if warming is None else 'not finite'] += 1
             return None

@@ -313,10 +313,8 @@ def load_arrays(data: bytes) -> Any:
 
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        n_bytes, limit = (
-            sum(member.file_size for member in archive.infolist()),
-            ARRAYS_BASE + ARRAYS_RATIO * len(data),
-        )
+        n_bytes = sum(member.file_size for member in archive.infolist())
+        limit = ARRAYS_BASE + ARRAYS_RATIO * len(data)
     if n_bytes > limit:
         raise ValueError(f'its arrays need {n_bytes} bytes, at most {limit} are accepted')
     return np.load(io.BytesIO(data), allow_pickle=False)

@@ -71,7 +71,9 @@ class ImuCalibrationError(Exception):
 
     def __init__(self, text: str = '', *, key: str | None = None, code: str = '', value: str = ''):
         super().__init__(text)
-        self.key, self.code, self.value = key, code, value
+        self.key = key
+        self.code = code
+        self.value = value
 
     def named(self, name: str) -> 'ImuCalibrationError':
         """Return the error with the name of its subject before its text."""

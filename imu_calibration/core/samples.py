@@ -318,7 +318,8 @@ def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
     """
     flags = np.asarray(flags, bool)
     joined = flags[1:] & flags[:-1] & np.logical_not(broken)
-    starts, stops = flags & ~np.append(False, joined), flags & ~np.append(joined, False)
+    starts = flags & ~np.append(False, joined)
+    stops = flags & ~np.append(joined, False)
     return np.column_stack([np.flatnonzero(starts), np.flatnonzero(stops) + 1])
 
 

@@ -36,8 +36,12 @@ class Unmet(Exception):
         self, kind: str, place: str, required: str, *, received: Any, code: str = '', hint: str = ''
     ):
         super().__init__(place)
-        self.kind, self.place, self.required = kind, place, required
-        self.received, self.code, self.hint = received, code, hint
+        self.kind = kind
+        self.place = place
+        self.required = required
+        self.received = received
+        self.code = code
+        self.hint = hint
 
 
 @dataclass(frozen=True)
@@ -276,7 +280,8 @@ def mapping(
         Of a missing or an unknown key.
 
     """
-    needed, optional = needed or {}, optional or {}
+    needed = needed or {}
+    optional = optional or {}
     known = {**needed, **optional}
 
     def check(value: Any, place: str) -> None:

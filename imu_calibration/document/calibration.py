@@ -389,7 +389,8 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     places = np.concatenate(
         [np.arange(part.start, part.stop) for part in map(model.slices.__getitem__, small.slices)]
     )
-    values, covariance = calibration.values[places], calibration.covariance[np.ix_(places, places)]
+    values = calibration.values[places]
+    covariance = calibration.covariance[np.ix_(places, places)]
     status = [calibration.status[place] for place in places]
     for effect in small.effects:
         if effect.sensor in sensors and effect.role is not Role.LIMIT:

@@ -209,7 +209,8 @@ def check_numbers(calibration: Calibration) -> Calibration:
             code='too_large',
         )
     _check_covariance(covariance)
-    terms, variance = calibration.covariance_terms, np.diag(covariance)
+    terms = calibration.covariance_terms
+    variance = np.diag(covariance)
     parts = np.array(list(terms.values()))
     if terms and not np.all(
         np.abs(parts.sum(axis=0) - variance) <= COVARIANCE_ROUNDING * np.abs(parts).sum(axis=0)

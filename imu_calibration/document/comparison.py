@@ -434,7 +434,8 @@ def _groups(
         index = np.array([k == key for k in keys]) & ~held
         if not index.any():
             continue
-        block, d = covariance[np.ix_(index, index)], difference[index]
+        block = covariance[np.ix_(index, index)]
+        d = difference[index]
         scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
         correlation = block / np.outer(scale, scale)
         chi2 = float(

@@ -143,7 +143,8 @@ def ratio_text(entry: RegimeErrors) -> str:
 
 def _cause(entry: ProofEntry) -> str:
     """Return the most likely cause as the end of a sentence."""
-    late, share = entry.delay_s or 0.0, entry.delay_explains or 0.0
+    late = entry.delay_s or 0.0
+    share = entry.delay_explains or 0.0
     if abs(late) > MIN_NAMED_DELAY and share > DELAY_SHARE:
         side = 'late' if late > 0 else 'early'
         return (

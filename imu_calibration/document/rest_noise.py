@@ -47,7 +47,8 @@ def moved_at_rest(by_hand: Mapping, sensor: str) -> str:
 
     Arguments as for `rest_density`.
     """
-    density, limit = rest_density(by_hand, sensor), MOVED_DENSITY[sensor]
+    density = rest_density(by_hand, sensor)
+    limit = MOVED_DENSITY[sensor]
     if density <= limit:
         return ''
     unit = UNITS[sensor]

@@ -84,7 +84,8 @@ def uncorrected_in_time(
     centre: dict[str, ColumnCentre] = {}
     sizes = []
     for effect in not_applied(model):
-        at_end, at_times = has_settled(latest, effect, end), columns_at(model, effect, times)
+        at_end = has_settled(latest, effect, end)
+        at_times = columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
         for name, columns in applied.items():
             centre[name] = constant_part(effect, columns.mean(axis=0))
@@ -231,7 +232,8 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
         would change that.
 
     """
-    words, refused = calibration.decisions, refused_sensors(calibration, anyway=anyway, live=live)
+    words = calibration.decisions
+    refused = refused_sensors(calibration, anyway=anyway, live=live)
     if refused.keys() == set(calibration.sensors):
         first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
         consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(

@@ -128,10 +128,8 @@ def _unused_rests(calibration: Calibration) -> list[Reason]:
         reason: counts.get(reason, 0)
         for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET)
     }
-    total, used = (
-        sum(unused.values()),
-        sum((calibration.statistics.get('samples_used') or {}).values()),
-    )
+    total = sum(unused.values())
+    used = sum((calibration.statistics.get('samples_used') or {}).values())
     if rested(calibration.statistics) or total <= LOST_SHARE * used:
         return []
     return [
@@ -200,7 +198,8 @@ def _adopted(calibration: Calibration) -> list[Reason]:
             # Where the motions determine them, the misfit has another cause.
             remedies = [need for need in _by_need(calibration, held) if need in REMEDY_KEYS]
             if remedies:
-                step, key = remedies[0], REMEDY_KEYS[remedies[0]]
+                step = remedies[0]
+                key = REMEDY_KEYS[remedies[0]]
         if names[change]:
             reasons.append(Reason(NOTE, text.format(', '.join(names[change])), step, key=key))
     return reasons
@@ -603,7 +602,8 @@ def _decided(calibration: Calibration, sensor: str, word: SensorDecision) -> Rea
 
 def _step_of(calibration: Calibration, sensor: str) -> tuple[str, str | None]:
     """Return (next step, its key) for a sensor that the calibration does not certainly help."""
-    entry, texts = calibration.proof.get(sensor), calibration.texts
+    entry = calibration.proof.get(sensor)
+    texts = calibration.texts
     # Values that are refused have their own cause, and no measurement of their error is missing.
     if limit := surpassed_limit(calibration, sensor):
         return limit.remedy, limit.key
@@ -824,7 +824,8 @@ def _by_need(calibration: Calibration, names: Sequence[str]) -> dict[str, list[s
         for direction in calibration.undetermined:
             weight = abs(direction['parameters'].get(name, 0.0))
             if weight > largest_weight:
-                need, largest_weight = direction['needs'], weight
+                need = direction['needs']
+                largest_weight = weight
         if largest_weight == 0.0:  # in no direction: that of another component of its effect
             need = _need_of_effect(calibration, name.rpartition('.')[0])
         by_need.setdefault(need, []).append(name)

@@ -578,8 +578,6 @@ def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) ->
     M_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse).
     """
     # One arm for all three.
-    matrix, arms = (
-        values['matrix'].reshape(3, 3),
-        np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3)),
-    )
+    matrix = values['matrix'].reshape(3, 3)
+    arms = np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3))
     return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}

@@ -264,7 +264,8 @@ def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndar
 
     Shape (n_columns, 3).
     """
-    of_sensor, layout = model.values_of(sensor, values), model.layout(sensor)
+    of_sensor = model.values_of(sensor, values)
+    layout = model.layout(sensor)
     total = np.zeros((layout.width, 3), values.dtype)
     for effect in layout.effects:
         _add_coefficients(total, model, effect, of_sensor, layout)
@@ -307,7 +308,8 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     Besides its own values an effect's coefficients depend on the sensor's matrix and, for warps, on
     its arms.
     """
-    layout, step = model.layout(sensor), 1e-30
+    layout = model.layout(sensor)
+    step = 1e-30
     jacobian = np.zeros((layout.width, 3, len(values)))
     for effect in layout.effects:
         concerned = layout.effects if effect.shared else (effect,)
@@ -315,7 +317,8 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
         for index in range(part.start, part.stop):
             moved = values.astype(complex)
             moved[index] += 1j * step
-            of_sensor, total = model.values_of(sensor, moved), np.zeros((layout.width, 3), complex)
+            of_sensor = model.values_of(sensor, moved)
+            total = np.zeros((layout.width, 3), complex)
             for other in concerned:
                 _add_coefficients(total, model, other, of_sensor, layout)
             jacobian[:, :, index] = total.imag / step
@@ -369,7 +372,8 @@ def output_of_effects(
         shape (n, 3, p).
 
     """
-    point, own = model.full_point(), model.values_of(effects[0].sensor, values)
+    point = model.full_point()
+    own = model.values_of(effects[0].sensor, values)
     output = np.zeros((len(ref.time), 3))
     derivatives = []
     for effect in effects:
@@ -410,7 +414,8 @@ def predict(
 
 def coefficients_at_point(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
     """Return the coefficients that belong to `columns_at_point`."""
-    layout, found = model.layout(sensor), coefficients(model, sensor, values)
+    layout = model.layout(sensor)
+    found = coefficients(model, sensor, values)
     return np.concatenate([found[layout.rows[name]] for name in layout.groups])
 
 

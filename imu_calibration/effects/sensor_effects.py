@@ -48,7 +48,9 @@ def _one_axis(table):
 def _pair(sensor):
     """Return the effects that both sensors have, for one of them."""
     accel = sensor == 'accelerometer'
-    short, kind, unit = PREFIXES[sensor], base.INPUT[sensor], UNITS[sensor]
+    short = PREFIXES[sensor]
+    kind = base.INPUT[sensor]
+    unit = UNITS[sensor]
     small = MILLI_G if accel else 0.01 * DEG
     full = STANDARD_GRAVITY if accel else 100 * DEG
     own = {

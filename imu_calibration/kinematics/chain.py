@@ -325,7 +325,9 @@ def _chain_steps(constants, motion):
             continue
 
         # Turns are computed about a coordinate axis; the way back begins the next step.
-        before, sense, third = np.eye(3), 1.0, 2
+        before = np.eye(3)
+        sense = 1.0
+        third = 2
         if link.joint.turns:
             before, sense, third = _to_coordinate_axis(link.axis)
         across = link.across @ before.T

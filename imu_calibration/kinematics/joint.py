@@ -301,7 +301,8 @@ def joint_entry(value: Any, place: str) -> None:
     """Require an entry of the joints in a table description."""
     kind = None
     if isinstance(value, Mapping):
-        place, kind = f'{place} ({value.get("name")})', value.get('type')
+        place = f'{place} ({value.get("name")})'
+        kind = value.get('type')
     mapping(
         {'name': text(), 'axis': direction},
         {
@@ -383,7 +384,8 @@ def joint_to_mapping(joint: Joint) -> dict[str, Any]:
             'multiplier': joint.mimic.multiplier,
             'offset': joint.mimic.offset,
         }
-    limits, unit = joint.limits, np.radians(1.0) if joint.turns else 1.0
+    limits = joint.limits
+    unit = np.radians(1.0) if joint.turns else 1.0
     ends = None if limits.lower is None else [limits.lower, limits.upper]
     if limits.endless:
         item['endless'] = True

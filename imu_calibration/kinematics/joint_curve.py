@@ -229,7 +229,8 @@ def fit_joint_curve(
         many periods.
 
     """
-    time, position = np.asarray(time, float), np.asarray(position, float)
+    time = np.asarray(time, float)
+    position = np.asarray(position, float)
     _check(time, position)
     position = (
         np.unwrap(position, axis=0)
@@ -242,7 +243,8 @@ def fit_joint_curve(
     floor = _noise_floor(position, noise_sd)
     trend = Trend.through(time, position, still)
     coefficients = np.zeros((knots.n_coefficients, position.shape[1]))
-    bandwidth, noise = np.zeros(position.shape[1]), floor.copy()
+    bandwidth = np.zeros(position.shape[1])
+    noise = floor.copy()
     moving = np.flatnonzero(~still).tolist()
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         interval, values = design_values(knots, time)

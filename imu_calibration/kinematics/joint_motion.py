@@ -156,7 +156,8 @@ def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
     if len(motion) < 2 or np.any(step <= 0):
         moved = _taylor(derivatives, -delay)
     else:
-        target, moved = motion.time - delay, np.empty_like(derivatives)
+        target = motion.time - delay
+        moved = np.empty_like(derivatives)
         for first in range(0, len(target), DERIVATIVE_BLOCK_ROWS):
             rows = slice(first, first + DERIVATIVE_BLOCK_ROWS)
             moved[:, :, rows] = _interpolated(
@@ -223,7 +224,8 @@ def _hermite(left, right, step, by):
     # The powers four to seven correct the error of the left-end cubic at the right end.
     upper = np.tensordot(_FROM_ENDS, scale * right - _taylor(left, 1.0), 1)
     coefficients = [left[0], left[1], left[2] / 2, left[3] / 6, *upper]
-    u, found = by / step, np.empty_like(left)
+    u = by / step
+    found = np.empty_like(left)
     for order in range(4):
         total = found[order]
         total[:] = coefficients[7]

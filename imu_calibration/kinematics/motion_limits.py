@@ -105,7 +105,8 @@ class TrajectoryPoints:
             When the trajectory names other joints than these, or not all of them.
 
         """
-        own, wanted = list(self.joint_names), list(joint_names)
+        own = list(self.joint_names)
+        wanted = list(joint_names)
         if sorted(own) != sorted(wanted):
             raise InputError(
                 f'a trajectory must name exactly the joints {", ".join(wanted)}, got'
@@ -201,10 +202,8 @@ class MotionLimits:
             When the position is outside the limits.
 
         """
-        lower, upper = (
-            np.maximum(self.lower, position - reach),
-            np.minimum(self.upper, position + reach),
-        )
+        lower = np.maximum(self.lower, position - reach)
+        upper = np.minimum(self.upper, position + reach)
         if np.any(lower > upper):
             raise InputError(
                 'the pose must lie within the range of every joint, joint number'
@@ -313,7 +312,8 @@ def missing_ranges(table: Table) -> tuple[str, ...]:
 
 def range_warnings(table: Table) -> list[str]:
     """Return one line on joints without a range, and one per range whose unit is doubtful."""
-    lines, missing = [], missing_ranges(table)
+    lines = []
+    missing = missing_ranges(table)
     if missing:
         lines.append(
             f'every joint must have a range to be moved, {", ".join(missing)}: none, or over ten'
@@ -344,7 +344,8 @@ def limit_words(table: Table, limits: MotionLimits) -> list[str]:
 
     Each line includes the origin of each limit.
     """
-    lines, described = [], limits_of(table)
+    lines = []
+    described = limits_of(table)
     for k, (name, (of_range, of_speed, of_acceleration)) in enumerate(
         zip(table.joint_names, limits.origins, strict=True)
     ):

@@ -186,7 +186,8 @@ def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
     """
     roll = np.arctan2(matrix[2, 1], matrix[2, 2])
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
-    sin, cos = np.sin(roll), np.cos(roll)
+    sin = np.sin(roll)
+    cos = np.cos(roll)
     return np.array(
         [
             roll,
@@ -354,7 +355,8 @@ def earth_rate_n(latitude_deg: float, azimuth_deg: float) -> np.ndarray:
         Heading of the x axis of n, degrees clockwise from true north.
 
     """
-    latitude, azimuth = np.radians(latitude_deg), np.radians(azimuth_deg)
+    latitude = np.radians(latitude_deg)
+    azimuth = np.radians(azimuth_deg)
     return EARTH_RATE * np.array(
         [np.cos(latitude) * np.cos(azimuth), np.cos(latitude) * np.sin(azimuth), np.sin(latitude)]
     )

@@ -43,7 +43,9 @@ class BandVariance:
         if not self._inputs:
             self._begin(force)
         keep, forget = _decays(period)
-        gain, inputs, variance = 0.5 * (1.0 + keep), self._inputs, []
+        gain = 0.5 * (1.0 + keep)
+        inputs = self._inputs
+        variance = []
         for axis, value in enumerate(force):
             for stage in range(_STAGES):
                 before, inputs[stage][axis] = inputs[stage][axis], value
@@ -64,7 +66,8 @@ class BandVariance:
         if not self._inputs:
             self._begin(force_s[0].tolist())
         keep, forget = _decays(period)
-        gain, values = 0.5 * (1.0 + keep), np.asarray(force_s, float)
+        gain = 0.5 * (1.0 + keep)
+        values = np.asarray(force_s, float)
         for stage in range(_STAGES):
             steps = np.diff(values, axis=0, prepend=[self._inputs[stage]])
             self._inputs[stage] = values[-1].tolist()

@@ -220,11 +220,9 @@ class PenalisedSpline:
     """
 
     def __init__(self, design: Any, bands: np.ndarray, n_kinds: int = 1):
-        self.design, self.bands, self.penalty = (
-            design,
-            bands,
-            penalty_bands(np.ones(design.shape[1] - 3)),
-        )
+        self.design = design
+        self.bands = bands
+        self.penalty = penalty_bands(np.ones(design.shape[1] - 3))
         self.n_rows, self.n_coefficients = design.shape
         # Splines are worst at the ends, which callers keep out: the ends have weight zero in the
         # noise and the penalty.

@@ -88,7 +88,9 @@ def integrate_turn(
     centred = (
         rate_measured - bias if further is None else rate_measured - bias - further[0]
     ).T.copy()
-    rate, step, slopes = inverse @ centred, np.diff(time), _slope_weights(time)
+    rate = inverse @ centred
+    step = np.diff(time)
+    slopes = _slope_weights(time)
     vectors = _rotation_vectors(rate, step, slopes)
     mat_ik = rotations_from_quaternions(_prefix_product(vectors).T)
     mat_ji = mat_ik[-1].T.copy()
@@ -127,7 +129,8 @@ def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
 
 def _rotation_vectors(rate, step, slopes):
     """Return the rotation vector of each step (`integrate_turn`), shape (3, n - 1)."""
-    first, second = rate[:, :-1], rate[:, 1:]
+    first = rate[:, :-1]
+    second = rate[:, 1:]
     slope = slopes[1] * rate
     slope[:, 1:] += slopes[0][1:] * first
     slope[:, :-1] += slopes[2][:-1] * second
@@ -149,7 +152,8 @@ def _slope_weights(time):
     Shape (3, n), 1/s; one-sided at the ends.
     """
     step = np.diff(time)
-    before, after = step[:-1], step[1:]
+    before = step[:-1]
+    after = step[1:]
     weights = np.zeros((3, len(time)))
     weights[0, 1:-1], weights[2, 1:-1] = (
         -after / (before * (before + after)),
@@ -168,7 +172,8 @@ def _per_sample(gain, step, rate, slopes):
     `gain`, shape (3, 3, n - 1), are multiplied from the right by a cross-product matrix: ``r^T [w
     x] = (r x w)^T``.
     """
-    half, by_vector = 0.5 * step * gain, MAGNUS_SECOND * step**2 * gain
+    half = 0.5 * step * gain
+    by_vector = MAGNUS_SECOND * step**2 * gain
     weight, by_slope = np.zeros((2, 3, 3, len(step) + 1))
     weight[..., :-1] = half - cross(by_vector, rate[:, 1:])
     weight[..., 1:] += half + cross(by_vector, rate[:, :-1])
@@ -378,7 +383,8 @@ def dead_reckoning_errors(
 
 
 def _checked(time, rate_s):
-    time, rate_s = np.asarray(time, float), np.asarray(rate_s, float)
+    time = np.asarray(time, float)
+    rate_s = np.asarray(rate_s, float)
     if rate_s.shape != (len(time), 3) or np.any(np.diff(time) <= 0):
         raise InputError(
             f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort'

@@ -65,7 +65,9 @@ def axis_angles(joints: tuple[Joint, ...]) -> tuple[AxisAngle, ...]:
     there are two angles, about `axis_error_directions`, and the zeros of their joints are one
     (Hayati and Mirmirani 1985).
     """
-    found, before, name = [], None, ''
+    found = []
+    before = None
+    name = ''
     for index, joint in enumerate(joints):
         # The axis of the turning joint before, brought along from frame to frame with all joints at
         # zero.

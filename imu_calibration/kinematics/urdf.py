@@ -59,7 +59,8 @@ class StaticTransforms:
             Whether it was usable: finite, a quaternion that turns, two frames.
 
         """
-        xyz, quaternion = np.array(xyz, float), np.array(quaternion, float)
+        xyz = np.array(xyz, float)
+        quaternion = np.array(quaternion, float)
         if (
             not (
                 np.isfinite(xyz).all()
@@ -84,7 +85,8 @@ class StaticTransforms:
             Turns source vectors into target vectors, shape (3, 3).
 
         """
-        ups, downs = self._to_root(source), self._to_root(target)
+        ups = self._to_root(source)
+        downs = self._to_root(target)
         if ups[-1][0] != downs[-1][0]:
             return None
         (_, xyz_s, mat_rs), (_, xyz_t, mat_rt) = ups[-1], downs[-1]
@@ -113,7 +115,8 @@ class StaticTransforms:
 
         The ancestors run from the frame up to its root. A ring ends once closed.
         """
-        steps, seen = [(frame, np.zeros(3), np.eye(3))], {frame}
+        steps = [(frame, np.zeros(3), np.eye(3))]
+        seen = {frame}
         while (step := self._parents.get(steps[-1][0])) is not None and step[0] not in seen:
             parent, xyz, mat = step
             _, origin, turned = steps[-1]
@@ -306,7 +309,8 @@ def _chain(robot, link):
                 f"the links of a robot description must form a tree, those around '{link}' form a"
                 ' circle; correct it'
             )
-    joints, placement = [], _Placement(np.zeros(3), np.eye(3))
+    joints = []
+    placement = _Placement(np.zeros(3), np.eye(3))
     for joint in reversed(on_the_way):
         placement = placement.then(*_origin(joint))
         if joint.type == 'fixed':
@@ -349,7 +353,10 @@ def _origin(joint):
 
 def _mimic(robot, joint):
     """Return the joint at the end of the chain of followed joints, or None."""
-    multiplier, offset, name, seen = 1.0, 0.0, joint.name, []
+    multiplier = 1.0
+    offset = 0.0
+    name = joint.name
+    seen = []
     while robot.joint_map[name].mimic is not None:
         mimic = robot.joint_map[name].mimic
         offset += multiplier * (mimic.offset or 0.0)
@@ -370,7 +377,8 @@ def _limits(joint):
 
     A continuous joint is endless, placeholders (zero, infinite) count as not given.
     """
-    limit, endless = joint.limit, joint.type == 'continuous'
+    limit = joint.limit
+    endless = joint.type == 'continuous'
     ends = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
     ends = (
         (None, None) if endless or ends == (0.0, 0.0) or not all(map(math.isfinite, ends)) else ends

@@ -334,7 +334,8 @@ def _transfer(
 
     By the pose in the parameters, without one by the static transforms.
     """
-    target, given = settings.target_frame, any(settings.target_xyz) or any(settings.target_rpy)
+    target = settings.target_frame
+    given = any(settings.target_xyz) or any(settings.target_rpy)
     if not target or given or target == calibration.frame_id:
         return requested_transfer(target, settings.target_xyz, settings.target_rpy)
     if not calibration.frame_id:

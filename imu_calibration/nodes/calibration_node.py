@@ -258,7 +258,8 @@ class CalibrationNode(Node):
         )
         for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
-        self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
+        self._complaints = Complaints(self.get_logger())
+        self._started = time.monotonic()
         self._listen(joints)
         reference = self._reference.live_words(words_of(robot, self.settings.table_file))
         self.get_logger().info(f'calibrates {reference}; ~/save writes {place.calibration}')
@@ -305,7 +306,8 @@ class CalibrationNode(Node):
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
         options = replace(self._options, windows=self._session[WindowSettings])
-        live, by_hand = self._session[LiveSettings], self._session[LiveByHandSettings]
+        live = self._session[LiveSettings]
+        by_hand = self._session[LiveByHandSettings]
         return self._reference.live(options, live, by_hand, saved=saved)
 
     def _resumed(self, place: SessionFiles) -> LiveSession:

@@ -108,21 +108,18 @@ class CalibrationGuide:
         *,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._inputs, self._save_command, self._noun, self._clock = (
-            inputs,
-            save_command,
-            noun,
-            clock,
-        )
+        self._inputs = inputs
+        self._save_command = save_command
+        self._noun = noun
+        self._clock = clock
         self._coming: set[str] = set()
-        self._stamping, self._stamping_at = '', float('-inf')
-        self._gathered, self._verdict, self._advice, self._advised, self._diagnosed = (
-            0,
-            '',
-            '',
-            float('-inf'),
-            '',
-        )
+        self._stamping = ''
+        self._stamping_at = float('-inf')
+        self._gathered = 0
+        self._verdict = ''
+        self._advice = ''
+        self._advised = float('-inf')
+        self._diagnosed = ''
 
     def lines(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         """Yield (INFO or WARNING, line) for each change since the last call."""
@@ -315,7 +312,8 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     made += [_arrow(*each, number=k) for k, each in enumerate(arrows_of(coverage))]
     step = coverage.next
     if step.axis is not None and coverage.up is not None and step.up is not None:
-        across, angles = np.cross(step.axis, coverage.up), np.linspace(0, step.angle, 24)[:, None]
+        across = np.cross(step.axis, coverage.up)
+        angles = np.linspace(0, step.angle, 24)[:, None]
         made.append(
             _marker(
                 'turn',

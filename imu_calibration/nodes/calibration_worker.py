@@ -53,7 +53,8 @@ class SessionFiles:
     def __init__(self, save_file: str):
         self.given = bool(save_file)
         self.calibration = files.user_path(save_file or DEFAULT_FILE)
-        self.saved_at, self.n_saved = time.monotonic(), 0
+        self.saved_at = time.monotonic()
+        self.n_saved = 0
         self._own: set[Path] = set()
         for path in (self.calibration, self.accumulator):
             files.remove_leftovers(path)
@@ -245,17 +246,21 @@ class CalibrationWorker(threading.Thread):
         provenance: dict | None = None,
     ):
         super().__init__(name='calibration', daemon=True)
-        self.gatherer, self.live, self.make_live = gatherer, live, make_live
-        self.place, self.autosave_period, self.listeners = place, autosave_period, listeners
-        self.hints, self._provenance = hints or {}, provenance or {}
-        self._pacer, self._watch = (
-            SolvePacer(live.settings.solve_share),
-            StreamWatch(live.needs_joints, live.needs_temperature),
-        )
+        self.gatherer = gatherer
+        self.live = live
+        self.make_live = make_live
+        self.place = place
+        self.autosave_period = autosave_period
+        self.listeners = listeners
+        self.hints = hints or {}
+        self._provenance = provenance or {}
+        self._pacer = SolvePacer(live.settings.solve_share)
+        self._watch = StreamWatch(live.needs_joints, live.needs_temperature)
         self._diagnosis = DiagnosisThread(self._diagnosis_period)
         self._diagnosed = 0
         self._asked: SimpleQueue[tuple[Callable[[], tuple[bool, str]], Future]] = SimpleQueue()
-        self._wake, self._ending = threading.Event(), False
+        self._wake = threading.Event()
+        self._ending = False
         self._n_solutions, self._new_windows, self._closed = 0, self.live.n_windows > 0, True
         self.place.note_saved(self.live.n_windows)
         self._covered: tuple[int, int, int] | None = None
@@ -505,9 +510,12 @@ class CalibrationWorker(threading.Thread):
         self._watch.note_counts(counts, self._looked)
         result = self.live.result
         lines: list[str] = []
-        verdict, judged, complete = '', '', False
+        verdict = ''
+        judged = ''
+        complete = False
         if result is not None:
-            verdict, judged = str(result.verdict.word), result.verdict.text
+            verdict = str(result.verdict.word)
+            judged = result.verdict.text
             complete = result.verdict.complete
             # First the causes of an incomplete state: a status has room for three lines.
             reasons = shortcomings(result.calibration)

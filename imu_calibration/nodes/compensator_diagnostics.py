@@ -59,10 +59,13 @@ class CompensatorDiagnostics:
 
     def __init__(self, node: Any):
         self._node, self._counts = node, {}
-        self._received, self._last_change, self._last_source = 0, monotonic(), ''
+        self._received = 0
+        self._last_change = monotonic()
+        self._last_source = ''
         self._last_stamps: tuple[Any, int] | None = None
         self._temperature: float | None = None
-        self._temperature_at, self._unusable_temperatures = monotonic(), ''
+        self._temperature_at = monotonic()
+        self._unusable_temperatures = ''
         self._stamps_at = -np.inf
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
@@ -156,10 +159,8 @@ class CompensatorDiagnostics:
 
     def _stream(self, compensation):
         """Return the faults of the message stream, and log its source when it begins."""
-        node, received = (
-            self._node,
-            self._node.uncorrected + (0 if compensation is None else compensation.received),
-        )
+        node = self._node
+        received = self._node.uncorrected + (0 if compensation is None else compensation.received)
         if received != self._received:
             self._received, self._last_change = received, monotonic()
             source = node.imu.source()

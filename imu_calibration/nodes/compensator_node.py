@@ -82,13 +82,11 @@ class CompensatorNode(Node):
         self._current: LiveCompensation | None = None
         self._wanted: LiveCompensation | None = None
         self._reported: Adopted | None = None
-        self.problem, self.refusal, self.corrected_already, self._heard, self.awaited = (
-            '',
-            '',
-            '',
-            '',
-            '',
-        )
+        self.problem = ''
+        self.refusal = ''
+        self.corrected_already = ''
+        self._heard = ''
+        self.awaited = ''
         announce(
             self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected']
         )
@@ -370,7 +368,8 @@ class CompensatorNode(Node):
 
     def _change_compensation(self, settings: CompensatorSettings) -> None:
         """Apply changed parameters; on an ImuCalibrationError all remain unchanged."""
-        old, insists = self.settings, settings.anyway and not self.settings.anyway
+        old = self.settings
+        insists = settings.anyway and not self.settings.anyway
         if settings.calibration_file and insists and not settings.takes_topic:
             self._load_file(settings)
         elif settings.takes_topic and self._heard and (insists or not old.takes_topic):

@@ -77,9 +77,13 @@ class DiagnosisThread:
     """
 
     def __init__(self, period: float):
-        self.period, self._pacer, self._ending = period, SolvePacer(MAX_DIAGNOSIS_SHARE), False
+        self.period = period
+        self._pacer = SolvePacer(MAX_DIAGNOSIS_SHARE)
+        self._ending = False
         self._thread: threading.Thread | None = None
-        self._next, self._wanted, self._urgent = time.monotonic() + period, False, False
+        self._next = time.monotonic() + period
+        self._wanted = False
+        self._urgent = False
         self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
         self._answered: dict | None = (

@@ -116,14 +116,15 @@ class MatchedInput:
         raw: bool = True,
         latched: bool = False,
     ):
-        self.node, self.message_type, self.topic, self.single = node, message_type, topic, single
-        self._callback, self._depth, self._group, self._raw, self._latched = (
-            callback,
-            depth,
-            group,
-            raw,
-            latched,
-        )
+        self.node = node
+        self.message_type = message_type
+        self.topic = topic
+        self.single = single
+        self._callback = callback
+        self._depth = depth
+        self._group = group
+        self._raw = raw
+        self._latched = latched
         self.type_name = '{}/msg/{}'.format(
             message_type.__module__.partition('.')[0], message_type.__name__
         )
@@ -154,7 +155,8 @@ class MatchedInput:
 
     def look(self) -> None:
         """Record the publishers, and subscribe again when they require another reliability."""
-        several, known = self.mixed, self.node.get_publishers_info_by_topic(self.topic_name)
+        several = self.mixed
+        known = self.node.get_publishers_info_by_topic(self.topic_name)
         self.publishers = [found for found in known if found.topic_type == self.type_name]
         self.others = [found for found in known if found.topic_type != self.type_name]
         reliable = self._latched or all(

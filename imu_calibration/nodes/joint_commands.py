@@ -87,12 +87,10 @@ class ActionCommand:
     def __init__(
         self, node: Node, action_type: Any, client: Any, *, refused: Callable[[str], None]
     ):
-        self._topic, self._action, self._client, self._refused = (
-            TopicCommand(node),
-            action_type,
-            client,
-            refused,
-        )
+        self._topic = TopicCommand(node)
+        self._action = action_type
+        self._client = client
+        self._refused = refused
         self._handle: Any = None
         self._number = 0
         self.name = self.action_name = 'follow_joint_trajectory'
@@ -231,7 +229,8 @@ class OtherDrivers:
 
     def found(self) -> str:
         """Return a line that names the other driver, '' for none."""
-        topic, own = self._command.topic_name, self._node.get_fully_qualified_name()
+        topic = self._command.topic_name
+        own = self._node.get_fully_qualified_name()
         names = sorted(map(node_of, self._node.get_publishers_info_by_topic(topic)))
         if own in names:
             names.remove(own)

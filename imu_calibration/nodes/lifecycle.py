@@ -153,7 +153,8 @@ def _watch(node: Node, group: _Group) -> None:
 
 
 def _set(groups: list[_Group], parameters: list) -> SetParametersResult:
-    new, hints = [group.settings for group in groups], {}
+    new = [group.settings for group in groups]
+    hints = {}
     try:
         for parameter in parameters:
             _change(new, parameter)
@@ -388,7 +389,9 @@ def run_node(
         return 1
     # rclpy's handlers, installed by init, end the wait and call these; without them Python would
     # also raise KeyboardInterrupt in mid-write.
-    asked_to_end, node, halts = [], None, hasattr(make_node, 'halt')
+    asked_to_end = []
+    node = None
+    halts = hasattr(make_node, 'halt')
 
     def asked(number, _):
         asked_to_end.append(number)

@@ -61,11 +61,14 @@ class LiveCompensation(SampleCompensation):
         super().__init__(calibration, transfer, with_parameters)
         self.watch, self.gate = watch, gate
         self.readings, self._convert = readings, not readings.is_si
-        self.frame_id, self.received = calibration.frame_id if check_frame else '', 0
+        self.frame_id = calibration.frame_id if check_frame else ''
+        self.received = 0
         self._message = ImuStream(
             None if transfer is None else transfer.frame_id, late_ns(calibration, correct_stamps)
         )
-        self._taken, self._rate_cov, self._force_cov = -1, b'', b''
+        self._taken = -1
+        self._rate_cov = b''
+        self._force_cov = b''
         self._no_rate = self._no_force = self._absent = self._odd = False
         self._orientation_in: bytes | None = None
         self._orientation_out, self._no_orientation = b'', False
@@ -198,10 +201,8 @@ class LiveCompensation(SampleCompensation):
         The true value is not known better.
         """
         force_level, rate_level = self.levels
-        rate, force = (
-            max(map(abs, readings[:3])) >= rate_level,
-            max(map(abs, readings[3:])) >= force_level,
-        )
+        rate = max(map(abs, readings[:3])) >= rate_level
+        force = max(map(abs, readings[3:])) >= force_level
         if rate or force:
             self.counts['saturated'] += 1
         return self._mark(rate_level) if rate else self._rate_cov, self._mark(

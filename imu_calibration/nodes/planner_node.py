@@ -203,16 +203,17 @@ class PlannerNode(Node):
                 else None
             ),
         )
-        self._lock, self._stamp, self._status = threading.RLock(), 0.0, {}
+        self._lock = threading.RLock()
+        self._stamp = 0.0
+        self._status = {}
         self._newest: str | None = None
         self._n_documents = 0
         self._is_halted = False
-        self._complaints, self._heard = Complaints(self.get_logger()), threading.Condition()
+        self._complaints = Complaints(self.get_logger())
+        self._heard = threading.Condition()
         self._names = tuple(self._table.joint_names)
-        self.driver, self._is_placed = (
-            Driver(self._names, limits_of(self._table), driver_settings),
-            False,
-        )
+        self.driver = Driver(self._names, limits_of(self._table), driver_settings)
+        self._is_placed = False
         self._command = make_command(self, settings.command, self._refused)
         self._others = OtherDrivers(self, self._command)
         self.worker = PlannerWorker(
@@ -258,10 +259,8 @@ class PlannerNode(Node):
         ):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
         every(self, CLOCK_CHECK_SECONDS, self._guarded(self._tick))
-        self._coverage, self._driven = (
-            self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()),
-            None,
-        )
+        self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
+        self._driven = None
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
         self.get_logger().info(
@@ -427,7 +426,8 @@ class PlannerNode(Node):
 
     def _ask(self, what: str) -> Trigger.Response | None:
         """Call a service of the calibration node from the worker's thread."""
-        future, done = self._calibrator[what].call_async(Trigger.Request()), threading.Event()
+        future = self._calibrator[what].call_async(Trigger.Request())
+        done = threading.Event()
         future.add_done_callback(lambda _: done.set())
         return future.result() if done.wait(ANSWER_PATIENCE) else None
 
@@ -499,10 +499,8 @@ class PlannerNode(Node):
                 ),
             )
         if not self._is_placed:
-            limits, reach = (
-                self.driver.limits.wound(self.driver.position, self.settings.max_turns),
-                self.settings.reach_deg,
-            )
+            limits = self.driver.limits.wound(self.driver.position, self.settings.max_turns)
+            reach = self.settings.reach_deg
             self.driver.limits, self._is_placed = (
                 limits.reached(self.driver.position, reach) if reach else limits,
                 True,
@@ -546,7 +544,9 @@ class PlannerNode(Node):
         # Again, because calibration_node's markers begin with DELETEALL.
         if self._driven is not None:
             self._coverage.publish(self._driven)
-        driver, worker, campaign = self.driver, self.worker, self.worker.campaign
+        driver = self.driver
+        worker = self.worker
+        campaign = self.worker.campaign
         name, excess = worker.worst
         values = {
             'state': driver.state.value,

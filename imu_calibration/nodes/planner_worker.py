@@ -73,12 +73,10 @@ class PlannerWorker(threading.Thread):
         self, driver: Driver, make_campaign: Callable[[], Campaign], *, peers: Peers, lock: Any
     ):
         super().__init__(name='planner', daemon=True)
-        self.driver, self._make_campaign, self._peers, self._lock = (
-            driver,
-            make_campaign,
-            peers,
-            lock,
-        )
+        self.driver = driver
+        self._make_campaign = make_campaign
+        self._peers = peers
+        self._lock = lock
         self.campaign: Campaign | None = None
         self.doing = Activity.NONE
         self.motion: Any = None
@@ -88,7 +86,9 @@ class PlannerWorker(threading.Thread):
         self.worst: tuple[str, float] = ('', 0.0)
         self.outside = 0
         """Parameters outside their tolerance."""
-        self._wanted, self._wake, self._ending = 0, threading.Event(), False
+        self._wanted = 0
+        self._wake = threading.Event()
+        self._ending = False
         self._began: float | None = None
         self.stamp: Callable[[], float] = time.monotonic
         """Seconds by which the time limit counts."""

@@ -85,13 +85,11 @@ class Playback(threading.Thread):
         ends_node: bool = True,
     ):
         super().__init__(name='playback', daemon=True)
-        self._node, self._publishers, self._batches, self._pace, self._awaited = (
-            node,
-            publishers,
-            batches,
-            pace,
-            awaited,
-        )
+        self._node = node
+        self._publishers = publishers
+        self._batches = batches
+        self._pace = pace
+        self._awaited = awaited
         self._end_text, self._ends_node = ended, ends_node
         self._clock_start_ns, self._next_clock = clock_start_ns, 0.0
         self._clock = (
@@ -100,7 +98,9 @@ class Playback(threading.Thread):
             else None
         )
         self._ending = threading.Event()
-        self._n_published, self._is_over, self.failed = 0, False, False
+        self._n_published = 0
+        self._is_over = False
+        self.failed = False
 
     def end(self) -> str:
         """Stop as soon as possible; return the outcome, '' when all messages were published."""
@@ -151,7 +151,8 @@ class Playback(threading.Thread):
     def _publish(self, batch, start):
         done = 0
         while done < len(batch.messages) and not self._ending.is_set():
-            upto, now = len(batch.messages), batch.until
+            upto = len(batch.messages)
+            now = batch.until
             if self._pace.factor:
                 now = (time.monotonic() - start) * self._pace.factor
                 upto = int(np.searchsorted(batch.time, now, side='right'))

@@ -45,7 +45,8 @@ class StaticFrames:
     def __init__(self, node: Node, changed: Callable[[], None]):
         self._node, self._changed = node, changed
         self._subscription: Any = None
-        self.transforms, self.n_unusable = StaticTransforms(), 0
+        self.transforms = StaticTransforms()
+        self.n_unusable = 0
 
     def pose(self, target: str, source: str) -> Any:
         """

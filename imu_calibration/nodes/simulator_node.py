@@ -315,7 +315,8 @@ class SimulatorNode(Node):
 
     def _batches(self):
         """Yield Batch after Batch; a received trajectory starts between two of them."""
-        until, step = 0.0, STRETCH_SECONDS * max(self.settings.time_factor, 1.0)
+        until = 0.0
+        step = STRETCH_SECONDS * max(self.settings.time_factor, 1.0)
         while until < self._motion.end or not self.settings.stop_at_end:
             while not self._trajectories.empty():
                 self._take_over(until, self._trajectories.get())

@@ -120,7 +120,8 @@ def suspected(
     coordinates = problem.coordinates
     found = []
     for key in causes:
-        places, names = _indices(coordinates.model, key), coordinates.model.param_names
+        places = _indices(coordinates.model, key)
+        names = coordinates.model.param_names
         known = (
             coordinates.values[places]
             if not found
@@ -145,7 +146,8 @@ def _imitating(problem, causes, unknown, table):
     information = problem.coordinates.prior_information + exact_information(
         windows, times, problem.noise
     )
-    first, found = causes[0], {}
+    first = causes[0]
+    found = {}
     rest = np.setdiff1d(
         np.arange(len(information)), np.concatenate([cause.places for cause in causes])
     )
@@ -249,12 +251,10 @@ class Campaign:
         first: Callable[[np.ndarray], Any] = lambda position: None,
         unwind: Callable[[np.ndarray], Any] = lambda position: None,
     ):
-        self.planner, self.settings, self._make_separator, self._unwind = (
-            planner,
-            settings,
-            make_separator,
-            unwind,
-        )
+        self.planner = planner
+        self.settings = settings
+        self._make_separator = make_separator
+        self._unwind = unwind
         self._first: Callable[[np.ndarray], Any] | None = first
         self._separator: Planner | None = None
         self.findings: list[Suspect] | None = None
@@ -464,7 +464,8 @@ def with_suspect(
     values = model.start_from(calibration.model, calibration.values)
     values[model.slices[cause]] = [sizes.get(name, 0.0) for name in effect.param_names()]
     places = [model.param_names.index(name) for name in calibration.param_names]
-    covariance, status = np.diag(model.prior()[1] ** 2), [HELD] * len(values)
+    covariance = np.diag(model.prior()[1] ** 2)
+    status = [HELD] * len(values)
     covariance[np.ix_(places, places)] = calibration.covariance
     for place, known in zip(places, calibration.status, strict=True):
         status[place] = known

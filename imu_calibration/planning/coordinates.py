@@ -45,7 +45,8 @@ class Coordinates:
     ):
         start = model.start() if values is None else np.asarray(values, float)
         self.values = np.where(np.isfinite(start), start, 0.0)
-        self.model, self.tolerances = model.at(self.values), np.asarray(tolerances, float)
+        self.model = model.at(self.values)
+        self.tolerances = np.asarray(tolerances, float)
         # At a fixed point the derivative of a lag needs no columns for each arm: a third of the
         # columns of an arm with seven joints.
         self.folded = replace(self.model, folded_arms=all_arms(self.model, self.values))
@@ -215,7 +216,8 @@ class ToldApart:
     """
 
     def __init__(self, coordinates: Coordinates, causes: Sequence[CollinearEffect], questions: int):
-        self.coordinates, self.causes = coordinates, tuple(causes)
+        self.coordinates = coordinates
+        self.causes = tuple(causes)
         self.pairs = list(permutations(self.causes, 2))
         self.words = ' and '.join(cause.key[1] for cause in causes)
         self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}

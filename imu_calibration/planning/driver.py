@@ -140,14 +140,19 @@ class Driver:
         limits: MotionLimits,
         settings: DriverSettings = DriverSettings(),
     ):
-        self.joint_names, self.limits = tuple(joint_names), limits
+        self.joint_names = tuple(joint_names)
+        self.limits = limits
         self.change(settings)
-        self.state, self.reason, self.motions = DriveState.IDLE, 'no motion before start', 0
+        self.state = DriveState.IDLE
+        self.reason = 'no motion before start'
+        self.motions = 0
         self.position: np.ndarray | None = None
         """Where the joints were seen last."""
         self.ignored: dict[str, int] = {}
         """Joint -> number of joint states that were ignored because its position was not finite."""
-        self._time, self._heard, self._advanced = 0.0, -np.inf, -np.inf
+        self._time = 0.0
+        self._heard = -np.inf
+        self._advanced = -np.inf
         self._watch: PathWatch | None = None
         self._rested_at: np.ndarray | None = None
         self._rested_since = self._settling_since = 0.0

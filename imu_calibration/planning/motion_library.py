@@ -129,7 +129,8 @@ def trajectory(joint_names: tuple[str, ...], segments: tuple[Segment, ...]) -> T
         ]
     )
     motion = motion_at(segments, times)
-    rate, acceleration = motion.rate.copy(), motion.acceleration.copy()
+    rate = motion.rate.copy()
+    acceleration = motion.acceleration.copy()
     rate[-1], acceleration[-1] = 0.0, 0.0
     return TrajectoryPoints(joint_names, times, motion.position, rate, acceleration)
 
@@ -229,7 +230,8 @@ def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
     features = np.concatenate(
         [mats[:, :, 2], HEADING * mats[:, :, 0], HEADING * mats[:, :, 1]], axis=1
     )
-    chosen, distance = [0], np.linalg.norm(features - features[0], axis=1)
+    chosen = [0]
+    distance = np.linalg.norm(features - features[0], axis=1)
     while len(chosen) < REST_PLACES and distance.max() > 0.05:
         nearly = distance > distance.max() - 1e-6
         chosen.append(int(np.argmax(nearly)))
@@ -274,7 +276,8 @@ class MotionLibrary:
     """
 
     def __init__(self, table: Table, limits: MotionLimits | None = None):
-        self.table, limits = table, limits or limits_of(table)
+        self.table = table
+        limits = limits or limits_of(table)
         self.limits = MotionLimits(
             limits.lower,
             limits.upper,
@@ -394,7 +397,8 @@ class MotionLibrary:
         None if that is too short for a window.
         """
         joint = int(np.argmax(np.abs(rates)))
-        lower, upper = self.limits.lower[joint], self.limits.upper[joint]
+        lower = self.limits.lower[joint]
+        upper = self.limits.upper[joint]
         start = place.copy()
         start[joint] = lower + 0.02 * (upper - lower)
         there = np.stack([rates, -rates])

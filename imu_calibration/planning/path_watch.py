@@ -59,14 +59,16 @@ class PathWatch:
         count = max(int(np.ceil(points.duration / PATH_STEP_SECONDS)), 1)
         self._time = np.linspace(0.0, points.duration, count + 1)
         motion = path.at(self._time)
-        self._path, self.tolerance = motion.position / tolerance, np.asarray(tolerance, float)
+        self._path = motion.position / tolerance
+        self.tolerance = np.asarray(tolerance, float)
         # The rate of the spline may vanish where an oscillation reverses: rest means no motion over
         # several steps.
         moved = np.max(np.abs(np.diff(self._path, axis=0, prepend=self._path[:1])), axis=1)
         self._rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
         edge = np.append(np.flatnonzero(~self._rests), len(self._time) - 1)
         self._rest_end = edge[np.searchsorted(edge, np.arange(len(self._time)))]
-        self._at, self._start = 0, np.asarray(start, float) / tolerance
+        self._at = 0
+        self._start = np.asarray(start, float) / tolerance
         self._last: float | None = None
         self._now = self._further = 0.0
         self._came = self._took = self._remainder = 0.0
@@ -159,7 +161,8 @@ class PathWatch:
 
         Before this point after a deviation, after it in a stall.
         """
-        near, place = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1, self._recent[-1][1]
+        near = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1
+        place = self._recent[-1][1]
         if self.has_strayed:
             wanted = np.ptp(self._path[max(self._at - near, 0) : self._at + 1], axis=0)
         # Distance to the following path: of joints with equal motion, a joint that has arrived is

@@ -116,7 +116,12 @@ def greedy(
         Time at most, s.
 
     """
-    posterior, place, chosen, spent, margin, factor = problem.posterior(), start, [], 0.0, 1.0, 0.0
+    posterior = problem.posterior()
+    place = start
+    chosen = []
+    spent = 0.0
+    margin = 1.0
+    factor = 0.0
     taken: list[tuple[np.ndarray, float]] = []
     beginning = problem.goal.left(posterior.known[None])[0]
     while len(chosen) < MAX_PLAN_MOTIONS and spent < longest:
@@ -162,7 +167,8 @@ def shortened_plan(
 
     Motions are left out, latest first and none of the first `fixed`.
     """
-    best, goal = list(sequence), remaining(problem, sequence, start) + 1e-9
+    best = list(sequence)
+    goal = remaining(problem, sequence, start) + 1e-9
     for place in range(len(best) - 1, fixed - 1, -1):
         trial = best[:place] + best[place + 1 :]
         if remaining(problem, trial, start) <= goal:
@@ -280,7 +286,8 @@ class Planner:
     """
 
     def __init__(self, problem: PlanningProblem):
-        self.problem, self._posterior = problem, problem.posterior()
+        self.problem = problem
+        self._posterior = problem.posterior()
         self._visited: set[int] = set()
         self._first: list[int] | None = None if problem.known is None else []
 
@@ -316,7 +323,8 @@ class Planner:
             self._first = [] if self.problem.known is not None else self.problem.first_rests(place)
         if not self._first and not self.problem.goal.left(self._posterior.known[None])[0] > 0:
             return Decision(why=STUCK if missing else GOAL_REACHED)
-        choice, must = CandidateMotions(self.problem, self._posterior, place), bool(self._first)
+        choice = CandidateMotions(self.problem, self._posterior, place)
+        must = bool(self._first)
         number = self._first.pop(0) if must else choice.best
         if not must and self._visited and choice.hopeless(number):
             return Decision(why=STUCK)
@@ -363,7 +371,8 @@ class Planner:
         The joints have restricted turns. The result is None within half a turn.
         """
         library = self.problem.library
-        limits, declared = library.limits, limits_of(library.table).endless
+        limits = library.limits
+        declared = limits_of(library.table).endless
         middle = np.where(declared & ~limits.endless, 0.5 * (limits.lower + limits.upper), position)
         far = np.abs(position - middle) > np.pi
         if not np.any(far):
@@ -386,7 +395,8 @@ class Planner:
         first = () if problem.known is not None else problem.first_rests(place)
         self.within(longest)
         sequence = self._sequence(place, first, longest)
-        bound, goal = float('nan'), problem.goal
+        bound = float('nan')
+        goal = problem.goal
         if with_bound and isinstance(goal, WithinTolerances):
             windows, _, seconds = problem.timed(sequence, place)
             factor = problem.variance_factor(windows)
@@ -400,10 +410,8 @@ class Planner:
                 problem.goal = goal
                 windows, _, less = problem.timed(other, place)
                 if less < seconds and remaining(problem, other, place) == 0.0:
-                    sequence, bound = (
-                        other,
-                        problem.lower_bound(factor=problem.variance_factor(windows)),
-                    )
+                    sequence = other
+                    bound = problem.lower_bound(factor=problem.variance_factor(windows))
         return self._plan_of(sequence, start, place, bound)
 
     def _sequence(self, place, first, longest):
@@ -444,7 +452,8 @@ class Planner:
 
     def _named(self, number: int) -> PlannedMotion:
         """Return a motion of the repertoire; a rest where there was one already is a return."""
-        motion, place = self.problem.motions[number], int(self.problem.library.place_of[number])
+        motion = self.problem.motions[number]
+        place = int(self.problem.library.place_of[number])
         if motion.kind is MotionKind.POSE:
             motion = replace(motion, kind=MotionKind.RETURN) if place in self._visited else motion
             self._visited.add(place)

@@ -73,7 +73,10 @@ class PlanningProblem:
         *,
         rate: float = 100.0,
     ):
-        self.library, self.coordinates, self.noise, self.rate = library, coordinates, noise, rate
+        self.library = library
+        self.coordinates = coordinates
+        self.noise = noise
+        self.rate = rate
         self.known: np.ndarray | None = None
         """Information about z of an earlier calibration, in addition to the prior."""
         self.goal: Goal = WithinTolerances(coordinates)
@@ -300,7 +303,9 @@ class PlanningProblem:
         With P and P' the prior variances of the bias and of b, ``var(bias) = (1 / P + 1 / (P' -
         P))^-1 + (P / P')^2 var(b)``.
         """
-        prior, asked, model = prior.copy(), asked.copy(), self.coordinates.model
+        prior = prior.copy()
+        asked = asked.copy()
+        model = self.coordinates.model
         for sensor in SENSORS:
             for parameter in range(
                 *model.part(sensor, Role.OFFSET).indices(len(model.param_names))
@@ -328,7 +333,10 @@ class PlanningProblem:
 
         With the ways between them.
         """
-        windows, times, now, place = [], [], 0.0, start
+        windows = []
+        times = []
+        now = 0.0
+        place = start
         for number in sequence:
             target = int(self.library.place_of[number])
             way = (self.way_windows[place, target], self.way_seconds[place, target])

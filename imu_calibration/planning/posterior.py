@@ -204,7 +204,10 @@ class WindowPredictor:
     def __init__(
         self, table: Table, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float
     ):
-        self.table, self.coordinates, self.noise, self.rate = table, coordinates, noise, rate
+        self.table = table
+        self.coordinates = coordinates
+        self.noise = noise
+        self.rate = rate
 
     def predict(self, motions: Sequence[tuple[Segment, ...]]) -> list[list[PlannedWindow]]:
         """Return the windows of each of several motions, a tuple of segments each."""
@@ -289,7 +292,8 @@ class WindowPredictor:
             )
             # Without the copy numpy multiplies reversed rows without BLAS.
             rows = np.concatenate([turned.T @ early[::-1].copy(), centre, turned.T @ late])
-            ones, rows = rows[:, 0], rows[:, 1:]
+            ones = rows[:, 0]
+            rows = rows[:, 1:]
             for axis in range(3):
                 weight = 1 / (noise.low_variance[axis] * count / samples + wander)
                 variance[sensor][axis] = 1 / (weight @ ones**2)
@@ -498,7 +502,8 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
     best = white / seconds
     for chosen in noise.bias_processes:
         k = np.sqrt(1 / chosen.time**2 + 2 * chosen.sd**2 / (chosen.time * white))
-        level, steep = 1 / (chosen.time * k) ** 2, np.tanh(k * seconds / 2)
+        level = 1 / (chosen.time * k) ** 2
+        steep = np.tanh(k * seconds / 2)
         information = (
             level * seconds + 2 * (1 - level) * steep / (k * (1 + k * chosen.time * steep))
         ) / white

@@ -369,7 +369,8 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """IMU and joints are stamped by one clock."""
     if not {'imu', 'joints'} <= evidence.streams.keys():
         return
-    imu, joints = evidence.streams['imu'], evidence.streams['joints']
+    imu = evidence.streams['imu']
+    joints = evidence.streams['joints']
     if any('clock reset' in stream.dropped for stream in (imu, joints)):
         return
     overlap = (min(imu.last_ns, joints.last_ns) - max(imu.first_ns, joints.first_ns)) * 1e-9

@@ -125,7 +125,9 @@ class Extremes:
     """The largest distinct values of one signal with their counts, in bounded memory."""
 
     def __init__(self) -> None:
-        self.level, self.count, self.n_jumps = -np.inf, 0, 0
+        self.level = -np.inf
+        self.count = 0
+        self.n_jumps = 0
         self._below, self._last = {}, np.inf
 
     def push(self, values: np.ndarray) -> None:
@@ -247,7 +249,8 @@ def relate_turns(chunks: Chunks) -> Turning | None:
         return None
     kept = spread > 1e-3 * spread.max()
     while kept.any():
-        seen, scale = directions[:, kept], spread[kept]
+        seen = directions[:, kept]
+        scale = spread[kept]
         matrix, sure, explained = _fit(direction, change, turn_time, rate @ seen / scale)
         if explained < LEAST_EXPLAINED:
             return None

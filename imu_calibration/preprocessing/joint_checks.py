@@ -91,7 +91,8 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     repeated = []
     for window, flags, turns, rate in zip(windows, same, turning, expected):
         for start, stop in runs_of(flags):
-            first, last = float(window.time[start]), float(window.time[stop - 1])
+            first = float(window.time[start])
+            last = float(window.time[stop - 1])
             if last - first < LASTING or turns[start:stop].mean() <= 0.5:
                 continue
             if not _rounded(window.rate_s[start], rate[start:stop], bias, step):
@@ -170,10 +171,8 @@ def _frozen(window, table, expected, *, joint):
     for start, stop in runs_of(np.abs(window.motion.rate[:, joint]) < MAX_REPEATED_RATE):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
-        motion, rest = (
-            window.motion.select(slice(start, stop)),
-            (window.rate_s - expected)[start:stop],
-        )
+        motion = window.motion.select(slice(start, stop))
+        rest = (window.rate_s - expected)[start:stop]
         faster = motion.rate.copy()
         faster[:, joint] += 1.0
         plain, changed = (
@@ -185,7 +184,8 @@ def _frozen(window, table, expected, *, joint):
         # A late clock turns the rates of the other joints about this axis too.
         lag = (rest * slope).sum() / max((slope**2).sum(), 1e-300)
         rest = rest - lag * slope
-        along, measured = (rest * axis).sum(axis=1), (window.rate_s[start:stop] * axis).sum(axis=1)
+        along = (rest * axis).sum(axis=1)
+        measured = (window.rate_s[start:stop] * axis).sum(axis=1)
         square = float(along @ along)
         if (
             square > len(along) * MIN_TURN_RATE**2

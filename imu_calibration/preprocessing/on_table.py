@@ -176,10 +176,8 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
         return None
     time = np.concatenate([window.time for window in windows])
     every = slice(None, None, max(1, len(time) // MAX_TESTED_SAMPLES))
-    time, motion = (
-        time[every],
-        JointMotion.concatenate(window.motion for window in windows).select(every),
-    )
+    time = time[every]
+    motion = JointMotion.concatenate(window.motion for window in windows).select(every)
     measured = np.concatenate([np.hstack([window.rate_s, window.force_s]) for window in windows])[
         every
     ]
@@ -217,7 +215,8 @@ def _best(measured, motion, table):
     The result is ((order, signs), matrix of the axes, that of the best candidate without joints,
     share explained) of the best candidate.
     """
-    candidates, axes = _candidates(motion.position.shape[1]), signed_permutations()
+    candidates = _candidates(motion.position.shape[1])
+    axes = signed_permutations()
     shares = np.empty((2, len(candidates), len(axes)))
     for k, (order, signs) in enumerate(candidates):
         parts = (
@@ -328,21 +327,18 @@ def same_motion(moments: tuple, windows: list[Window], table: Table) -> CheckFin
     # Other checks report units, signs and axes.
     if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:
         return a_period_late(windows, table) if explained < 1.0 - SHARE_TIE else None
-    key, cause = (
-        'imu_topic',
-        'this IMU does not turn when the table does; give the topic of the IMU on the table',
-    )
+    key = 'imu_topic'
+    cause = 'this IMU does not turn when the table does; give the topic of the IMU on the table'
     if np.trace(measured) > MIN_RATE_GAIN * np.trace(reference):
-        cause, key = _cause(windows, table), None
+        cause = _cause(windows, table)
+        key = None
     elif gain > MIN_RATE_GAIN:
         return None
     if not cause:
-        key, cause = (
-            'imu_topic',
-            (
-                'its motion is not that of the table; give the topic of the IMU on the table, and'
-                ' check the names of the joints and both clocks'
-            ),
+        key = 'imu_topic'
+        cause = (
+            'its motion is not that of the table; give the topic of the IMU on the table, and'
+            ' check the names of the joints and both clocks'
         )
     return CheckFinding(
         'on_table',
@@ -482,7 +478,8 @@ def _best_shift(windows: Sequence[Window], table: Table) -> _Shift:
     if not windows:
         return _Shift(0.0, 0.0, 0.0, False)
     period = float(np.median([window.period for window in windows]))
-    start, end = windows[0].time[0], windows[-1].time[-1]
+    start = windows[0].time[0]
+    end = windows[-1].time[-1]
     measured, reference = np.zeros((2, int((end - start) / period) + 2, 3))
     inside = np.zeros((len(measured), 1))
     bias = np.median(np.concatenate([window.rate_s for window in windows]), axis=0)
@@ -512,7 +509,8 @@ def _best_shift(windows: Sequence[Window], table: Table) -> _Shift:
     shares = np.where(
         paired, products * np.abs(products) / np.maximum(np.prod(energies, axis=0), 1e-300), 0.0
     )
-    middle, lag = RESOLVED * most, int(RESOLVED * LEAST_SHIFT / period)
+    middle = RESOLVED * most
+    lag = int(RESOLVED * LEAST_SHIFT / period)
     near = np.abs(shares[middle - lag : middle + lag + 1])
     place = int(np.argmax(near)) + middle - lag
     # The nearest peak to zero delay among those within SHARE_TIE of the highest: periodic motion

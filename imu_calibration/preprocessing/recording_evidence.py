@@ -148,10 +148,8 @@ class EvidenceGatherer:
 
     def __init__(self, gravity: float):
         self.gravity = gravity
-        self._chunks, self._ends = (
-            scan.ChunkSeries(),
-            tuple((Extremes(), Extremes()) for _ in range(6)),
-        )
+        self._chunks = scan.ChunkSeries()
+        self._ends = tuple((Extremes(), Extremes()) for _ in range(6))
         self._resolution = scan.ResolutionSearch()
         self._joints = scan.StandingJoints()
         self._temperature_c: tuple[float, float] | None = None
@@ -175,7 +173,8 @@ class EvidenceGatherer:
     ) -> RecordingEvidence:
         """Return the RecordingEvidence, with the StreamStatistics of each stream."""
         streams = {name: found for name, found in statistics.items() if found.count}
-        chunks, series = self._chunks.chunks(), self._chunks
+        chunks = self._chunks.chunks()
+        series = self._chunks
         resolution = self._resolution.result()
         return RecordingEvidence(
             streams,

@@ -129,7 +129,8 @@ def _steady(cells, *, ratio, resting):
     from scipy.ndimage import minimum_filter1d  # here, because its import is slow
 
     width = cells.width(SPANS[0])
-    variance, at_rest = cells.variance(width), _free_of(~cells.all_of(resting), width)
+    variance = cells.variance(width)
+    at_rest = _free_of(~cells.all_of(resting), width)
     around = 2 * int(round(cells.cells_in(STEADY_SECONDS))) + 1
     least = minimum_filter1d(
         np.where(at_rest[:, None], variance, np.inf), around, axis=0, mode='nearest'
@@ -176,7 +177,8 @@ def quiet_samples(
 
     """
     at_rest = None if resting is None else cells.all_of(resting)
-    quiet, shorter = np.ones(len(cells.edges) - 1, bool), np.full(2, np.inf)
+    quiet = np.ones(len(cells.edges) - 1, bool)
+    shorter = np.full(2, np.inf)
     for span in spans:
         width = cells.width(min(span, longest))
         variance = cells.variance(width)
@@ -240,14 +242,16 @@ class Cells:
 
     def __init__(self, force_s: np.ndarray, rate_s: np.ndarray, period: float):
         n = len(force_s)
-        self._period, self._size = period, max(1, min(int(_GRID / period), n))
+        self._period = period
+        self._size = max(1, min(int(_GRID / period), n))
         # The last cell has the remainder.
         self.edges = np.append(np.arange(0, n - self._size + 1, self._size), n)
         self.least = np.array([least_variance(values) for values in (force_s, rate_s)])
         """Of force and rate."""
         self._sums = []
         for values in (force_s, rate_s):
-            sums, squares = [], np.zeros(len(self.edges) - 1)
+            sums = []
+            squares = np.zeros(len(self.edges) - 1)
             for axis in values.T:  # one at a time: a long recording is large
                 centred = axis - axis.mean()
                 sums.append(np.add.reduceat(centred, self.edges[:-1]))
@@ -271,9 +275,11 @@ class Cells:
 
         Shape (n_spans, 2).
         """
-        count, variances = self.edges[width:] - self.edges[:-width], []
+        count = self.edges[width:] - self.edges[:-width]
+        variances = []
         for sums, squares in self._sums:
-            total, square = sums[:, width:] - sums[:, :-width], squares[width:] - squares[:-width]
+            total = sums[:, width:] - sums[:, :-width]
+            square = squares[width:] - squares[:-width]
             variances.append(
                 np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0)
                 / np.maximum(count - 1, 1)
@@ -428,7 +434,8 @@ def _at_one_rate(rate, found, period, shortest):
     least = np.maximum(
         noise, 1e-3 * _farthest(rate, np.array([np.median(axis) for axis in rate.T]))
     )
-    width, parts = max(10, int(round(_STEP_SPAN / period))), []
+    width = max(10, int(round(_STEP_SPAN / period)))
+    parts = []
     for piece in found:
         count = (piece.stop - piece.start) // width
         means = (
@@ -473,7 +480,9 @@ def _trimmed(imu, found, period, shortest):
         )
         for k, (piece, middle, centre) in enumerate(zip(slow, middles, centres)):
             off = np.sum((piece - centre) ** 2, axis=1) > 3 * _LEAVES**2 * spread[k]
-            before, after, start = off[: middle.start], off[middle.stop :], first[k]
+            before = off[: middle.start]
+            after = off[middle.stop :]
+            start = first[k]
             last[k] = start + middle.stop + int(np.argmax(after)) if after.any() else last[k]
             first[k] = (
                 start + middle.start - int(np.argmax(before[::-1])) if before.any() else start

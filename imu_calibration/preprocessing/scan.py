@@ -80,10 +80,8 @@ class ChunkSeries:
         """
         self._count_changes(columns)
         if self._rest is not None:
-            stamp_ns, columns = (
-                np.concatenate([self._rest[0], stamp_ns]),
-                np.concatenate([self._rest[1], columns], axis=1),
-            )
+            stamp_ns = np.concatenate([self._rest[0], stamp_ns])
+            columns = np.concatenate([self._rest[1], columns], axis=1)
         self._rest = (stamp_ns, columns)
         if self.size is None and len(stamp_ns) >= FIRST:
             self.size = _size(stamp_ns, self._chunk_time)

@@ -135,7 +135,8 @@ class OtherSensor:
 def finite_stream(stamp_ns: np.ndarray, values: np.ndarray) -> SensorStream:
     """Return the finite readings with increasing stamps of one sensor."""
     known = np.isfinite(values).all(axis=1)
-    stamp_ns, values = stamp_ns[known], values[known]
+    stamp_ns = stamp_ns[known]
+    values = values[known]
     newest = np.maximum.accumulate(stamp_ns)
     advances = np.append(True, stamp_ns[1:] > newest[:-1])[: len(stamp_ns)]
     return SensorStream(stamp_ns[advances], values[advances])
@@ -188,7 +189,8 @@ def interpolated(stream: SensorStream, stamp_ns: np.ndarray) -> tuple[np.ndarray
     after = np.searchsorted(stream.stamp_ns, stamp_ns)
     inside = (stamp_ns >= stream.stamp_ns[0]) & (stamp_ns <= stream.stamp_ns[-1])
     after = np.clip(after, 1, n - 1)
-    first, last = stream.stamp_ns[after - 1], stream.stamp_ns[after]
+    first = stream.stamp_ns[after - 1]
+    last = stream.stamp_ns[after]
     step = last - first
     share = ((stamp_ns - first) / step)[:, None]
     values = (1.0 - share) * stream.values[after - 1] + share * stream.values[after]
@@ -294,7 +296,9 @@ class _DelayCost:
         middle: np.ndarray,
         change: np.ndarray,
     ):
-        self._time, self._start, self._stop = time, start, stop
+        self._time = time
+        self._start = start
+        self._stop = stop
         steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
         self._theta = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         lever = skew(middle)
@@ -418,8 +422,13 @@ def _windows(accelerometer):
     if not usual > 0.0 or len(time) < 4 * half:
         return None
     direction = unit_rows(np.where((length > 0.1 * usual)[:, None], accelerometer.values, 1.0))
-    start, middle = np.arange(0, len(time) - 2 * half, half), half
-    begin, centre, end = start, start + middle, start + 2 * half
+    start = np.arange(0, len(time) - 2 * half, half)
+    middle = half
+    begin = start
+    centre = start + middle
+    end = start + 2 * half
     whole = time[end] - time[begin] < 2.0 * DELAY_WINDOW + 4e-9 * accelerometer.period_ns
-    begin, centre, end = begin[whole], centre[whole], end[whole]
+    begin = begin[whole]
+    centre = centre[whole]
+    end = end[whole]
     return time[begin], time[end], direction[centre], direction[end] - direction[begin]

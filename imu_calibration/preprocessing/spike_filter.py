@@ -93,7 +93,8 @@ class SpikeFilter:
         """Return the first `count` of the buffered samples, without spikes, in a list."""
         if not count:
             return []
-        samples, held = self._held.select(slice(0, count)), self._held.select(slice(count, None))
+        samples = self._held.select(slice(0, count))
+        held = self._held.select(slice(count, None))
         at = len(self._values) - len(self._held) + np.arange(count)
         spiky = self._spikes(at)
         self.dropped, self._held = self.dropped + int(np.count_nonzero(spiky)), held
@@ -122,7 +123,8 @@ class SpikeFilter:
         row, column = np.nonzero(second[at] > _CANDIDATE / LARGE * limit)
         if len(row):
             first = np.clip(at[row] - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
-            window, column = first[:, None] + np.arange(2 * SPIKE_REACH + 1), column[:, None]
+            window = first[:, None] + np.arange(2 * SPIKE_REACH + 1)
+            column = column[:, None]
             inner = np.clip(at[row], 2, len(values) - 3)
             knock = _knocked(values[inner[:, None] + [-2, -1, 1, 2]], limit[row]) & (
                 inner == at[row]
@@ -132,10 +134,8 @@ class SpikeFilter:
             shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
             limit = np.maximum(limit[row, column[:, 0]], shaking)
             first = np.clip(at[row] - SPIKE_NEIGHBOURS, 0, len(values) - 2 * SPIKE_NEIGHBOURS - 1)
-            around, place = (
-                values[first[:, None] + np.arange(2 * SPIKE_NEIGHBOURS + 1), column],
-                at[row] - first,
-            )
+            around = values[first[:, None] + np.arange(2 * SPIKE_NEIGHBOURS + 1), column]
+            place = at[row] - first
             spiky[
                 row[
                     ~knock
@@ -153,7 +153,8 @@ class SpikeFilter:
         start = self._n_noise * NOISE_SAMPLES - self._first
         count = (len(second) - 1 - start) // NOISE_SAMPLES if len(second) > NOISE_SAMPLES else 0
         if self._n_noise == 0 and count == 0:  # a stream that ended before
-            parts, values = second[None], self._values[None]
+            parts = second[None]
+            values = self._values[None]
         else:
             parts, values = (
                 rows[start : start + count * NOISE_SAMPLES].reshape(count, NOISE_SAMPLES, 6)
@@ -187,7 +188,8 @@ def _median(values):
 
     A sort of short columns is several times faster than the partition of `np.median`.
     """
-    ordered, count = np.sort(values, axis=1), values.shape[1]
+    ordered = np.sort(values, axis=1)
+    count = values.shape[1]
     return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
 
 
@@ -219,10 +221,8 @@ def _contradicted(around, place, limit):
     """
     a, b, x, c, d = around[:, SPIKE_NEIGHBOURS - 2 : SPIKE_NEIGHBOURS + 3].T
     predicted = (4 * (b + c) - (a + d)) / 6
-    off, apart = (
-        np.abs(x - predicted),
-        np.maximum(np.abs(2 * b - a - predicted), np.abs(2 * c - d - predicted)),
-    )
+    off = np.abs(x - predicted)
+    apart = np.maximum(np.abs(2 * b - a - predicted), np.abs(2 * c - d - predicted))
     # The prediction is as noisy as the reading.
     return (
         (place == SPIKE_NEIGHBOURS)
@@ -233,7 +233,8 @@ def _contradicted(around, place, limit):
 
 def _off_the_median(around, place, limit):
     """Compare with the median, which is robust to two further outliers."""
-    ordered, rows = np.sort(around, axis=1), np.arange(len(around))
+    ordered = np.sort(around, axis=1)
+    rows = np.arange(len(around))
     off = np.abs(around - ordered[:, [SPIKE_NEIGHBOURS]])
     own = off[rows, place]
     beside = off[rows[:, None], np.clip(place[:, None] + [-2, -1, 1, 2], 0, 2 * SPIKE_NEIGHBOURS)]

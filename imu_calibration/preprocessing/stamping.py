@@ -376,7 +376,8 @@ class CountedClock:
         self._margin = LOST_PERIOD_SHARE * line.period_ns + (
             0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns)
         )
-        self._raw, self._times = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
+        self._raw = np.zeros(0, np.int64)
+        self._times = [np.zeros(0, np.int64)]
         self._begin()
 
     def _begin(self) -> None:
@@ -536,12 +537,11 @@ class SampleTimes:
         """
         if self._pass(samples):
             return samples
-        samples, ready = self._without_repeated(samples), []
+        samples = self._without_repeated(samples)
+        ready = []
         while len(samples):
-            part, samples = (
-                samples.select(slice(0, CLOCK_BLOCK - self._unseen)),
-                samples.select(slice(CLOCK_BLOCK - self._unseen, None)),
-            )
+            part = samples.select(slice(0, CLOCK_BLOCK - self._unseen))
+            samples = samples.select(slice(CLOCK_BLOCK - self._unseen, None))
             self._unseen = (self._unseen + len(part)) % CLOCK_BLOCK
             self._history = np.concatenate([self._history, part.stamp_ns])[-STAMP_HISTORY:]
             ready += self._take(part)

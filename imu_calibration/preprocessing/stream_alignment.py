@@ -105,9 +105,14 @@ class MotionChunks:
     ):
         self.counts = Counter()
         self.time_origin = 0.0
-        self._settings, self._noise_rad, self._floors = settings, noise_rad, floors
-        self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
-        self._branch, self._vibration = ThermalBranch(), BandVariance()
+        self._settings = settings
+        self._noise_rad = noise_rad
+        self._floors = floors
+        self._imu = SampleBuffer()
+        self._joints = SampleBuffer()
+        self._temperature = SampleBuffer()
+        self._branch = ThermalBranch()
+        self._vibration = BandVariance()
         self._slope = TemperatureSlope()
         self.margin = max(settings.overlap, _LEAST_MARGIN)
         self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
@@ -376,7 +381,8 @@ class MotionChunks:
         readings = self._temperature.between(-NEVER, last_ns)
         if readings is None or not len(readings):
             return np.full((3, len(stamp_ns)), np.nan)
-        at, known = (stamp_ns - self._start_ns) / 1e9, (readings.stamp_ns - self._start_ns) / 1e9
+        at = (stamp_ns - self._start_ns) / 1e9
+        known = (readings.stamp_ns - self._start_ns) / 1e9
         series = (readings.temperature_c, readings.branch, readings.rate)
         return [np.interp(at, known, values) for values in series]
 

@@ -213,7 +213,8 @@ class StreamCheck:
         undecided = far[-1] if len(step) else True
         if undecided:
             self._held = samples.select(slice(len(samples) - 1, None))
-            samples, stray = samples.select(slice(0, len(samples) - 1)), stray[:-1]
+            samples = samples.select(slice(0, len(samples) - 1))
+            stray = stray[:-1]
         if len(samples):
             self._before_held = samples.stamp_ns[-1]
         self._count('stray stamp', np.count_nonzero(stray))
@@ -428,7 +429,8 @@ class StepHistogram:
         The median is exact to one per cent, and exactly when the steps are equal; all steps of a
         bin count alike.
         """
-        mean, total = self._sum_ns / np.maximum(self._number, 1), int(self._number.sum())
+        mean = self._sum_ns / np.maximum(self._number, 1)
+        total = int(self._number.sum())
         median = mean[np.searchsorted(np.cumsum(self._number), (total + 1) // 2)]
         longer = mean > max(gap * 1e9, 5 * median)
         irregular = self._number[np.abs(mean - median) > MAX_STEP_DEVIATION * median].sum() / max(
@@ -571,7 +573,9 @@ class BlockCleaner:
     ):
         self._without, self._n_imu = without, 0
         self._unusable = unusable
-        self._names, self._nominal, self._watchers = tuple(joint_names), nominal, watchers
+        self._names = tuple(joint_names)
+        self._nominal = nominal
+        self._watchers = watchers
         self._checks = {name: StreamCheck(one_sensor=one_sensor) for name in STREAMS}
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
         self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}

@@ -65,8 +65,11 @@ class StreamWatch:
         after = {'imu': SILENT_AFTER, 'joints': SILENT_AFTER, 'temperature': COLD_AFTER}
         self._needed = {name: after[name] for name, asked in wanted.items() if asked}
         self._count = dict.fromkeys(STREAMS, 0)
-        self._newest, self._arrived, self._period = {}, {}, {}
-        self._lost, self._recent = Counter(), Counter()
+        self._newest = {}
+        self._arrived = {}
+        self._period = {}
+        self._lost = Counter()
+        self._recent = Counter()
         self._lost_at: float | None = None
         self._apart_since: float | None = None
         self._unstamped_at: float | None = None
@@ -88,7 +91,8 @@ class StreamWatch:
             samples = getattr(block, name)
             if samples is None or not len(samples):
                 continue
-            first, last = int(samples.stamp_ns[0]), int(samples.stamp_ns[-1])
+            first = int(samples.stamp_ns[0])
+            last = int(samples.stamp_ns[-1])
             if len(samples) > 1 and last > first:
                 self._period[name] = (last - first) * 1e-9 / (len(samples) - 1)
             self._count[name] += len(samples)

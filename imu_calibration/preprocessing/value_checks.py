@@ -358,7 +358,9 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         else:
             least = np.maximum(least, LEAST_RANGE)
         held = _held(evidence, sensor)
-        words, total, level = [], 0, 0.0
+        words = []
+        total = 0
+        level = 0.0
         for axis, ends in enumerate(evidence.ends[part]):
             counts = [
                 (
@@ -370,10 +372,8 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             ]
             if sum(counts):
                 words.append(f'{"xyz"[axis]} {sum(counts)}')
-                total, level = (
-                    total + sum(counts),
-                    max([level, *(end.level for end, count in zip(ends, counts) if count)]),
-                )
+                total = total + sum(counts)
+                level = max([level, *(end.level for end, count in zip(ends, counts) if count)])
         if words:
             people = (
                 f' ({level / DEG:.0f} deg/s)'
@@ -500,7 +500,8 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if evidence.rest is None:
         return
     for sensor, part, unit in CHANNELS:
-        step, range_ = evidence.resolution[part], evidence.rest.range[part]
+        step = evidence.resolution[part]
+        range_ = evidence.rest.range[part]
         # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
         coarse = (step > MIN_CONVERTER_STEP) & (4 * step > range_)
         constant = coarse & (range_ == 0)

@@ -284,14 +284,17 @@ def _mean_motion(motion):
     mean = motion.position.mean(axis=0)
     # The levels are averages over 0.2 s, so these contain the same information.
     some = slice(None, None, max(1, len(motion) // 500))
-    time, position = motion.time[some] - motion.time[some].mean(), motion.position[some] - mean
+    time = motion.time[some] - motion.time[some].mean()
+    position = motion.position[some] - mean
     slope = time @ position / max(time @ time, 1e-12)
     rest = (position - time[:, None] * slope).std(axis=0)
     distance = np.abs(slope) * (time[-1] - time[0])
     # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no
     # creep
     slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
-    zero, branch, warming = np.zeros((1, len(mean))), motion.thermal_branch, motion.temperature_rate
+    zero = np.zeros((1, len(mean)))
+    branch = motion.thermal_branch
+    warming = motion.temperature_rate
     return JointMotion(
         motion.time.mean(keepdims=True),
         mean[None],

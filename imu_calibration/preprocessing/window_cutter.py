@@ -175,9 +175,11 @@ def _slopes(time, rows, half):
     place = np.arange(n)
     count = np.minimum(place + half + 1, n) - np.maximum(place - half, 0)
     middle = rows.mean(axis=1, keepdims=True)
-    t, p = time - time.mean(), rows - middle
+    t = time - time.mean()
+    p = rows - middle
     sum_t, sum_tt = _window_sums(np.stack([t, t * t]), half)
-    sum_p, sum_tp = _window_sums(p, half), _window_sums(p * t, half)
+    sum_p = _window_sums(p, half)
+    sum_tp = _window_sums(p * t, half)
     spread = np.maximum(sum_tt - sum_t**2 / count, 1e-18)
     slope = (sum_tp - sum_t * sum_p / count) / spread
     return slope, sum_p / count + middle, p - sum_p / count - slope * (t - sum_t / count)
@@ -208,7 +210,9 @@ class JointRun:
         settings: WindowSettings,
         noise_rad: float | None,
     ):
-        self.time, self.position, self.velocity = time, position, velocity
+        self.time = time
+        self.position = position
+        self.velocity = velocity
         self.phase, self.level = joint_phases(time, position, settings, noise_rad=noise_rad)
         self._moving = time[self.phase != STILL]
         self.step = np.array([encoder_step(column) for column in position.T])
@@ -251,10 +255,8 @@ class JointRun:
     def curve(self, time: np.ndarray, overlap: float, noise_rad: float | None) -> JointMotion:
         """Return the `JointMotion` of a smooth curve at instants."""
         first, stop = np.searchsorted(self.time, [time[0] - overlap, time[-1] + overlap])
-        first, stop = (
-            max(0, min(first, len(self.time) - LEAST_READINGS)),
-            min(len(self.time), max(stop, LEAST_READINGS)),
-        )
+        first = max(0, min(first, len(self.time) - LEAST_READINGS))
+        stop = min(len(self.time), max(stop, LEAST_READINGS))
         piece = slice(first, stop)
         velocity = None if np.isnan(self.velocity[piece]).all() else self.velocity[piece]
         return fit_joint_curve(
@@ -345,7 +347,9 @@ class WindowCutter:
 
     def __init__(self, settings: WindowSettings, short_rest: float, keep_unused: bool = False):
         self.counts = Counter()
-        self._settings, self._short_rest, self._keep_unused = settings, short_rest, keep_unused
+        self._settings = settings
+        self._short_rest = short_rest
+        self._keep_unused = keep_unused
         self._waiting = None
         self._phase_before = None
         self._disturbed = self._ramped = -np.inf
@@ -426,10 +430,8 @@ class WindowCutter:
         use = self._uses(samples, phase)
         if self._open is not None:
             before, use_before = self._open
-            samples, use = (
-                PhasedSamples.concatenate([before, samples]),
-                np.append(np.full(len(before), use_before), use),
-            )
+            samples = PhasedSamples.concatenate([before, samples])
+            use = np.append(np.full(len(before), use_before), use)
         windows = []
         for start, stop in _runs(use, samples.after_gap):
             cut_off, start = self._shed(samples, start, stop, use[start])
@@ -446,7 +448,8 @@ class WindowCutter:
 
         Independent of the time of arrival.
         """
-        windows, longest = [], self._longest(use)
+        windows = []
+        longest = self._longest(use)
         while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
             cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
             windows += self._finished(samples.select(slice(start, cut)), use)

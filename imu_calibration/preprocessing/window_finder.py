@@ -254,7 +254,8 @@ class _Unwrapper:
 
 
 def _span(queue):
-    first, last = queue[0][1].stamp_ns[0], queue[-1][1].stamp_ns[-1]
+    first = queue[0][1].stamp_ns[0]
+    last = queue[-1][1].stamp_ns[-1]
     return abs(int(last) - int(first)) / 1e9
 
 

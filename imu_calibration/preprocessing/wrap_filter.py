@@ -120,7 +120,9 @@ class WrapFilter:
         """Return the list of `WrappedSpan`, and the stamp of the first step without return, ns."""
         row, column, up = wrap_steps(samples, self._largest)
         new = samples.stamp_ns[row] > self._returned_ns[column]
-        row, column, up = row[new], column[new], up[new]
+        row = row[new]
+        column = column[new]
+        up = up[new]
         spans = []
         open_steps = []
         for number in np.unique(column):
@@ -199,12 +201,15 @@ def wrap_steps(
     step = np.diff(values, axis=0)
     row, column = np.nonzero(np.abs(step) > LEAST_WRAP)
     inside = (row >= 2) & (row + 2 < len(step))
-    row, column = row[inside], column[inside]
+    row = row[inside]
+    column = column[inside]
     if not len(row):
         return none, none, none.astype(bool)
     size = step[row, column]
-    before, after = values[row, column], values[row + 1, column]
-    earlier, later = step[row - 1, column], step[row + 1, column]
+    before = values[row, column]
+    after = values[row + 1, column]
+    earlier = step[row - 1, column]
+    later = step[row + 1, column]
     sizes = np.abs(size)
     seconds = np.diff(samples.stamp_ns)[row] * 1e-9
     # Both readings are at the ends of the range.

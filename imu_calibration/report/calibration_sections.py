@@ -98,10 +98,8 @@ def _bars(figure, result, live):
     """One bar per parameter on a logarithmic axis, one at the tolerance."""
     calibration = result.calibration
     share = (calibration.sd / result.tolerances)[live]
-    names, colours = (
-        list(compress(calibration.param_names, live)),
-        [STATUS[status] for status in compress(calibration.status, live)],
-    )
+    names = list(compress(calibration.param_names, live))
+    colours = [STATUS[status] for status in compress(calibration.status, live)]
     axes = figure.subplots()
     place = np.arange(len(names))[::-1]
     low = min(1e-3, float(share.min()) / 2)
@@ -220,7 +218,8 @@ def _effects(result):
 
 def _dots(figure, result, budget):
     """One line per effect, one dot per cause, in tolerances."""
-    axes, effects = figure.subplots(), _effects(result)
+    axes = figure.subplots()
+    effects = _effects(result)
     place = np.arange(len(effects))[::-1]
     highest = 1.0
     for cause, values in budget.causes.items():
@@ -399,7 +398,8 @@ def calibration_report(result: CalibrationResult) -> str:
     result : CalibrationResult
 
     """
-    errors, windows = result.window_errors(), (result.options or CalibrationOptions()).windows
+    errors = result.window_errors()
+    windows = (result.options or CalibrationOptions()).windows
     return render(
         'calibration.html',
         title='IMU calibration',

@@ -180,12 +180,16 @@ def cause_of(
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
     kinds = against if len(signal) >= FEW else ()  # bins of few poses have uncertain means
-    best_share, best_label, best_values = 0.0, '', None
+    best_share = 0.0
+    best_label = ''
+    best_values = None
     for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items():
         if kind in kinds:
             share = explained_share(values, signal[:, axis])
             if best_values is None or share > best_share:
-                best_share, best_label, best_values = share, label, values
+                best_share = share
+                best_label = label
+                best_values = values
     if best_values is None or best_share < MIN_DRAWN_FIT:
         factor, unit = for_people(UNITS[sensor])
         return axis, f'prediction of the effect, {unit}', signal[:, axis] * factor

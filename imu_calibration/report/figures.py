@@ -155,7 +155,8 @@ def draw(
         matplotlib.rcParams.update(_style() | {'svg.hashsalt': name})
         figure = Figure(figsize=size, layout='constrained')
         paint(figure, *data)
-        canvas, text = _laid_out(figure), io.StringIO()
+        canvas = _laid_out(figure)
+        text = io.StringIO()
         # Of pictures inside, which the canvas lays out at 72.
         figure.dpi = matplotlib.rcParams['figure.dpi']
         canvas.print_svg(

@@ -46,7 +46,8 @@ def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[
     """Return figures and end values of dead reckoning at rest and in motion, None without it."""
     if result.calibration.absent:  # it needs both sensors
         return {'rest': None, 'moving': None}
-    before, moving = rest_growth(errors), motion_growth(result)
+    before = rest_growth(errors)
+    moving = motion_growth(result)
     return {
         'rest': (
             None if before is None else _shown('rest', before, *expected_growth(result, errors))
@@ -167,7 +168,8 @@ def _constant_variances(uncertainty, force):
     The variance of the specific-force error covers all axes, and the variance of the rate error is
     across the vertical.
     """
-    covariance, up = uncertainty.at(force).parameters, force / np.linalg.norm(force)
+    covariance = uncertainty.at(force).parameters
+    up = force / np.linalg.norm(force)
     return np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:]) - up @ covariance[3:, 3:] @ up
 
 
@@ -228,7 +230,8 @@ def _joined_growth(time, runs):
 def _moving_runs(result, window, length):
     """Return the Growth of one stretch, raw and corrected."""
     some = slice(0, int(np.searchsorted(window.time, window.time[0] + length, 'right')))
-    time, motion = window.time[some], window.motion.select(some)
+    time = window.time[some]
+    motion = window.motion.select(some)
     truth = _at_origin(result.calibration, reference_motion(result.data.table, motion))
     reference_c = result.calibration.model.temperature_ref_c
     temperature = (

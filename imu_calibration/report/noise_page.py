@@ -64,7 +64,8 @@ def _curves(figure, result, sensor):
 
 def _axis(axes, result, k, factor, name):
     """Draw one axis: measured, band, model, and the curve with its trends."""
-    curve, colour = result.record.curve, AXIS_COLOURS[name]
+    curve = result.record.curve
+    colour = AXIS_COLOURS[name]
     measured, raw = (np.sqrt(values[:, k]) * factor for values in (curve.variance, curve.raw))
     model, freedom = predicted(result.record.moments[k], result.axes[k])
     lower, upper = (measured * np.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))

@@ -114,7 +114,8 @@ def draw_progress(plan: Plan) -> Drawn:
 
 
 def _motion(figure, plan):
-    axes, points = figure.subplots(), plan.points
+    axes = figure.subplots()
+    points = plan.points
     if not len(points):
         return
     turns = plan.motions[0].limits.turns
@@ -131,8 +132,10 @@ def _motion(figure, plan):
             lw=1.2,
             label=f'{name}, {"deg" if turns[k] else "mm"}',
         )
-    top, bottom = axes.get_ylim()[1], axes.get_ylim()[0]
-    begins, shown = np.concatenate([[0.0], plan.ends[:-1]]), set()
+    top = axes.get_ylim()[1]
+    bottom = axes.get_ylim()[0]
+    begins = np.concatenate([[0.0], plan.ends[:-1]])
+    shown = set()
     for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True):
         axes.fill_between(
             [begin, end],
@@ -149,12 +152,10 @@ def _motion(figure, plan):
 
 def _progress(figure, plan):
     """Draw a line for each parameter, the worst of all, the tolerance, and the least time."""
-    axes, shown, time, history = (
-        figure.subplots(),
-        set(),
-        np.concatenate([[0.0], plan.ends]),
-        plan.history,
-    )
+    axes = figure.subplots()
+    shown = set()
+    time = np.concatenate([[0.0], plan.ends])
+    history = plan.history
     names = [
         name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted
     ]
@@ -231,10 +232,12 @@ def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     within = plan.sd <= plan.tolerances * (1 + 1e-6)
     if plan.start is None:
-        texts, motion = OF_POSES, draw_steps(plan.motions)
+        texts = OF_POSES
+        motion = draw_steps(plan.motions)
         labels = [str(number) for number, _ in enumerate(plan.motions, 1)]
     else:
-        texts, motion = OF_JOINTS, draw_motion(plan)
+        texts = OF_JOINTS
+        motion = draw_motion(plan)
         labels = [f'{end:.1f}' for end in plan.ends]
     return render(
         'plan.html',

@@ -111,7 +111,8 @@ class Segment:
         ):
             omega = 2.0 * np.pi * frequency
             angle = np.outer(time, omega) + phase
-            sine, cosine = amplitude * np.sin(angle), amplitude * np.cos(angle) * omega
+            sine = amplitude * np.sin(angle)
+            cosine = amplitude * np.cos(angle) * omega
             waves = [sine, cosine, -sine * omega**2, -cosine * omega**2]
             for order in range(4):
                 for inner in range(order + 1):

@@ -137,7 +137,8 @@ def simulate_on_recording(
         exact['accelerometer'] += unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
     readings = []
     for sensor in SENSORS:
-        own, shape = noise[sensor], exact[sensor].shape
+        own = noise[sensor]
+        shape = exact[sensor].shape
         noisy = exact[sensor] + rng.normal(0.0, own.white_sd, shape)
         noisy += gauss_markov_samples(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
         readings.append(clip(model, sensor, values, output=noisy))

@@ -197,7 +197,9 @@ class ImuNoise:
         rng: np.random.Generator,
         drawn: bool = False,
     ):
-        self._model, self._rate, self._rng = model, sample_rate, rng
+        self._model = model
+        self._rate = sample_rate
+        self._rng = rng
         sizes = (model.accel_instability, model.gyro_instability)
         self._force_bias, self._rate_bias = (
             [rng.normal(0.0, size, 3) for size in sizes] if drawn else (None, None)

@@ -106,7 +106,8 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
 
     Bias, matrix and arms scatter with the sd of the grade; every other effect is zero.
     """
-    rng, grade = np.random.default_rng([seed, 7]), GRADES[grade]
+    rng = np.random.default_rng([seed, 7])
+    grade = GRADES[grade]
     values = model.start()
     for effect in model.effects:
         part = model.slices[effect.key]
@@ -253,14 +254,13 @@ class LiveSimulation:
         causes: Sequence[Cause] = (),
         drawn: bool = True,
     ):
-        self.model, self.values, self.table, self.motion, self.options = (
-            model,
-            values,
-            turning_world(table, model),
-            motion,
-            options,
-        )
-        self.start_ns, self.causes = start_ns, tuple(causes)
+        self.model = model
+        self.values = values
+        self.table = turning_world(table, model)
+        self.motion = motion
+        self.options = options
+        self.start_ns = start_ns
+        self.causes = tuple(causes)
         self._rng = np.random.default_rng([seed, 3])
         self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
         self._noise = ImuNoise(
@@ -287,10 +287,8 @@ class LiveSimulation:
     ) -> SimulatedBlock:
         """Return the samples at the times of each stream, s."""
         imu = self._imu(imu_time)
-        motion, warmth = (
-            self.motion.at(joint_time),
-            warm_up_temperature(temperature_time, self.options),
-        )
+        motion = self.motion.at(joint_time)
+        warmth = warm_up_temperature(temperature_time, self.options)
         position = read_encoders(motion.position, self.options.noise, self._rng)
         velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
         joints = JointSamples(
@@ -355,10 +353,8 @@ class LiveSimulation:
         """Return true specific force and rate, each (n, 3)."""
         references = References(self.model, self.table, self.motion.at(time))
         accelerometer, gyroscope = (references.at(sensor) for sensor in SENSORS)
-        true_force, arm = (
-            accelerometer.force_s,
-            self.model.value('accelerometer', Role.ARM, self.values),
-        )
+        true_force = accelerometer.force_s
+        arm = self.model.value('accelerometer', Role.ARM, self.values)
         if arm is not None:
             true_force = (
                 true_force + lever_matrix(accelerometer.rate_s, accelerometer.alpha_s) @ arm
@@ -421,7 +417,8 @@ def answered(
 
     Motion, warm-up, and a machine if biases depend on vibration.
     """
-    warmth, hum = warm_up_temperature(time, options), 0.0
+    warmth = warm_up_temperature(time, options)
+    hum = 0.0
     if warmth is not None:  # it never turns (`kinematics.signal_history`)
         motion = replace(
             motion,

@@ -105,7 +105,8 @@ def braking_from(start: JointMotion, limits: MotionLimits) -> JointTrajectory:
 
     More acceleration is used if the range ends before.
     """
-    position, rate = start.position[0], start.rate[0]
+    position = start.position[0]
+    rate = start.rate[0]
     wanted = float(np.max(PEAK_ACCELERATION_OF_BRAKING * np.abs(rate) / limits.acceleration))
     room = np.where(rate > 0, limits.upper - position, position - limits.lower)
     ends = room[(rate != 0) & (room > 0)] / np.abs(rate[(rate != 0) & (room > 0)])
@@ -132,10 +133,8 @@ def limit_excess(
         np.union1d(np.linspace(trajectory.time[0], trajectory.end, count + 1), trajectory.time)
     )
     beyond = np.maximum(limits.lower - motion.position, motion.position - limits.upper)
-    speed, acceleration = (
-        np.abs(motion.rate) / limits.speed,
-        np.abs(motion.acceleration) / limits.acceleration,
-    )
+    speed = np.abs(motion.rate) / limits.speed
+    acceleration = np.abs(motion.acceleration) / limits.acceleration
     return float(np.max(beyond)), float(np.max(speed)), float(np.max(acceleration))
 
 
@@ -222,18 +221,18 @@ class TableController:
         settings: ControllerSettings = ControllerSettings(),
         repeat: bool = False,
     ):
-        self.joint_names, self.limits, self.settings = (
-            tuple(joint_names),
-            limits or free_limits(len(joint_names)),
-            settings,
-        )
+        self.joint_names = tuple(joint_names)
+        self.limits = limits or free_limits(len(joint_names))
+        self.settings = settings
         if settings.stall_joint and settings.stall_joint not in self.joint_names:
             raise InputError(
                 f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got"
                 f" '{settings.stall_joint}'; name one",
                 code='joint_unknown',
             )
-        self._profile, self._repeat, self._n_followed = profile, repeat, 0
+        self._profile = profile
+        self._repeat = repeat
+        self._n_followed = 0
         self._home = np.clip(np.zeros(len(joint_names)), self.limits.lower, self.limits.upper)
         self._taken: list[tuple[float, JointTrajectory]] = []
         self._stalled: JointTrajectory | None = None
@@ -309,10 +308,8 @@ class TableController:
             self._stalled = braking_from(
                 self._commanded(np.array([self.settings.stall_time])), self.limits
             )
-        column, stuck = (
-            self.joint_names.index(self.settings.stall_joint),
-            self._stalled.at(time[late]),
-        )
+        column = self.joint_names.index(self.settings.stall_joint)
+        stuck = self._stalled.at(time[late])
         for name in ('position', 'rate', 'acceleration', 'jerk'):
             getattr(motion, name)[late, column] = getattr(stuck, name)[:, column]
         return motion

@@ -262,7 +262,8 @@ def log_options(readings: RawReadings | None, choices: Mapping[str, Any]) -> Log
         stated = choices.get(UNIT_KEYS[sensor])
         if readings is not None and (stated or not getattr(readings, sensor).is_si):
             raw.append(quantity)
-    columns, where = choices.get('columns') or (), choices.get('where') or ()
+    columns = choices.get('columns') or ()
+    where = choices.get('where') or ()
     return LogOptions(tuple(columns), tuple(where), tuple(raw))
 
 

@@ -182,7 +182,8 @@ def compensate_recording(
     """
     calibration = files.given_calibration(calibration)
     used = usable(calibration, anyway=anyway)
-    calibration, figures = used.calibration, noise_of(noise)
+    calibration = used.calibration
+    figures = noise_of(noise)
     calibration = calibration if figures is None else with_measured_noise(calibration, figures)
     transfer = requested_transfer(target_frame, target_xyz, target_rpy)
     late = late_ns(calibration, correct_stamps)
@@ -231,7 +232,8 @@ def compensate_recording(
         # The messages of the slower sensor are corrected, in the frame of the accelerometer.
         checks.require_scale(joined.select(slice(UNIT_READINGS)))
         refuse_corrected(gyroscope_topic)
-        other, frame = split.other, target_frame or joined.frame_id
+        other = split.other
+        frame = target_frame or joined.frame_id
         if split.topic == gyroscope_topic:
             topics = topics._replace(imu=gyroscope_topic, frame=None)
     bag = open_bag(recording, topics, want_joints=False)
@@ -375,7 +377,8 @@ class RawChecks:
         self._calibration = calibration
         self.cautions: tuple[str, ...] = ()
         """A line for each sensor whose corrected readings may have another scale than the truth."""
-        self._readings, self._check = readings, StreamCheck(one_sensor=True)
+        self._readings = readings
+        self._check = StreamCheck(one_sensor=True)
         self._gatherer = EvidenceGatherer(STANDARD_GRAVITY)
         self._n_samples = 0
 

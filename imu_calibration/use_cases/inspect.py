@@ -154,7 +154,8 @@ def inspect_imus(
         See `Choices`.
 
     """
-    options, topics = calibration_options(choices), [topics_of(choices)]
+    options = calibration_options(choices)
+    topics = [topics_of(choices)]
     if not isinstance(recording, SampleBlock):
         topics = imu_topics_of(recording, *topics)
     reference = reference_of(stand, [recording], topics[0], options=options)

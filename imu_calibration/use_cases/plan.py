@@ -146,7 +146,8 @@ class Planned:
     def _messages(self):
         from imu_calibration.planning.motion_library import trajectory
 
-        names, begins = self.plan.moved_joints, np.concatenate([[0.0], self.plan.ends[:-1]])
+        names = self.plan.moved_joints
+        begins = np.concatenate([[0.0], self.plan.ends[:-1]])
         return [
             (PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
             for begin, segments in zip(begins, self.plan.segments, strict=True)
@@ -224,11 +225,13 @@ def plan(
     reference = reference_of(stand, options=options)
     table = reference.table_for('a plan of motions needs a table or a robot description')
     noise = expected_noise(options.noise, grade, imu_rate)
-    limits, start = limits_of(table), None
+    limits = limits_of(table)
+    start = None
     if around or reach is not None:
         limits, start = _neighbourhood(limits, table.joint_names, around or {}, reach)
     known = _known(calibration, table, options)
-    causes, sizes = tuple(separate), {}
+    causes = tuple(separate)
+    sizes = {}
     if diagnosis and not separate:
         causes, sizes = (
             class_in(diagnosis)
@@ -399,7 +402,8 @@ def plan_summary(made: Plan) -> list[str]:
                 f' {", ".join(made.missing)}'
             ),
         ]
-    count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
+    count = int(made.wanted.sum())
+    met = int(made.wanted.sum()) - len(made.missing)
     lines = [
         f'{len(made.motions)} {made.noun} in {made.seconds:.0f} s; {met} of {count} parameters are'
         ' within their tolerance'

@@ -82,7 +82,8 @@ def inputs_of(
             f' {", ".join(Choices.__annotations__)}',
             code='choice_unknown',
         )
-    options, topics = calibration_options(choices), topics_of(choices)
+    options = calibration_options(choices)
+    topics = topics_of(choices)
     reference = reference_of(stand, recordings, topics, options=options)
     sources = [source_of(item, topics, reference.joint_names) for item in recordings]
     for source in sources:

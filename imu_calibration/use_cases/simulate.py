@@ -73,10 +73,8 @@ class Simulated:
         from msg_adapters.write import write_session
 
         report(f'writing {Path(path).name}')
-        samples, packed = (
-            self.samples,
-            {} if compression == 'none' else {'compression': compression},
-        )
+        samples = self.samples
+        packed = {} if compression == 'none' else {'compression': compression}
         write_session(
             path,
             cast(ImuSamples, samples.imu),

@@ -205,7 +205,8 @@ def mcap_bytes(topics: Iterable[tuple[str, Sequence[tuple[float, Any]]]]) -> byt
         When foxglove-sdk is not installed.
 
     """
-    sdk, whole = foxglove(), BytesIO()
+    sdk = foxglove()
+    whole = BytesIO()
     context = sdk.Context()
     with sdk.open_mcap(whole, context=context):
         for topic, messages in topics:

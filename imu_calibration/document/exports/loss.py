@@ -74,10 +74,12 @@ def standard_motion(calibration: Calibration) -> TrialMotion:
     gravity = gravity if isinstance(gravity, float) and gravity > 0 else STANDARD_GRAVITY
     time = np.arange(int(SPIRAL_SECONDS * SAMPLES_PER_SECOND)) / SAMPLES_PER_SECOND
     height = np.linspace(-1.0, 1.0, len(time))
-    turn, level = 2 * np.pi * SPIRAL_TURNS * time / SPIRAL_SECONDS, np.sqrt(1.0 - height**2)
+    turn = 2 * np.pi * SPIRAL_TURNS * time / SPIRAL_SECONDS
+    level = np.sqrt(1.0 - height**2)
     force = gravity * np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
     phase = 2 * np.pi * RATE_FREQUENCIES * time[:, None]
-    rate, alpha = largest * np.sin(phase), largest * 2 * np.pi * RATE_FREQUENCIES * np.cos(phase)
+    rate = largest * np.sin(phase)
+    alpha = largest * 2 * np.pi * RATE_FREQUENCIES * np.cos(phase)
     low, high = conditions.get('temperature_range_c') or [calibration.model.temperature_ref_c] * 2
     temperature = np.linspace(low, high, len(time))
     warmth = f'{low:g} C' if low == high else f'{low:g} to {high:g} C'
@@ -210,7 +212,8 @@ def loss_of(
 
     """
     model, values = invertible_values(calibration)
-    ref, effects = motion.reference, {effect.key: effect for effect in model.effects}
+    ref = motion.reference
+    effects = {effect.key: effect for effect in model.effects}
     read = {sensor: sensor_output(model, sensor, values, ref=ref) for sensor in SENSORS}
     without = values.copy()
     estimated = tuple(
@@ -300,7 +303,8 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     if target.whole:
         return from_mapping(found.numbers)
     assert target.imu is not None
-    read, own = target.imu(found.numbers), affine.find_pose(content)
+    read = target.imu(found.numbers)
+    own = affine.find_pose(content)
     if own is None:
         if target.forward_right_down:
             back = affine.forward_right_down(IMPORTED_FROM_AUTOPILOT)
@@ -341,7 +345,8 @@ def _document(
     values, sd = model.prior()
     status = np.full(len(values), HELD, dtype=object)
     for effect in model.effects:
-        capability, part = affine.capability_of(effect, holds), model.slices[effect.key]
+        capability = affine.capability_of(effect, holds)
+        part = model.slices[effect.key]
         if capability is not None:
             values[part] = imu.value(capability).ravel()
             known = np.eye(3).ravel() > 0 if capability.own_axis else np.full(effect.size, True)

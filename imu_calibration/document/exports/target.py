@@ -215,7 +215,8 @@ def inverted(imu: AffineImu, readings: Readings) -> tuple[np.ndarray, np.ndarray
         @ np.linalg.inv(imu.matrix[sensor]).T
         for sensor, raw in zip(SENSORS, (readings.force, readings.rate))
     )
-    apparent, cross = force, np.linalg.solve(imu.matrix['gyroscope'], imu.cross)
+    apparent = force
+    cross = np.linalg.solve(imu.matrix['gyroscope'], imu.cross)
     for _ in range(EXPORT_INVERSION_STEPS):
         rate = turning - force @ cross.T
         force = apparent - np.einsum('nij,ij->ni', lever_matrix(rate, readings.alpha), imu.arms)

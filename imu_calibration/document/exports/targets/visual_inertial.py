@@ -66,7 +66,8 @@ def numbers_kalibr(imu: AffineImu) -> dict:
 
 def imu_kalibr(found: dict) -> AffineImu:
     """Return the IMU of such numbers."""
-    accelerometers, gyroscopes = found['accelerometers'], found['gyroscopes']
+    accelerometers = found['accelerometers']
+    gyroscopes = found['gyroscopes']
     turn = np.asarray(gyroscopes['C_gyro_i'])
     arms = (
         np.array([accelerometers[name] for name in LEVERS])
@@ -128,7 +129,8 @@ def read_kalibr(content: bytes, _path: str | Path) -> Read:
             f"the {what} must come of a model with intrinsics, its model is '{model}'; run Kalibr"
             ' with scale-misalignment'
         )
-    a, g = section(mapping, 'accelerometers', what), section(mapping, 'gyroscopes', what)
+    a = section(mapping, 'accelerometers', what)
+    g = section(mapping, 'gyroscopes', what)
     arms = {name: numbers_at(a, name, (3,), what=what) for name in LEVERS if name in a}
     found = {
         'model': mapping.get('model'),
@@ -298,7 +300,8 @@ def numbers_basalt(imu: AffineImu) -> dict:
 
 def imu_basalt(found: dict) -> AffineImu:
     """Return the IMU of such numbers."""
-    accel, gyro = np.asarray(found['calib_accel_bias']), np.asarray(found['calib_gyro_bias'])
+    accel = np.asarray(found['calib_accel_bias'])
+    gyro = np.asarray(found['calib_gyro_bias'])
     lower = np.eye(3)
     for at, value in zip(LOWER_BY_COLUMNS, accel[3:]):
         lower[at] += value
@@ -346,7 +349,8 @@ def read_basalt(content: bytes, _path: str | Path) -> Read:
         name: numbers_at(values, name, (size,), what=what)
         for name, size in (('calib_accel_bias', 9), ('calib_gyro_bias', 12))
     }
-    rate, sample_sd = values.get('imu_update_rate'), {}
+    rate = values.get('imu_update_rate')
+    sample_sd = {}
     if isinstance(rate, (int, float)) and rate > 0:
         for sensor, name in (('accelerometer', 'accel_noise_std'), ('gyroscope', 'gyro_noise_std')):
             if name in values:
