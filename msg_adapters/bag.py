@@ -79,11 +79,10 @@ def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str
 
     The quaternion is x y z w of the child in the parent.
     """
-    return [
-        row
-        for rows in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows)
-        for row in rows
-    ]
+    found = []
+    for rows in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows):
+        found.extend(rows)
+    return found
 
 
 def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
@@ -92,14 +91,16 @@ def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
 
     As an object of rclpy or rosbags.
     """
-    return [
-        (
-            clean_name(t.header.frame_id).lstrip('/'),
-            clean_name(t.child_frame_id).lstrip('/'),
-            np.array([float(getattr(t.transform.rotation, a)) for a in 'xyzw']),
+    found = []
+    for t in message.transforms:
+        found.append(
+            (
+                clean_name(t.header.frame_id).lstrip('/'),
+                clean_name(t.child_frame_id).lstrip('/'),
+                np.array([float(getattr(t.transform.rotation, a)) for a in 'xyzw']),
+            )
         )
-        for t in message.transforms
-    ]
+    return found
 
 
 def _messages(

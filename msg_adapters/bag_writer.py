@@ -109,19 +109,20 @@ class BagWriter:
             'duration': {'nanoseconds': (self.last_ns or 0) - (self.first_ns or 0)},
             'message_count': self.counts.total(),
         }
-        topics = [
-            {
-                'topic_metadata': {
-                    'name': name,
-                    'type': definition.type,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': qos,
-                    'type_description_hash': definition.digest,
-                },
-                'message_count': self.counts[topic_id],
-            }
-            for topic_id, (name, definition, qos) in self.topics.items()
-        ]
+        topics = []
+        for topic_id, (name, definition, qos) in self.topics.items():
+            topics.append(
+                {
+                    'topic_metadata': {
+                        'name': name,
+                        'type': definition.type,
+                        'serialization_format': 'cdr',
+                        'offered_qos_profiles': qos,
+                        'type_description_hash': definition.digest,
+                    },
+                    'message_count': self.counts[topic_id],
+                }
+            )
         return {
             'version': METADATA_VERSION,
             'storage_identifier': self.kind.identifier,

@@ -201,11 +201,10 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
     given = {
         name: [list(getattr(point, field)) for point in points] for name, field in _FIELDS.items()
     }
-    complete = {
-        name: np.array(values, float).reshape(len(points), len(names))
-        for name, values in given.items()
-        if all(len(row) == len(names) for row in values) and (values or name == 'position')
-    }
+    complete = {}
+    for name, values in given.items():
+        if all(len(row) == len(names) for row in values) and (values or name == 'position'):
+            complete[name] = np.array(values, float).reshape(len(points), len(names))
     if 'position' not in complete:
         raise InputError(
             f'each point of a trajectory must have {len(names)} positions, one for each joint, some'

@@ -210,12 +210,8 @@ class Rosbag2:
         if not self.path.is_dir():
             return [self.path]
         if self.metadata.get('relative_file_paths'):
-            return [
-                self.path / name
-                for name in dict.fromkeys(
-                    PurePath(name).name for name in self.metadata['relative_file_paths']
-                )
-            ]
+            names = [PurePath(name).name for name in self.metadata['relative_file_paths']]
+            return [self.path / name for name in dict.fromkeys(names)]
         return sorted(
             (path for path in self.path.iterdir() if _storage_suffix(path) in suffixes()),
             key=_natural,

@@ -628,11 +628,10 @@ def lines(figures: NoiseFigures) -> list[str]:
 
 
 def _rest_line(recording):
-    left = {
-        name.replace('_', ' '): seconds
-        for name, seconds in recording['left_out'].items()
-        if seconds >= 0.05
-    }
+    left = {}
+    for name, seconds in recording['left_out'].items():
+        if seconds >= 0.05:
+            left[name.replace('_', ' ')] = seconds
     said = ', '.join(f'{seconds:.1f} s of {name}' for name, seconds in left.items())
     parts = (
         ''

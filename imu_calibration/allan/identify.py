@@ -423,11 +423,10 @@ def _without_scatter(curve, skipped):
         if sensor in skipped:
             continue
         n_scales = np.sum(curve.variance[:, part] > 0, axis=0)
-        frozen = [
-            f'{sensor} {letter}'
-            for letter, count in zip(AXES, n_scales, strict=True)
-            if count < LEAST_SCALES
-        ]
+        frozen = []
+        for letter, count in zip(AXES, n_scales, strict=True):
+            if count < LEAST_SCALES:
+                frozen.append(f'{sensor} {letter}')
         if frozen:
             reasons[sensor] = (
                 f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of'

@@ -480,11 +480,10 @@ class _ScoreOfCoefficient(_Score):
 
     def _directions(self, fit):
         design = self.moments.design(fit.processes)
-        others = [
-            design[:, k]
-            for k in range(len(fit.processes))
-            if k != self.index and fit.coefficients[k] > 0
-        ]
+        others = []
+        for k in range(len(fit.processes)):
+            if k != self.index and fit.coefficients[k] > 0:
+                others.append(design[:, k])
         if fit.processes[-1].time and fit.coefficients[-1] > 0:
             others.append(_by_time(self.moments, fit.processes[-1].time))
         return design[:, self.index], others

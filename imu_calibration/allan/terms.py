@@ -101,11 +101,10 @@ class Choice:
 
         Or None.
         """
-        near = [
-            fit
-            for fit in self.fits
-            if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME
-        ]
+        near = []
+        for fit in self.fits:
+            if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME:
+                near.append(fit)
         return near[0] if near else None
 
 
@@ -135,11 +134,10 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
 
 def _all_forms(moments, fast, excess):
     n_scales = int(moments.used.sum())
-    fits = [
-        fit_form(moments, form, fast, excess=excess)
-        for form in FORMS
-        if len(fast) + 2 * len(form) + 3 <= n_scales
-    ]
+    fits = []
+    for form in FORMS:
+        if len(fast) + 2 * len(form) + 3 <= n_scales:
+            fits.append(fit_form(moments, form, fast, excess=excess))
     return tuple(sorted(fits, key=lambda found: found.cost))
 
 

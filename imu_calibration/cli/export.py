@@ -81,17 +81,12 @@ def _show_targets():
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document.exports.export import all_targets, holds_in_words
 
-    rows = [
-        (
-            target.name,
-            target.title,
-            holds_in_words(target),
-            target.noise_is or '-',
-            'yes' if target.read else '-',
-        )
-        for target in all_targets().values()
-        if target.write is not None
-    ]
+    rows = []
+    for target in all_targets().values():
+        if target.write is not None:
+            noise = target.noise_is or '-'
+            read = 'yes' if target.read else '-'
+            rows.append((target.name, target.title, holds_in_words(target), noise, read))
     show_table(
         Terminal.of(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows
     )

@@ -71,16 +71,14 @@ def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
         raise InputError(
             f'the folder of units {folder} must exist, there is none; correct the path'
         )
-    members = [
-        path
-        for path in sorted(folder.iterdir())
-        if not path.name.startswith('.') and path.resolve() != output
-    ]
-    units = [
-        (path.name if path.is_dir() else path.stem, bags_of(path))
-        for path in members
-        if path.is_dir() or is_bag(path)
-    ]
+    members = []
+    for path in sorted(folder.iterdir()):
+        if not path.name.startswith('.') and path.resolve() != output:
+            members.append(path)
+    units = []
+    for path in members:
+        if path.is_dir() or is_bag(path):
+            units.append((path.name if path.is_dir() else path.stem, bags_of(path)))
     units = [(name, bags or [folder / name]) for name, bags in units]
     names = [name for name, _ in units]
     units = [(name if names.count(name) == 1 else bags[0].name, bags) for name, bags in units]

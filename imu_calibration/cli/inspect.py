@@ -116,12 +116,11 @@ def _show_topics(out, looks):
     """Print the topics; for the topics that are read also rate, gaps and step of the stamps."""
     from imu_calibration.cli.show import show_table
 
-    used = {
-        getattr(look.recording, attribute): look.streams.get(name)
-        for look in looks
-        for attribute, name in TOPICS
-        if getattr(look.recording, attribute)
-    }
+    used = {}
+    for look in looks:
+        for attribute, name in TOPICS:
+            if getattr(look.recording, attribute):
+                used[getattr(look.recording, attribute)] = look.streams.get(name)
     numbers = ('messages', 'Hz', 'seconds', 'gaps', 'stamp step')
     rows = []
     for topic in sorted(looks[0].recording.topics, key=lambda topic: topic.name not in used):

@@ -49,11 +49,10 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.noise import identify_recording, noise_provenance
     from imu_calibration.use_cases.recordings import existing
 
-    choices = {
-        name: value
-        for name, value in options.arguments_for(identify_recording).items()
-        if value is not None
-    }
+    choices = {}
+    for name, value in options.arguments_for(identify_recording).items():
+        if value is not None:
+            choices[name] = value
     if not options.force:
         require_same_inputs(
             options.output,

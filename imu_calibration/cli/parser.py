@@ -389,11 +389,11 @@ class Options(argparse.Namespace):
 
     def arguments_for(self, function: Callable) -> dict[str, Any]:
         """Return the options whose names are parameters of a function."""
-        return {
-            name: value
-            for name, value in vars(self).items()
-            if name in signature(function).parameters
-        }
+        found = {}
+        for name, value in vars(self).items():
+            if name in signature(function).parameters:
+                found[name] = value
+        return found
 
 
 def complain(text: str) -> None:

@@ -239,11 +239,10 @@ class RawReadings:
         units = {}
         for sensor in SI_UNITS:
             entry = mapping.get(sensor)
-            flat = {
-                name: mapping[f'{sensor}_{name}']
-                for name in ('scale', 'offset')
-                if f'{sensor}_{name}' in mapping
-            }
+            flat = {}
+            for name in ('scale', 'offset'):
+                if f'{sensor}_{name}' in mapping:
+                    flat[name] = mapping[f'{sensor}_{name}']
             if entry is not None and flat:
                 raise InputError(
                     f'{place} must describe the {sensor} once, it has {sensor} and'

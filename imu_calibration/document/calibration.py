@@ -165,11 +165,10 @@ class Calibration:
     @property
     def status_by_name(self) -> dict[str, str]:
         """Status of each parameter of the sensors with readings, and of the common scale."""
-        found = {
-            name: status
-            for name, status in zip(self.param_names, self.status)
-            if name.partition('.')[0] not in self.absent
-        }
+        found = {}
+        for name, status in zip(self.param_names, self.status):
+            if name.partition('.')[0] not in self.absent:
+                found[name] = status
         if self.common_scale:
             found[COMMON_SCALE] = self.common_scale['status']
         return found
@@ -246,11 +245,11 @@ class Calibration:
         Table, clock and the common arm are nuisances: they belong to the reference.
         """
         nuisances = set(np.array(self.param_names)[~self.model.requested])
-        return {
-            name: status
-            for name, status in self.status_by_name.items()
-            if name not in nuisances and status != FIXED and name.partition('.')[0] in SENSORS
-        }
+        found = {}
+        for name, status in self.status_by_name.items():
+            if name not in nuisances and status != FIXED and name.partition('.')[0] in SENSORS:
+                found[name] = status
+        return found
 
     @overload
     def compensate(self, samples: ImuSamples, *, temperature_c: Any = None) -> ImuSamples: ...

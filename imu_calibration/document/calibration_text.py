@@ -230,17 +230,14 @@ def check_numbers(calibration: Calibration) -> Calibration:
 
 
 def _without_ill_conditioned(calibration: Calibration) -> Calibration:
-    condition = {
-        sensor: float(np.linalg.cond(calibration.of(sensor, Role.LINEAR))) for sensor in SENSORS
-    }
-    wrong = {
-        sensor: (
-            f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its'
-            f' condition number is {number:.3g}; calibrate again with more attitudes'
-        )
-        for sensor, number in condition.items()
-        if not number < CONDITION_LIMIT
-    }
+    wrong = {}
+    for sensor in SENSORS:
+        condition = float(np.linalg.cond(calibration.of(sensor, Role.LINEAR)))
+        if not condition < CONDITION_LIMIT:
+            wrong[sensor] = (
+                f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its'
+                f' condition number is {condition:.3g}; calibrate again with more attitudes'
+            )
     if len(wrong) == len(SENSORS):
         raise DocumentError(next(iter(wrong.values())), code='ill_conditioned')
     if not wrong:
@@ -342,11 +339,10 @@ def _model(document: Mapping[str, Any]) -> SensorModel:
     """Return the SensorModel of the effects that a document lists."""
     joint_names = JointNames.of(document.get('joint_names', JOINTS), document.get('joint_errors'))
     catalogue = CATALOGUE.with_definitions(document.get('effects') or {})
-    owners = {
-        effect.name: effect.sensor
-        for effect in catalogue.effects(joint_names).values()
-        if effect.in_reference
-    }
+    owners = {}
+    for effect in catalogue.effects(joint_names).values():
+        if effect.in_reference:
+            owners[effect.name] = effect.sensor
     members: dict[str, list[str]] = {section: [] for section in SECTIONS}
     for section in SECTIONS:
         names = (document.get(section) or {'effects': []})['effects']
@@ -457,11 +453,10 @@ def _section(calibration: Calibration, section: str) -> dict[str, Any]:
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit),
             'status': status.tolist(),
         }
-        centre = {
-            group.name: calibration.model.centre[group.name]
-            for group in effect.groups
-            if group.name in calibration.model.centre
-        }
+        centre = {}
+        for group in effect.groups:
+            if group.name in calibration.model.centre:
+                centre[group.name] = calibration.model.centre[group.name]
         if centre:
             entries[effect.name]['centre'] = plain(
                 {name: part.constant for name, part in centre.items()}

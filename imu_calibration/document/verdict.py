@@ -94,16 +94,18 @@ LOST_SHARE = 0.05
 
 def _doubtful_scales(calibration: Calibration) -> list[Reason]:
     """Return a warning for each sensor with a scale factor that a wrong unit may explain."""
-    return [
-        Reason(
-            WARNING,
-            question,
-            CONVERT,
-            key=f'{sensor}_unit',
-            sensors=(sensor,),
+    found = []
+    for sensor, question in scale_questions(calibration).items():
+        found.append(
+            Reason(
+                WARNING,
+                question,
+                CONVERT,
+                key=f'{sensor}_unit',
+                sensors=(sensor,),
+            )
         )
-        for sensor, question in scale_questions(calibration).items()
-    ]
+    return found
 
 
 def _worse(calibration: Calibration) -> list[Reason]:
@@ -207,17 +209,19 @@ def _adopted(calibration: Calibration) -> list[Reason]:
 
 def _unexplained(calibration: Calibration) -> list[Reason]:
     """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
-    return [
-        Reason(
-            NOTE,
-            unexplained_text(sensor, rest['rms'], rest.get('unit'))
-            + (f' ({", ".join(rest["axes"])})' if rest['axes'] else ''),
-            'find the cause',
-            key='diagnose',
-            sensors=(sensor,),
+    found = []
+    for sensor, rest in (calibration.statistics.get('unexplained') or {}).items():
+        found.append(
+            Reason(
+                NOTE,
+                unexplained_text(sensor, rest['rms'], rest.get('unit'))
+                + (f' ({", ".join(rest["axes"])})' if rest['axes'] else ''),
+                'find the cause',
+                key='diagnose',
+                sensors=(sensor,),
+            )
         )
-        for sensor, rest in (calibration.statistics.get('unexplained') or {}).items()
-    ]
+    return found
 
 
 def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
@@ -578,11 +582,10 @@ def _absent(calibration: Calibration) -> list[Reason]:
                 f'the recording has no readings of the {sensor}: it is not calibrated, and its'
                 ' readings are not corrected'
             )
-            lacking = [
-                effect.name
-                for effect in without_input(calibration.model, [sensor])
-                if effect.sensor != sensor and effect.compensation == 'exact'
-            ]
+            lacking = []
+            for effect in without_input(calibration.model, [sensor]):
+                if effect.sensor != sensor and effect.compensation == 'exact':
+                    lacking.append(effect.name)
             if lacking:
                 text += f'; without its readings {", ".join(lacking)} cannot be corrected'
             reasons.append(Reason(NOTE, text, '', sensors=(sensor,)))

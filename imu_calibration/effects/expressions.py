@@ -318,11 +318,11 @@ def added(*sums: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
 
 def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str, ...], float]:
     """Return a multiple of a sum of products."""
-    return {
-        factors: factor * coefficient
-        for factors, coefficient in terms.items()
-        if factor * coefficient != 0.0
-    }
+    found = {}
+    for factors, coefficient in terms.items():
+        if factor * coefficient != 0.0:
+            found[factors] = factor * coefficient
+    return found
 
 
 def _multiplied(left, right):

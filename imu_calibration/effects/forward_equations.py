@@ -450,15 +450,17 @@ def not_applied(model: SensorModel) -> list[Effect]:
 
     Drifts, formulas in joint angles or time.
     """
-    return [
-        effect
-        for effect in model.effects
-        if effect.sensor in SENSORS
-        and effect.compensation == 'none'
-        and not effect.in_reference
-        and effect.warp is None
-        and effect.groups
-    ]
+    found = []
+    for effect in model.effects:
+        if (
+            effect.sensor in SENSORS
+            and effect.compensation == 'none'
+            and not effect.in_reference
+            and effect.warp is None
+            and effect.groups
+        ):
+            found.append(effect)
+    return found
 
 
 def in_time(effect: Effect) -> bool:

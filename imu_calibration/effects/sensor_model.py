@@ -296,11 +296,11 @@ class SensorModel:
 
     def values_of(self, sensor: str, values: np.ndarray) -> dict[str, np.ndarray]:
         """Return {effect name: values} that concern `sensor`, its own and the reference's."""
-        return {
-            e.name: values[self.slices[e.key]]
-            for e in self.effects
-            if e.sensor in (sensor, 'reference')
-        }
+        found = {}
+        for e in self.effects:
+            if e.sensor in (sensor, 'reference'):
+                found[e.name] = values[self.slices[e.key]]
+        return found
 
     def with_effect(self, sensor: str, name: str) -> 'SensorModel':
         """Return the model extended by one effect."""
@@ -352,11 +352,11 @@ class SensorModel:
 
     def concerning(self, sensor: str) -> list[Effect]:
         """Return the effects that contribute columns to `sensor`."""
-        return [
-            e
-            for e in self.effects
-            if e.sensor == sensor or (e.sensor == 'reference' and sensor in e.acts_on)
-        ]
+        found = []
+        for e in self.effects:
+            if e.sensor == sensor or (e.sensor == 'reference' and sensor in e.acts_on):
+                found.append(e)
+        return found
 
     def groups(self, sensor: str) -> list[tuple[str, int]]:
         """Return the columns of `sensor` in order: (group name, width)."""

@@ -350,11 +350,10 @@ class Table:
 
 def site_from_mapping(site: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a valid description except the joints, as arguments of `Table`."""
-    values = {
-        name: value
-        for name, value in site.items()
-        if value is not None and name not in ('mount', 'joints')
-    }
+    values = {}
+    for name, value in site.items():
+        if value is not None and name not in ('mount', 'joints'):
+            values[name] = value
     mount = site.get('mount') or {}
     return values | {f'mount_{name}': value for name, value in mount.items() if value is not None}
 

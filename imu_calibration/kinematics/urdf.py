@@ -413,11 +413,10 @@ def _with_limits(joints, entries, link):
         limits = mapping({'name': text()}, LIMITS[known.type], closed=True)
         require(entry, replace(SITE, name=f"limits of joint '{name}'"), limits)
         given = limits_from_mapping(entry, known.type)
-        better = {
-            key: value
-            for key, value in vars(given).items()
-            if key != 'described' and value is not None and value is not False
-        }
+        better = {}
+        for key, value in vars(given).items():
+            if key != 'described' and value is not None and value is not False:
+                better[key] = value
         if given.endless or given.lower is not None:  # a range and endless exclude each other
             better = {'lower': None, 'upper': None, 'endless': False} | better
         better['described'] = known.limits.described - set(better)

@@ -93,13 +93,15 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
 
 def _imu_topics(node):
     """Return the published topics with Imu messages, or with names of Imu topics."""
-    return [
-        name
-        for name, types in sorted(node.get_topic_names_and_types())
-        if (TYPE in types or name.endswith(IMU_TOPIC_ENDINGS))
-        and not name.endswith(NOT_MEASURED)
-        and node.count_publishers(name)
-    ]
+    found = []
+    for name, types in sorted(node.get_topic_names_and_types()):
+        if (
+            (TYPE in types or name.endswith(IMU_TOPIC_ENDINGS))
+            and not name.endswith(NOT_MEASURED)
+            and node.count_publishers(name)
+        ):
+            found.append(name)
+    return found
 
 
 def _spin(node, spin_once, seconds):

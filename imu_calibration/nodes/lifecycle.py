@@ -263,11 +263,10 @@ error.
 def settings_of(node: str) -> list[type]:
     """Return the settings classes that the module of `node` declares as parameters."""
     tree = ast.parse(Path(__file__).with_name(f'{node}.py').read_text())
-    calls = [
-        call
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters'
-    ]
+    calls = []
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters':
+            calls.append(call)
     module = importlib.import_module(f'imu_calibration.nodes.{node}')
     return [
         getattr(module, ast.unparse(call.args[1]))

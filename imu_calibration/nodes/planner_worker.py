@@ -255,11 +255,10 @@ def findings_from(values: dict[str, str]) -> list[Suspect]:
     """
     if values.get('outcome') != FOUND:
         return []
-    found = [
-        (key.removeprefix(MATES_KEY), value.split())
-        for key, value in values.items()
-        if key.startswith(MATES_KEY)
-    ]
+    found = []
+    for key, value in values.items():
+        if key.startswith(MATES_KEY):
+            found.append((key.removeprefix(MATES_KEY), value.split()))
     return [
         Suspect(
             effect,

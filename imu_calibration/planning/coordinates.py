@@ -81,14 +81,14 @@ class Coordinates:
     @cached_property
     def slopes(self) -> dict[str, np.ndarray]:
         """Sensor -> derivative of the coefficients of the columns by z, shape (n_columns, 3, n)."""
-        return {
-            sensor: np.einsum(
+        found = {}
+        for sensor in SENSORS:
+            found[sensor] = np.einsum(
                 'cap,pq->caq',
                 coefficient_jacobian(self.folded, sensor, self.values) * self.units,
                 self.basis,
             )
-            for sensor in SENSORS
-        }
+        return found
 
     @property
     def names(self) -> list[str]:
@@ -264,11 +264,10 @@ class ToldApart:
         The covariance is a lower bound of all plans.
         """
         enough_left = self.noncentrality(covariance[None])[0] >= 1.0
-        apart = {
-            (a.key, b.key)
-            for (a, b), reached in zip(self.pairs, enough_left, strict=True)
-            if reached
-        }
+        apart = set()
+        for (a, b), reached in zip(self.pairs, enough_left, strict=True):
+            if reached:
+                apart.add((a.key, b.key))
         self.reachable = np.array(
             [(a.key, b.key) in apart and (b.key, a.key) in apart for a, b in self.pairs]
         )

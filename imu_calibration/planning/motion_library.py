@@ -201,15 +201,15 @@ def candidates(limits: MotionLimits) -> np.ndarray:
     spread = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)
     parts = [home[None], spread]
     if len(limits) <= 3:
-        steps = [
-            (
-                np.arange(np.ceil(a / POSITION_GRID - 1e-9), np.floor(b / POSITION_GRID + 1e-9) + 1)
-                * POSITION_GRID
-                if turning
-                else np.linspace(a, b, 3)
-            )
-            for a, b, turning in zip(lower, upper, limits.turns, strict=True)
-        ]
+        steps = []
+        for a, b, turning in zip(lower, upper, limits.turns, strict=True):
+            if not turning:
+                steps.append(np.linspace(a, b, 3))
+                continue
+            # Multiples of the grid within the limits, those of rounding errors included.
+            first = np.ceil(a / POSITION_GRID - 1e-9)
+            last = np.floor(b / POSITION_GRID + 1e-9)
+            steps.append(np.arange(first, last + 1) * POSITION_GRID)
         grid = np.stack(np.meshgrid(*steps, indexing='ij'), axis=-1).reshape(-1, len(limits))
         parts.insert(1, grid[np.lexsort(np.abs(grid).T)])
     return np.concatenate(parts)

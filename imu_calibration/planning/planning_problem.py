@@ -406,16 +406,16 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
         'accelerometer': (noise.accel_density, noise.accel_instability, noise.accel_resolution),
         'gyroscope': (noise.gyro_density, noise.gyro_instability, noise.gyro_resolution),
     }
-    return {
-        sensor: NoiseModel(
+    found = {}
+    for sensor, (density, instability, resolution) in figures.items():
+        found[sensor] = NoiseModel(
             np.full(3, density**2 * rate + resolution**2 / 12),
             np.ones(3),
             bias_processes=(
                 (BiasProcess(instability, noise.correlation_time),) if instability > 0 else ()
             ),
         )
-        for sensor, (density, instability, resolution) in figures.items()
-    }
+    return found
 
 
 def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:

@@ -297,11 +297,11 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def _fast_streams(evidence):
     """Return (message type, StreamStatistics) of the IMU and the joints."""
-    return [
-        (MESSAGES[name], evidence.streams[name])
-        for name in ('imu', 'joints')
-        if name in evidence.streams
-    ]
+    found = []
+    for name in ('imu', 'joints'):
+        if name in evidence.streams:
+            found.append((MESSAGES[name], evidence.streams[name]))
+    return found
 
 
 def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

@@ -75,11 +75,11 @@ def _wrong_axes(matrix):
     """
     Return (row, column, sign) of the entries of a signed permutation that differ from the identity.
     """
-    return [
-        (int(i), int(j), float(matrix[i, j]))
-        for i, j in np.argwhere(matrix)
-        if i != j or matrix[i, j] < 0
-    ]
+    found = []
+    for i, j in np.argwhere(matrix):
+        if i != j or matrix[i, j] < 0:
+            found.append((int(i), int(j), float(matrix[i, j])))
+    return found
 
 
 def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:

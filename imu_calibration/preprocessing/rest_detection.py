@@ -391,11 +391,10 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
         longest=settings.static_minimum,
         floor=QuietFloor(),
     )
-    found = [
-        piece
-        for piece in _intervals(imu.stamp_ns, quiet, period, settings)
-        if _keeps_attitude(imu.force_s[piece], period)
-    ]
+    found = []
+    for piece in _intervals(imu.stamp_ns, quiet, period, settings):
+        if _keeps_attitude(imu.force_s[piece], period):
+            found.append(piece)
     found = _at_one_rate(imu.rate_s, found, period, settings.static_minimum)
     return _not_turning(imu.rate_s, _trimmed(imu, found, period, settings.static_minimum))
 

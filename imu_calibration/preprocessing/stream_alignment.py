@@ -318,17 +318,18 @@ class MotionChunks:
         time = (joints.stamp_ns - self._start_ns) / 1e9
         step = np.diff(time)
         joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
-        runs = [
-            JointRun(
-                time[a:b],
-                joints.position[a:b],
-                joints.velocity[a:b],
-                settings=self._settings,
-                noise_rad=self._noise_rad,
-            )
-            for a, b in runs_of(np.ones(len(time)), step > joint_limit)
-            if b - a >= LEAST_READINGS
-        ]
+        runs = []
+        for a, b in runs_of(np.ones(len(time)), step > joint_limit):
+            if b - a >= LEAST_READINGS:
+                runs.append(
+                    JointRun(
+                        time[a:b],
+                        joints.position[a:b],
+                        joints.velocity[a:b],
+                        settings=self._settings,
+                        noise_rad=self._noise_rad,
+                    )
+                )
         return runs, limit
 
     def _phases(self, time, runs, final):

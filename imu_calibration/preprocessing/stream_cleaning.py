@@ -619,12 +619,12 @@ class BlockCleaner:
     def statistics(self, gap: float = 0.1) -> dict[str, StreamStatistics]:
         """Return stream name -> `StreamStatistics`; `gap` as for `StreamCheck.statistics`."""
         self._clean()
-        return {
-            name: replace(
+        found = {}
+        for name, check in self._checks.items():
+            found[name] = replace(
                 check.statistics(gap), unstamped=self.notes.get(f'{MESSAGES[name]} zero stamp', 0)
             )
-            for name, check in self._checks.items()
-        }
+        return found
 
     @property
     def sources(self) -> TwoSourceSearch:

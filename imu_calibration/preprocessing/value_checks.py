@@ -362,18 +362,17 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         total = 0
         level = 0.0
         for axis, ends in enumerate(evidence.ends[part]):
-            counts = [
-                (
-                    _clipped(end, sign * held[:, axis], evidence.chunks.size)
-                    if end.level > least[axis] and (fine[axis] or end.jumped)
-                    else 0
-                )
-                for sign, end in zip((1, -1), ends)
-            ]
-            if sum(counts):
-                words.append(f'{"xyz"[axis]} {sum(counts)}')
-                total = total + sum(counts)
-                level = max([level, *(end.level for end, count in zip(ends, counts) if count)])
+            count = 0
+            for sign, end in zip((1, -1), ends):
+                if not (end.level > least[axis] and (fine[axis] or end.jumped)):
+                    continue
+                clipped = _clipped(end, sign * held[:, axis], evidence.chunks.size)
+                if clipped:
+                    count += clipped
+                    level = max(level, end.level)
+            if count:
+                words.append(f'{"xyz"[axis]} {count}')
+                total = total + count
         if words:
             people = (
                 f' ({level / DEG:.0f} deg/s)'
@@ -480,11 +479,10 @@ def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every message carries a new measurement."""
     frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
     share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
-    noisy = [
-        evidence.quiet_range[part].all()
-        for sensor, part in SENSOR_COLUMNS.items()
-        if sensor not in evidence.absent
-    ]
+    noisy = []
+    for sensor, part in SENSOR_COLUMNS.items():
+        if sensor not in evidence.absent:
+            noisy.append(evidence.quiet_range[part].all())
     if share > REPEATED_SHARE and all(noisy):
         yield CheckFinding(
             'repeated_readings',

@@ -77,11 +77,10 @@ class Window:
 
     def select(self, index: Any) -> 'Window':
         """Return the samples at `index` (slice, mask or integer array)."""
-        rows = {
-            name: value[index]
-            for name, value in vars(self).items()
-            if isinstance(value, np.ndarray) and name != 'joint_step'
-        }
+        rows = {}
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray) and name != 'joint_step':
+                rows[name] = value[index]
         return replace(
             self,
             motion=self.motion.select(index) if len(self.motion) == len(self) else self.motion,
@@ -247,11 +246,12 @@ def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | 
 
     Or None.
     """
-    known = [
-        [w.temperature_c.mean()] if w.kind == WindowKind.STATIC else w.temperature_c
-        for w in windows
-        if w.temperature_c is not None
-    ]
+    known = []
+    for w in windows:
+        if w.temperature_c is not None:
+            known.append(
+                [w.temperature_c.mean()] if w.kind == WindowKind.STATIC else w.temperature_c
+            )
     temperatures = np.concatenate(known) if len(known) == len(windows) else None
     if len(windows) == 1:
         return windows[0].motion, temperatures

@@ -543,8 +543,8 @@ def dropped(counts: dict[str | UnusedReason | WindowKind, int]) -> dict[str, int
 
     Without zeros.
     """
-    return {
-        reason: int(count)
-        for reason, count in sorted(counts.items())
-        if count and reason not in ACCEPTED
-    }
+    found = {}
+    for reason, count in sorted(counts.items()):
+        if count and reason not in ACCEPTED:
+            found[reason] = int(count)
+    return found

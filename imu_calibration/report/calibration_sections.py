@@ -182,11 +182,10 @@ def budget_section(result: CalibrationResult) -> dict[str, Any]:
     The standard deviations are given by cause and by term of the reported variances.
     """
     budget = result.error_budget()
-    terms = {
-        name: np.sqrt(np.maximum(variance, 0.0))
-        for name, variance in result.calibration.covariance_terms.items()
-        if np.any(variance > 0)
-    }
+    terms = {}
+    for name, variance in result.calibration.covariance_terms.items():
+        if np.any(variance > 0):
+            terms[name] = np.sqrt(np.maximum(variance, 0.0))
     figure = draw(
         'budget',
         (8.6, 0.9 + 0.26 * len(_effects(result))),
@@ -209,11 +208,11 @@ def budget_section(result: CalibrationResult) -> dict[str, Any]:
 
 def _effects(result):
     model = result.calibration.model
-    return [
-        (e, model.slices[e.key])
-        for e in model.effects
-        if np.any(result.calibration.sd[model.slices[e.key]] > 0)
-    ]
+    found = []
+    for e in model.effects:
+        if np.any(result.calibration.sd[model.slices[e.key]] > 0):
+            found.append((e, model.slices[e.key]))
+    return found
 
 
 def _dots(figure, result, budget):

@@ -142,16 +142,16 @@ def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> 
     Turns about two axes at a time.
     """
     a, b = speeds_deg
-    return [
-        two_axes(at, rates, dwell)
-        for at, rates in (
-            ([0, 0, 0], [a, 0, b]),
-            ([0, 0, 0], [a, b, 0]),
-            ([0, 0, 90], [a, -b, 0]),
-            ([0, 45, 0], [a, 0, -b]),
-            ([0, 0, 30], [0, b, a]),
-        )
-    ]
+    found = []
+    for at, rates in (
+        ([0, 0, 0], [a, 0, b]),
+        ([0, 0, 0], [a, b, 0]),
+        ([0, 0, 90], [a, -b, 0]),
+        ([0, 45, 0], [a, 0, -b]),
+        ([0, 0, 30], [0, b, a]),
+    ):
+        found.append(two_axes(at, rates, dwell))
+    return found
 
 
 AXIS_ORDERS = ('XYX', 'XYZ', 'XZX', 'XZY', 'YXY', 'YXZ', 'YZX', 'YZY', 'ZXY', 'ZXZ', 'ZYX', 'ZYZ')

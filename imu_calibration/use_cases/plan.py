@@ -148,11 +148,13 @@ class Planned:
 
         names = self.plan.moved_joints
         begins = np.concatenate([[0.0], self.plan.ends[:-1]])
-        return [
-            (PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
-            for begin, segments in zip(begins, self.plan.segments, strict=True)
-            if segments
-        ]
+        found = []
+        for begin, segments in zip(begins, self.plan.segments, strict=True):
+            if segments:
+                found.append(
+                    (PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
+                )
+        return found
 
     def __str__(self):
         return '\n'.join([*plan_summary(self.plan), *self.notes])

@@ -342,11 +342,10 @@ def temperatures(path: str | PathLike, topics: Topics) -> TemperatureSamples | N
     parts = []
     with open_bag(path, topics, want_joints=False) as recording:
         if recording.temperature_topic:
-            parts = [
-                block.temperature
-                for block in recording.blocks()
-                if block.temperature is not None and len(block.temperature)
-            ]
+            parts = []
+            for block in recording.blocks():
+                if block.temperature is not None and len(block.temperature):
+                    parts.append(block.temperature)
     return TemperatureSamples.concatenate(parts) if parts else None
 
 

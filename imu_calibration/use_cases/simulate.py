@@ -228,12 +228,11 @@ def replay(
     require_joints(known.model, given)
     noise = None
     if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
-        noise = {
-            sensor: ReplayNoise(
+        noise = {}
+        for sensor in SENSORS:
+            noise[sensor] = ReplayNoise(
                 *known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME
             )
-            for sensor in SENSORS
-        }
     report('simulating')
     samples, lost = run_replay(
         source, given, known.model, values=known.values, noise=noise, seed=seed

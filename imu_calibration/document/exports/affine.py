@@ -270,11 +270,10 @@ def find_pose(content: bytes) -> tuple[Placement, str] | None:
     line = re.search(rf'{PUBLISHER} (.*)', content.decode(errors='replace'))
     try:
         words = shlex.split(line.group(1).partition('"')[0]) if line else []
-        options = {
-            name.removeprefix('--'): value
-            for name, value in zip(words, words[1:], strict=False)
-            if name.startswith('--')
-        }
+        options = {}
+        for name, value in zip(words, words[1:], strict=False):
+            if name.startswith('--'):
+                options[name.removeprefix('--')] = value
         values = np.array([float(options[name]) for name in POSE_NUMBERS])
         parent = options[PARENT]
     except (KeyError, ValueError):

@@ -391,11 +391,10 @@ def find_target(name: str, *, read: bool = False) -> Target:
         When there is none.
 
     """
-    fitting = {
-        target.name: target
-        for target in all_targets().values()
-        if (target.read if read else target.write) is not None
-    }
+    fitting = {}
+    for target in all_targets().values():
+        if (target.read if read else target.write) is not None:
+            fitting[target.name] = target
     if name not in fitting:
         raise InputError(
             f'the name of a program whose files can be {"read" if read else "written"} is required,'
