@@ -480,10 +480,6 @@ def add_verbs(
 def _usage(action):
     """Return a required argument as the usage line shows it."""
     name = action.metavar or action.dest.upper()
-    return (
-        f'{action.option_strings[0]} {name}'
-        if action.option_strings
-        else f'{name} [{name} ...]'
-        if action.nargs == '+'
-        else name
-    )
+    if action.option_strings:
+        return f'{action.option_strings[0]} {name}'
+    return f'{name} [{name} ...]' if action.nargs == '+' else name

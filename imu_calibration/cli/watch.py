@@ -265,14 +265,12 @@ def screen(node: str, statuses: dict[str, NodeStatus], picture: str, *, out: Ter
     for name, status in statuses.items():
         if name not in NOT_GROUPS:
             ratio = ratio_of(status)
-            style = 'dim' if math.isnan(ratio) else 'green' if ratio <= 1 else 'yellow'
-            rows.append(
-                [
-                    name.replace('accelerometer', 'accel.').replace('gyroscope', 'gyro.'),
-                    (bar(ratio), style),
-                    '-' if math.isnan(ratio) else f'{ratio:.2g}',
-                ]
-            )
+            short = name.replace('accelerometer', 'accel.').replace('gyroscope', 'gyro.')
+            if math.isnan(ratio):
+                rows.append([short, (bar(ratio), 'dim'), '-'])
+            else:
+                style = 'green' if ratio <= 1 else 'yellow'
+                rows.append([short, (bar(ratio), style), f'{ratio:.2g}'])
     if rows:
         headings = ('parameters', f'{"":{round(BAR / 4)}}| determined', 'x tolerance')
         lines += out.table([[(heading, 'dim') for heading in headings], *rows], right=[2])

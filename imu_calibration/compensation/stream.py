@@ -496,10 +496,9 @@ class SampleCompensation:
         Covariances of the readings, (3, 3), may be zero or invalid: the noise of the calibration is
         used; or None: not measured.
         """
-        force, rate = (
-            np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise
-            for cov, noise in zip((force_cov, rate_cov), self._uncertainty.noise)
-        )
+        of_force, of_rate = self._uncertainty.noise
+        force = _stated_covariance(force_cov, of_force)
+        rate = _stated_covariance(rate_cov, of_rate)
         return self._sensitivity.covariances(force, rate, self.with_parameters)
 
     def refresh(self) -> None:
@@ -554,3 +553,14 @@ class SampleCompensation:
     def _take_derivative(self):
         self._uncertainty.use(self.slope.derivative, self.slope.period)
         self.refresh()
+
+
+def _stated_covariance(covariance: np.ndarray | None, noise: np.ndarray) -> np.ndarray:
+    """
+    Return the covariance of a reading, zero where it is not measured.
+
+    That of the `noise` where the message states none.
+    """
+    if covariance is None:
+        return np.zeros((3, 3))
+    return covariance if is_known(covariance) else noise

@@ -102,13 +102,11 @@ def printable(text: str) -> str:
 
     These are each line end, control character, change of direction and undecodable byte.
     """
-    return (
-        text
-        if text.isprintable() and '\ufffd' not in text
-        else ''.join(
-            character if character.isprintable() and character != '\ufffd' else '?'
-            for character in text
-        )
+    if text.isprintable() and '\ufffd' not in text:
+        return text
+    return ''.join(
+        character if character.isprintable() and character != '\ufffd' else '?'
+        for character in text
     )
 
 

@@ -78,18 +78,7 @@ class AlignedArrays:
 
     def select(self, index: Any) -> Any:
         """Return the rows at `index` (slice, mask or integer array)."""
-        return type(self)(
-            **{
-                name: (
-                    value[index]
-                    if isinstance(value, np.ndarray)
-                    else value.select(index)
-                    if isinstance(value, AlignedArrays)
-                    else value
-                )
-                for name, value in vars(self).items()
-            }
-        )
+        return type(self)(**{name: _selected(value, index) for name, value in vars(self).items()})
 
     @classmethod
     def concatenate(cls, parts: Iterable[Any]) -> Any:
@@ -103,6 +92,12 @@ class AlignedArrays:
         return cls(
             **{name: _joined([getattr(part, name) for part in parts]) for name in vars(parts[0])}
         )
+
+
+def _selected(value, index):
+    if isinstance(value, np.ndarray):
+        return value[index]
+    return value.select(index) if isinstance(value, AlignedArrays) else value
 
 
 def _joined(values):

@@ -99,14 +99,14 @@ class StaticTransforms:
             return 'no static transform has come'
         absent = [f"'{name}'" for name in (target, source) if name not in known]
         names = ', '.join(sorted(known)[:NAMED]) + (', ...' if len(known) > NAMED else '')
-        return (
-            f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came'
-            f' (frames: {names})'
-            if absent
-            else (
-                f"'{target}' and '{source}' are in trees without a static connection (roots:"
-                f' {self._to_root(target)[-1][0]}, {self._to_root(source)[-1][0]})'
+        if absent:
+            return (
+                f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came'
+                f' (frames: {names})'
             )
+        return (
+            f"'{target}' and '{source}' are in trees without a static connection (roots:"
+            f' {self._to_root(target)[-1][0]}, {self._to_root(source)[-1][0]})'
         )
 
     def _to_root(self, frame):

@@ -375,14 +375,10 @@ class CalibrationNode(Node):
         state = self.worker.state
         about_topics = [line for each in self._inputs.values() for line in each.faults()]
         streams = state.streams
-        silent = (
-            []
-            if streams is None
-            else [
-                self._inputs[name].silence(streams.unusable.get(name, ''))
-                for name in streams.silent
-            ]
-        )
+        silent = []
+        if streams is not None:
+            for name in streams.silent:
+                silent.append(self._inputs[name].silence(streams.unusable.get(name, '')))
         if 'joints' not in self._inputs and self.count_publishers(
             self.resolve_topic_name('joint_states')
         ):

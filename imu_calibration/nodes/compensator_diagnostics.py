@@ -110,7 +110,9 @@ class CompensatorDiagnostics:
         notes += doubts
         adopted: Adopted | None = node.adopted
         notes += [] if adopted is None else adopted.caveats
-        level = ERROR if serious else WARN if notes else OK
+        level = WARN if notes else OK
+        if serious:
+            level = ERROR
         good = ''
         if adopted is not None:
             good = (

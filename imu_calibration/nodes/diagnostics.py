@@ -152,11 +152,8 @@ class Complaints:
         An ended one is repeated after `patience` seconds at least. With `replaces` the lines of the
         source are states of one fault, which ends when there is no line.
         """
-        present = {
-            kind_of(source, line): (level, line)
-            for level, lines in ((LOG_WARN, warnings), (LOG_ERROR, errors))
-            for line in lines
-        }
+        present = {kind_of(source, line): (LOG_WARN, line) for line in warnings}
+        present |= {kind_of(source, line): (LOG_ERROR, line) for line in errors}
         for kind in [
             kind for kind in self._open if kind.startswith(source + ':') and kind not in present
         ]:

@@ -274,13 +274,9 @@ class PlannerNode(Node):
         """Stop the joints; return the outcome."""
         unstopped = self.driver.is_driving  # the context has ended, and no message can be sent
         self.worker.end()
-        return (
-            'the joints finish the motion that they are in'
-            if unstopped
-            else MID_MOTION
-            if self._is_halted
-            else ''
-        )
+        if unstopped:
+            return 'the joints finish the motion that they are in'
+        return MID_MOTION if self._is_halted else ''
 
     def halt(self) -> None:
         """Stop the joints; called at the first signal, while messages can still be sent."""
@@ -506,14 +502,12 @@ class PlannerNode(Node):
                 True,
             )
         self.worker.go(motions)
-        what = (
-            'one motion, then it rests'
-            if motions > 0
-            else (
+        what = 'one motion, then it rests'
+        if motions <= 0:
+            what = (
                 'plans and moves until every parameter is within its tolerance; the first motion is'
                 ' small, the first large one slow'
             )
-        )
         return True, f'{what}; limits: {self._limit_words()}'
 
     def _limit_words(self) -> str:
@@ -571,7 +565,9 @@ class PlannerNode(Node):
                 'told apart': ' '.join(campaign.told_apart),
             }
         faults = self._joints.faults() + self._calibrations.faults()
-        level = ERROR if driver.state == DriveState.STOPPED else WARN if faults else OK
+        level = WARN if faults else OK
+        if driver.state == DriveState.STOPPED:
+            level = ERROR
         return [
             make_status(
                 level,

@@ -259,16 +259,13 @@ def findings_from(values: dict[str, str]) -> list[Suspect]:
     for key, value in values.items():
         if key.startswith(MATES_KEY):
             found.append((key.removeprefix(MATES_KEY), value.split()))
-    return [
-        Suspect(
-            effect,
-            tuple(mates),
-            {
-                key.removeprefix(f'{SIZE_KEY}{each}.'): float(value)
-                for each in (effect, *mates)
-                for key, value in values.items()
-                if key.startswith(f'{SIZE_KEY}{each}.')
-            },
-        )
-        for effect, mates in found
-    ]
+    suspects = []
+    for effect, mates in found:
+        sizes = {}
+        for each in (effect, *mates):
+            prefix = f'{SIZE_KEY}{each}.'
+            for key, value in values.items():
+                if key.startswith(prefix):
+                    sizes[key.removeprefix(prefix)] = float(value)
+        suspects.append(Suspect(effect, tuple(mates), sizes))
+    return suspects

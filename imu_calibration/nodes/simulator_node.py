@@ -338,13 +338,12 @@ class SimulatorNode(Node):
         due = np.concatenate(
             [(samples.stamp_ns - self._simulation.start_ns) * 1e-9 for _, samples, _ in parts]
         )
-        publishers = [publisher for publisher, samples, _ in parts for _ in range(len(samples))]
-        messages = [
-            message
-            for _, samples, encode in parts
-            if len(samples)
-            for message in Packed.of_rows(encode(samples)).views()
-        ]
+        publishers = []
+        messages = []
+        for publisher, samples, encode in parts:
+            publishers += [publisher] * len(samples)
+            if len(samples):
+                messages += Packed.of_rows(encode(samples)).views()
         order = np.argsort(due, kind='stable')
         return Batch(
             due[order], [publishers[k] for k in order], [messages[k] for k in order], until

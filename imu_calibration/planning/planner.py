@@ -559,14 +559,9 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so.
     """
     begins = [0.0, *plan.ends.tolist()]
-    of_joints = (
-        {}
-        if plan.start is None
-        else {
-            'probability': PROBABILITY,
-            'joints': list(plan.moved_joints),
-        }
-    )
+    of_joints: dict[str, Any] = {}
+    if plan.start is not None:
+        of_joints = {'probability': PROBABILITY, 'joints': list(plan.moved_joints)}
     return {
         'format': PLAN_FORMAT,
         'seconds': round(plan.seconds, 3),

@@ -281,14 +281,13 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             )
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
-            text = (
-                f'{count} of {total} samples {STAMP_FAULTS[reason]}'
-                if reason != 'clock reset'
-                else (
+            if reason == 'clock reset':
+                text = (
                     f'the stamps jump {"once" if count == 1 else f"{count} times"}: the clock was'
                     ' set while recording; the parts are processed separately'
                 )
-            )
+            else:
+                text = f'{count} of {total} samples {STAMP_FAULTS[reason]}'
             yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {text}')
         clean += [] if found.dropped else [MESSAGES[name]]
     if clean:

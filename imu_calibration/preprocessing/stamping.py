@@ -687,4 +687,6 @@ class SampleTimes:
 
 def _joined(parts: list) -> ImuSamples | None:
     parts = [part for part in parts if part is not None and len(part)]
-    return parts[0] if len(parts) == 1 else ImuSamples.concatenate(parts) if parts else None
+    if not parts:
+        return None
+    return parts[0] if len(parts) == 1 else ImuSamples.concatenate(parts)

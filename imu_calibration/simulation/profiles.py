@@ -186,13 +186,9 @@ def make_profile(
         )
     # A description in a mapping states no limits.
     limits = limits_of(table) if isinstance(table, Table) else free_limits(len(joint_names))
-    build = (
-        within_limits
-        if entry.adapts and not limits.endless.all()
-        else entry.build
-        if fits
-        else _any_table
-    )
+    build = entry.build if fits else _any_table
+    if entry.adapts and not limits.endless.all():
+        build = within_limits
 
     def segments(dwell):
         builder = MotionBuilder(len(joint_names), dwell, limits)

@@ -189,19 +189,13 @@ def _beside(result, proof):
 
 def _side_by_side(sources, reference, options, recordings, jobs):
     """Calibrate, recordings in several processes if `jobs` is above 1."""
-    names = [name_of(recording) for recording in recordings]
-    names = [
-        (
-            name
-            if names.count(name) == 1
-            else (
-                f'recording {number}'
-                if isinstance(recording, SampleBlock)
-                else str(Path(recording))
-            )
-        )
-        for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)
-    ]
+    short = [name_of(recording) for recording in recordings]
+    names = []
+    for number, (name, recording) in enumerate(zip(short, recordings, strict=True), 1):
+        if short.count(name) > 1:
+            is_block = isinstance(recording, SampleBlock)
+            name = f'recording {number}' if is_block else str(Path(recording))
+        names.append(name)
     gathered = reference.gather(sources, options, names=names, jobs=jobs)
     return calibrate_by_evidence(gathered, options)
 

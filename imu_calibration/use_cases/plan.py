@@ -265,14 +265,10 @@ def plan(
     provenance = {
         'noise': grade if options.noise is None else 'as identified',
         'imu_rate': imu_rate,
-        'known': (
-            Path(calibration).name
-            if isinstance(calibration, (str, PathLike))
-            else 'a calibration'
-            if known
-            else 'nothing'
-        ),
+        'known': 'a calibration' if known else 'nothing',
     }
+    if isinstance(calibration, (str, PathLike)):
+        provenance['known'] = Path(calibration).name
     provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits))}
     if warnings := range_warnings(table):
         provenance['warnings'] = '; '.join(warnings)

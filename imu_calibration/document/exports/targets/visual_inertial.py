@@ -98,9 +98,9 @@ def noise_kalibr(found: Noise) -> dict:
 
 def _sensor_entries(page: Page) -> dict[str, float | np.ndarray | str]:
     """Return the entries of an IMU in addition to its intrinsics."""
-    known = (
-        page.noise if page.noise is not None else {'update_rate': page.rate} if page.rate else {}
-    )
+    known = {'update_rate': page.rate} if page.rate else {}
+    if page.noise is not None:
+        known = page.noise
     return {'rostopic': '/imu/data_raw', **known, 'T_i_b': np.eye(4), 'time_offset': 0.0}
 
 
