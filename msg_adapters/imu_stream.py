@@ -62,11 +62,13 @@ class ImuStream:
         self.forget()
         layout = find_imu_layout(data)
         self._use(layout.order)
-        self._order, self._body = data[:2], layout.offsets['orientation'][0]
+        self._order = data[:2]
+        self._body = layout.offsets['orientation'][0]
         # The padding after it is arbitrary.
         self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]
         self._head = data[HEAD_AT : self._head_end]
-        self._rate_at, self._force_at = layout.offsets['rate_s'][0], layout.offsets['force_s'][0]
+        self._rate_at = layout.offsets['rate_s'][0]
+        self._force_at = layout.offsets['force_s'][0]
         self._head_out = frame_head(
             layout.names[0] if self._frame_out is None else self._frame_out, layout.order
         )

@@ -117,7 +117,8 @@ class _Walk:
         return self._skip(8 * count), count
 
     def _skip(self, size):
-        start, self.position = self.position, self.position + size
+        start = self.position
+        self.position += size
         if self.position > len(self.data):
             raise struct.error
         return start

@@ -243,7 +243,8 @@ class RateSlope:
         if stamp_ns == self._newest and (x, y, z) == self._reading:  # the same message again
             return self._slope
         step_ns = 0 if self._newest is None else stamp_ns - self._newest
-        self._newest, self._reading = stamp_ns, (x, y, z)
+        self._newest = stamp_ns
+        self._reading = (x, y, z)
         self._stamps.append(stamp_ns)
         self._due -= 1
         if not self._due:
@@ -321,7 +322,9 @@ class RateSlope:
         The window is kept while the period is unchanged.
         """
         is_first = self.line is None and bool(self._stamps)
-        self.line, self._doubtful, self._agreeing = line, [], 0
+        self.line = line
+        self._doubtful = []
+        self._agreeing = 0
         self._longest_ns = (
             line.high_ns - line.low_ns + stamping.MAX_REGULAR_STEP * line.period_ns
             if line.word == COUNTED
@@ -376,13 +379,13 @@ class RateSlope:
 
     def follow(self, before: 'RateSlope') -> None:
         """Continue from another one, after `prepare`."""
-        self._stamps, self._due, self._count = before._stamps, before._due, before._count
+        self._stamps = before._stamps
+        self._due = before._due
+        self._count = before._count
         self._newest, self._reading = before._newest, before._reading
-        self._agreeing, self._ahead_ns, self._doubtful = (
-            before._agreeing,
-            before._ahead_ns,
-            before._doubtful,
-        )
+        self._agreeing = before._agreeing
+        self._ahead_ns = before._ahead_ns
+        self._doubtful = before._doubtful
         if self._tracker is not None and isinstance(before._tracker, type(self._tracker)):
             self._tracker.seed(before._tracker)  # type: ignore[arg-type]
 

@@ -536,11 +536,9 @@ class SampleCompensation:
         """
         Continue from another compensation: same past of the rate, same temperature, same counts.
         """
-        self.counts, self.corrected, self.fastest_squared = (
-            before.counts,
-            before.corrected,
-            before.fastest_squared,
-        )
+        self.counts = before.counts
+        self.corrected = before.corrected
+        self.fastest_squared = before.fastest_squared
         if before.warming is not None and before.needs_temperature and self.warming is None:
             self.warming = (
                 before.warming

@@ -157,7 +157,9 @@ class UnitGate:
 
     def _begin(self) -> None:
         """Begin a window with the next reading."""
-        self._stamps, self._lengths, self._corrected = [], [], []
+        self._stamps = []
+        self._lengths = []
+        self._corrected = []
 
     def _judge(self) -> None:
         """Open, or set the error of a window at rest; begin the next window."""

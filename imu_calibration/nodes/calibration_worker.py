@@ -424,7 +424,9 @@ class CalibrationWorker(threading.Thread):
             pending, self._provenance | {'mode': 'live', 'solution': self._n_solutions + 1}
         )
         self._n_solutions += 1
-        self._trouble, self._new_windows, self._closed = '', False, pending
+        self._trouble = ''
+        self._new_windows = False
+        self._closed = pending
         self._faults['solution'] = ''
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
@@ -480,7 +482,9 @@ class CalibrationWorker(threading.Thread):
     def _reset(self) -> tuple[bool, str]:
         lost = self.place.unsaved(self.live)
         self.live = self.make_live()
-        self._new_windows, self._closed, self._diagnosed = False, True, 0
+        self._new_windows = False
+        self._closed = True
+        self._diagnosed = 0
         self.place.note_saved(0)
         self._trouble = ''
         self._diagnosis.forget()

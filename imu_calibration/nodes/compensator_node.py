@@ -257,13 +257,18 @@ class CompensatorNode(Node):
             f' used again: {watch.health.state.message}',
             LOG_ERROR,
         )
-        self._harmful, self._previous, self.adopted = harmful.version, None, None
+        self._harmful = harmful.version
+        self._previous = None
+        self.adopted = None
         self._put_in_force(again(previous, self.settings, self._frames))
 
     def _put_in_force(self, adopted: Adopted) -> None:
         if self.adopted is not None and self.adopted.version != adopted.version:
             self._previous = self.adopted
-        self.adopted, self.problem, self.refusal, self.awaited = adopted, '', '', ''
+        self.adopted = adopted
+        self.problem = ''
+        self.refusal = ''
+        self.awaited = ''
         self.unready = ''
         self._wanted = adopted.compensation
         if self.temperature is None and (

@@ -114,11 +114,9 @@ class DiagnosisThread:
 
     def forget(self) -> None:
         """Discard all results: the session is restarted."""
-        self.state, self._wanted, self._urgent = (
-            NOT_YET if self.period else self.state,
-            False,
-            False,
-        )
+        self.state = NOT_YET if self.period else self.state
+        self._wanted = False
+        self._urgent = False
         self._answered = self._extension = None
         self._session += 1
 

@@ -221,7 +221,8 @@ class LiveCompensation(SampleCompensation):
         quaternion, covariance = self._message.orientation(data)
         if covariance != self._orientation_in:
             given = self._message.unpacked(covariance)
-            self._no_orientation, self._orientation_in = given[0, 0] == ABSENT_MARK, covariance
+            self._no_orientation = given[0, 0] == ABSENT_MARK
+            self._orientation_in = covariance
             self._orientation_out = (
                 covariance
                 if self._no_orientation

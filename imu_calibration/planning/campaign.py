@@ -302,10 +302,8 @@ class Campaign:
                     self._separator = self._make_separator(finding)
                 except ImuCalibrationError as error:
                     return f'{what}, and no motion is known that separates them: {error}'
-                self.separations, self.told_apart = (
-                    self.separations + 1,
-                    (finding.effect, *finding.mates),
-                )
+                self.separations += 1
+                self.told_apart = (finding.effect, *finding.mates)
                 self._left.clear()
                 return f'{what}: planning the motion that separates them'
         return ''
@@ -345,7 +343,8 @@ class Campaign:
         step = None if self._separator is None else self._separator.next_motion(position)
         # Predicted only: a calibration has no information on causes that its model lacks.
         if step is None or step.motion is None:
-            has_separated, self._separator = self._separator is not None, None
+            has_separated = self._separator is not None
+            self._separator = None
             if has_separated:
                 return Decision(diagnose=True, why='the causes should be separable now')
             if self._promises_in_vain:

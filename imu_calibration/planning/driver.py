@@ -336,11 +336,9 @@ class Driver:
             if trouble := self._straying():
                 return self.stop(trouble)
             if self._watch.at_end:
-                self._rested_at, self._rested_since, self._settling_since = (
-                    self.position,
-                    time,
-                    time,
-                )
+                self._rested_at = self.position
+                self._rested_since = time
+                self._settling_since = time
                 self._become(DriveState.SETTLING, self.reason)
             return False
         return self._settle()

@@ -132,7 +132,8 @@ class Extremes:
 
     def push(self, values: np.ndarray) -> None:
         """Process values, shape (n,)."""
-        before, self._last = self._last, values[-1]
+        before = self._last
+        self._last = values[-1]
         largest = values.max()
         if largest <= 0 or largest < NEAR_LARGEST_SHARE * self.level:
             return

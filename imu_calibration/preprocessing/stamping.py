@@ -475,7 +475,8 @@ class CountedClock:
             # a computed part beside a recorded one, or this block and the one before, overlap
             mixed = self._stamp
         if recorded.any() or mixed is self._stamp:
-            times, self._points = mixed, self._points[-1:]
+            times = mixed
+            self._points = self._points[-1:]
         self._told = times[-1:]
         self._times.append((self._origin_ns or 0) + np.rint(times).astype(np.int64))
 

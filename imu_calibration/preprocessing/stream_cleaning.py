@@ -235,7 +235,9 @@ class StreamCheck:
             if end < len(stamps):
                 accepted += self._end_epoch()
                 self._count('clock reset', 1)
-                self.epoch, self._newest, self._newest_raw = self.epoch + 1, None, None
+                self.epoch += 1
+                self._newest = None
+                self._newest_raw = None
             samples = samples.select(slice(end, None))
         return accepted
 
