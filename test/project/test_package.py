@@ -502,6 +502,8 @@ def test_scripts_import_names_that_the_package_has(folder):
     """
     No lane runs every script; a name that was moved or removed would be noticed by a user first.
     """
+    if find_spec('rclpy') is None:
+        pytest.skip('scripts import nodes, and there is no ROS here')
 
     def known(module, name):
         return (
