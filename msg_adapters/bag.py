@@ -333,7 +333,8 @@ class Recording:
         """
         # With a chosen frame, several frames are no error.
         decoder = self._decoders(None, '')[self.imu_topic]
-        if (raw := next(iter(self.source.stretches([self.imu_topic])), None)) is not None:
+        raw = next(iter(self.source.stretches([self.imu_topic])), None)
+        if raw is not None:
             decoder.decode(*raw.of(0))
         return sorted(
             frame for frame, count in decoder.choice.counts.items() if count >= OTHER_FRAME

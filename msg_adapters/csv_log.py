@@ -308,7 +308,8 @@ def read_csv(
     found += [each for each in guessed if (each.quantity, each.joint) not in given]
     found = [_as_raw(each) if each.quantity in raw else each for each in found]
     by_quantity = {each.quantity: each for each in found}
-    if lacking := _lacking(table, by_quantity, stated=bool(columns)):
+    lacking = _lacking(table, by_quantity, stated=bool(columns))
+    if lacking:
         raise InputError(
             f'{path} must have a column of'
             f' {lacking}{"" if lacking == "time" else " per axis"}, got the columns'
@@ -1349,7 +1350,8 @@ def _guess(table, stated=frozenset()):
                 found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
         if joint:
             found.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
-    if pair := _seconds_and_nanoseconds(table):
+    pair = _seconds_and_nanoseconds(table)
+    if pair:
         found = [pair, *(columns for columns in found if columns.quantity != 'time')]
     if not any(columns.quantity == 'time' for columns in found):
         found += _unnamed_time(table)

@@ -585,12 +585,14 @@ def noise_shortcomings(figures: NoiseFigures) -> list[str]:
     """Return why the exit code is 3, a line each; empty for 0."""
     found = counts(figures)
     lines = []
-    if lacking := found[WEAK] + found[HELD]:
+    lacking = found[WEAK] + found[HELD]
+    if lacking:
         lines.append(f'{lacking} of {sum(found.values())} noise figures are not determined')
     for sensor, why in (figures.recording.get('unusable') or {}).items():
         lines.append(f'the noise of the {sensor} is not identified: {why}')
     kept = round(figures.recording.get('seconds_at_rest', 0.0) * figures.rate)
-    if dropped := dropped_text(figures.recording.get('dropped') or {}, kept):
+    dropped = dropped_text(figures.recording.get('dropped') or {}, kept)
+    if dropped:
         lines.append(dropped)
     return lines
 

@@ -454,7 +454,8 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
         )
         axes_of_sensor[SENSORS[number // 3]].append(figures)
     dropped = dict(record.survey.dropped)
-    if frozen := record.left_out['frozen_output']:
+    frozen = record.left_out['frozen_output']
+    if frozen:
         dropped['imu frozen output'] = round(frozen / record.curve.period)
     recording = {
         'seconds_at_rest': float(record.curve.seconds),

@@ -415,7 +415,8 @@ class CalibrationHealth:
         measured_length, measured_rate = (
             float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6))
         )
-        if unit := unit_of_rest(measured_length):
+        unit = unit_of_rest(measured_length)
+        if unit:
             return LiveState(
                 UNIT,
                 f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit},'

@@ -354,7 +354,8 @@ def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
                 calibration.values[index] * factor, calibration.own_sd[index] * factor
             )
             yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
-    if common := calibration.common_scale:
+    common = calibration.common_scale
+    if common:
         yield COMMON_SCALE, *with_sd(1.0, common['sd']), '1', str(common['status'])
 
 
@@ -577,7 +578,8 @@ def never_applied(calibration: Calibration, sensor: str) -> str:
     """Return why compensation refuses the values of a sensor; '' where it does not."""
     if sensor in calibration.absent:
         return ABSENT
-    if why := beyond_instruments(calibration, sensor):
+    why = beyond_instruments(calibration, sensor)
+    if why:
         return why
     if sensor == 'gyroscope' and needs_accelerometer(calibration, calibration.decisions):
         return AXES_MISSING

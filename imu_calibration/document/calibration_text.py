@@ -421,7 +421,8 @@ def calibration_mapping(calibration: Calibration) -> dict:
         document[section] = _section(calibration, section)
     document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)
     document['joint_names'] = list(calibration.model.joint_names)
-    if (errors := calibration.model.joint_names.errors) is not None:
+    errors = calibration.model.joint_names.errors
+    if errors is not None:
         document['joint_errors'] = errors
     document['covariance'] = {
         'names': list(calibration.param_names),

@@ -63,7 +63,8 @@ def dropped_of(calibration: Calibration) -> tuple[dict[str, int], int]:
     """Return (reason -> dropped samples, samples without a fault) of a calibration."""
     statistics = calibration.statistics
     dropped = dict(statistics.get('dropped') or {})
-    if unusable := statistics.get('unusable'):
+    unusable = statistics.get('unusable')
+    if unusable:
         dropped['unusable'] = unusable
     # samples between windows have no fault: they count as kept
     kept = sum((statistics.get('samples_used') or {}).values())

@@ -77,7 +77,8 @@ def motions_at_rest(by_hand: Mapping, sensors: Sequence[str]) -> dict[str, tuple
     """Return text -> sensors for each motion of an IMU that was held still."""
     found: dict[str, tuple[str, ...]] = {}
     for sensor in sensors:
-        if text := moved_at_rest(by_hand, sensor):
+        text = moved_at_rest(by_hand, sensor)
+        if text:
             found[text] = (sensor,)
     if not found and (text := swayed_at_rest(by_hand)):
         found[text] = tuple(sensors)

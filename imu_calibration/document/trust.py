@@ -272,9 +272,10 @@ def refused_sensors(
         if calibration.decisions[sensor] not in accepted
     }
     for sensor in calibration.sensors:
-        if why := beyond_instruments(calibration, sensor) or (
+        why = beyond_instruments(calibration, sensor) or (
             live and _mostly_undetermined(calibration, sensor)
-        ):
+        )
+        if why:
             refused[sensor] = why
     if calibration.gyroscope_in_accelerometer_axes and 'accelerometer' in refused:
         refused.setdefault('gyroscope', AXES_MISSING)

@@ -484,7 +484,8 @@ def _lost(calibration: Calibration) -> list[Reason]:
     if not dropped:
         return []
     text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
-    if many := dropped_text(*dropped_of(calibration)):
+    many = dropped_text(*dropped_of(calibration))
+    if many:
         return [Reason(WARNING, many, 'find the cause', key='inspect')]
     return [Reason(NOTE, text, '')]
 
@@ -515,7 +516,8 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     limiting = ('', 0.0)
     if count.requested:
         limiting = (calibration.param_names[worst], float(share[worst]))
-    if common := calibration.common_scale:
+    common = calibration.common_scale
+    if common:
         limiting = max(
             limiting, (COMMON_SCALE, common['sd'] / common['tolerance']), key=lambda pair: pair[1]
         )
@@ -608,7 +610,8 @@ def _step_of(calibration: Calibration, sensor: str) -> tuple[str, str | None]:
     entry = calibration.proof.get(sensor)
     texts = calibration.texts
     # Values that are refused have their own cause, and no measurement of their error is missing.
-    if limit := surpassed_limit(calibration, sensor):
+    limit = surpassed_limit(calibration, sensor)
+    if limit:
         return limit.remedy, limit.key
     if moved_at_rest(calibration.by_hand, sensor):
         return MOVED_REMEDY, None
@@ -647,7 +650,8 @@ def _undecided_motion(calibration: Calibration, sensor: str) -> str:
     A sensor moved where it was held still, or none of its requested parameters is determined:
     held-out windows then contain the same motions.
     """
-    if moved := moved_at_rest(calibration.by_hand, sensor):
+    moved = moved_at_rest(calibration.by_hand, sensor)
+    if moved:
         return moved
     own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
     if own and DETERMINED not in own:
@@ -682,7 +686,8 @@ def _reason(calibration: Calibration, sensor: str) -> str:
     if decide(calibration.proof.get(sensor)) is HELPS:
         why = _undecided_motion(calibration, sensor)
         reason += f'; unproven, because {why}' if why else _held_out_motions(calibration, sensor)
-    if why := never_applied(calibration, sensor):
+    why = never_applied(calibration, sensor)
+    if why:
         reason += f'; not applied: {why}'
     return reason
 

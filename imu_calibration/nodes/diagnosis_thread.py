@@ -36,13 +36,15 @@ def _libc() -> Any:
 
 def give_arrays_own_pages() -> None:
     """Fix the size from which arrays have pages of their own."""
-    if (libc := _libc()) is not None:
+    libc = _libc()
+    if libc is not None:
         libc.mallopt(_M_MMAP_THRESHOLD, THRESHOLD)
 
 
 def return_freed_memory() -> None:
     """Return the free pages of the heap to the system."""
-    if (libc := _libc()) is not None:
+    libc = _libc()
+    if libc is not None:
         libc.malloc_trim(0)
 
 

@@ -78,7 +78,8 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     """
     for _ in range(RETRIES):
         _spin(node, spin_once, DISCOVERY)
-        if topics := _imu_topics(node):
+        topics = _imu_topics(node)
+        if topics:
             break
     streams = [_Stream(node, name) for name in topics]
     _spin(node, spin_once, 0.2)

@@ -474,7 +474,8 @@ class PlannerNode(Node):
             return False, range_warnings(self._table)[0]
         if self.driver.position is None:
             return False, self._joints.silence(self.driver.ignored_words().strip(' ()'))
-        if trouble := self.driver.stamp_fault(time.monotonic()):
+        trouble = self.driver.stamp_fault(time.monotonic())
+        if trouble:
             return False, trouble
         if not self._command.is_heard:
             return (
@@ -484,7 +485,8 @@ class PlannerNode(Node):
                     ' joint_trajectory'
                 ),
             )
-        if other := self._others.found():
+        other = self._others.found()
+        if other:
             return False, other
         if not self._calibrator['solve'].service_is_ready():
             return (

@@ -163,7 +163,8 @@ class PlannerWorker(threading.Thread):
             asked = self.campaign.take_findings(self._peers.diagnose())
             if asked:
                 self._peers.say(LOG_INFO, asked)
-            if (calibration := self._peers.latest()) is not None:
+            calibration = self._peers.latest()
+            if calibration is not None:
                 self.campaign.take(calibration)
             decision = self._decide()
         if decision is not None:
@@ -179,7 +180,8 @@ class PlannerWorker(threading.Thread):
         end = time.monotonic() + patience
         while self._wanted and not self._ending and not self.driver.rests:
             self.doing = Activity.AWAITING_REST
-            if trouble := self.driver.stamp_fault(time.monotonic()):
+            trouble = self.driver.stamp_fault(time.monotonic())
+            if trouble:
                 raise InputError(trouble)
             # No other driver need be searched for yet.
             if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):
@@ -227,7 +229,8 @@ class PlannerWorker(threading.Thread):
             self._peers.say(LOG_INFO, f'done after {self.driver.motions} motions: {decision.why}')
             return
         self._wait_for_rest()  # the joints may have been turned during planning
-        if obstacle := self._peers.obstacle():
+        obstacle = self._peers.obstacle()
+        if obstacle:
             raise InputError(obstacle)
         with self._lock:
             if not self._wanted:  # stopped meanwhile

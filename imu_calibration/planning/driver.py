@@ -329,11 +329,13 @@ class Driver:
         self._note_rest()
         if self._watch is None or not self.is_driving:
             return False
-        if trouble := self._beyond(position, rate):
+        trouble = self._beyond(position, rate)
+        if trouble:
             return self.stop(trouble)
         if self.state is DriveState.MOVING:
             self._watch.observe(time, self.position, now=now)
-            if trouble := self._straying():
+            trouble = self._straying()
+            if trouble:
                 return self.stop(trouble)
             if self._watch.at_end:
                 self._rested_at = self.position

@@ -421,5 +421,6 @@ def check_units(gathered: Reduced, model: SensorModel, table: Table) -> None:
 
 def check_force(length: float) -> None:
     """Refuse a median length of the specific force at rest that is not gravity in m/s^2."""
-    if (error := force_error(length)) is not None:
+    error = force_error(length)
+    if error is not None:
         raise error

@@ -101,7 +101,8 @@ class StreamWatch:
     def note_counts(self, counts: dict[str, int], now: float) -> None:
         """Record the counts of samples by their use."""
         lost = Counter(dropped(counts))
-        if grown := lost - self._lost:
+        grown = lost - self._lost
+        if grown:
             self._recent, self._lost_at = grown, now
         self._lost = lost
 
@@ -190,6 +191,7 @@ class StreamWatch:
         if self._unstamped_at is not None and now - self._unstamped_at < RECENT_SECONDS:
             notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
             return TROUBLE, f'{notes}: the driver sets none, the time of arrival is used'
-        if recently := self._recently(now):
+        recently = self._recently(now)
+        if recently:
             return TROUBLE, f'dropped lately: {recently}'
         return GOOD, f'{" and ".join(MESSAGES[name] for name in self._needed)} messages come'

@@ -427,7 +427,8 @@ MOST_WINDOWS = 60
 
 def residual_figure(result: CalibrationResult) -> Drawn | None:
     """Return the autocorrelation of the residuals as SVG; None without moving windows."""
-    if not (traces := autocorrelation(result)):
+    traces = autocorrelation(result)
+    if not traces:
         return None
     return draw(
         'autocorrelation',

@@ -61,7 +61,8 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     spectra = []
     for sensor, rest in diagnosis.unexplained.items():
         beyond += beyond_lines(sensor, rest)
-        if drawn := draw_tones(sensor, rest):
+        drawn = draw_tones(sensor, rest)
+        if drawn:
             spectra.append(drawn)
     return render(
         'diagnosis.html',
@@ -330,7 +331,8 @@ def _sensor(traces, sensor, against, first):
             }
         )
 
-    if segments := traces.segments.get(sensor):
+    segments = traces.segments.get(sensor)
+    if segments:
         row(
             f'Measured and simulated on the segment with the largest difference, {unit}',
             lambda k: _chart(

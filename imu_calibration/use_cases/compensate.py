@@ -104,7 +104,8 @@ class Compensated:
             dropped['frozen output'] = self.frozen
         if self.wrapped:
             dropped['wrapped'] = self.wrapped
-        if lost := dropped_text(dropped, self.count - self.frozen - self.wrapped):
+        lost = dropped_text(dropped, self.count - self.frozen - self.wrapped)
+        if lost:
             lines.append(lost)
         return lines
 
@@ -335,7 +336,8 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
 
 def _refuse_corrected_log(recording):
     """Refuse text logs whose header states that their readings are corrected."""
-    if (log := corrected_log(recording)) is not None:
+    log = corrected_log(recording)
+    if log is not None:
         raise InputError(
             f'the log must hold raw measurements, the header of {log} states corrected ones; give'
             ' the raw log',
@@ -393,9 +395,11 @@ class RawChecks:
             return
         scale = GravityScale(self._calibration)
         lengths = scale.lengths(force[measured])
-        if (error := scale.error(lengths)) is not None:
+        error = scale.error(lengths)
+        if error is not None:
             raise error
-        if question := scale.question(lengths):
+        question = scale.question(lengths)
+        if question:
             self.cautions += (question,)
 
     def push(self, imu: ImuSamples) -> None:

@@ -87,9 +87,11 @@ class RecordingSummary:
         lines = [finding.text for finding in warnings(self.findings)]
         received = self.streams['imu'].count if 'imu' in self.streams else 0
         dropped = dict(self.lost)
-        if count := unusable(self.findings):
+        count = unusable(self.findings)
+        if count:
             dropped['unusable'] = count
-        if lost := dropped_text(dropped, received):
+        lost = dropped_text(dropped, received)
+        if lost:
             lines.append(lost)
         if self.result is None:
             return lines

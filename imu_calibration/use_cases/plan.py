@@ -270,7 +270,8 @@ def plan(
     if isinstance(calibration, (str, PathLike)):
         provenance['known'] = Path(calibration).name
     provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits))}
-    if warnings := range_warnings(table):
+    warnings = range_warnings(table)
+    if warnings:
         provenance['warnings'] = '; '.join(warnings)
     if causes:
         provenance['tells_apart'] = ', '.join(causes)
