@@ -177,6 +177,7 @@ class _Patch:
 
         A zero stamp counts as the time of arrival.
         """
+        # Messages of one layout are decoded together; messages of other IMUs are not changed.
         groups, n_broken = group_by_layout(packed, find_imu_layout)
         if n_broken:
             self.dropped['Imu message that cannot be decoded'] += n_broken
@@ -187,6 +188,8 @@ class _Patch:
         samples = in_order([(index, decode_imu(layout, group)) for layout, index, group in groups])
         stamp_ns = np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns)
         samples = replace(samples, stamp_ns=stamp_ns)
+
+        # Without excluded times.
         if self.keep is not None:
             kept = self.keep(stamp_ns)
             if not kept.any():
@@ -197,6 +200,8 @@ class _Patch:
             ]
             done = done[kept]
             samples = samples.select(kept)
+
+        # Correct all samples in order of time, then patch the bytes of each layout.
         order = np.argsort(np.concatenate([index for _, index, _ in groups]))
         if self.other is not None:
             samples = self.other.added_to(samples)
@@ -211,6 +216,7 @@ class _Patch:
                 corrected.marks[place],
             )
             table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
+            # Seconds (int32) and nanoseconds (uint32) of the stamp, without the delay.
             if self.late_ns:
                 for place, values, kind in zip(
                     (4, 8),

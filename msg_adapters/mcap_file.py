@@ -199,6 +199,7 @@ def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int,
             or (opcode == MESSAGE and length < 22)
         ):
             break
+        # After `RUN` records of one length the next ones are compared in one step.
         if opcode != MESSAGE:
             if len(others) == MOST_OTHERS:
                 break
@@ -214,6 +215,8 @@ def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int,
             run += len(offsets[-1]) - 1
             behind = int(offsets[-1][-1]) + PREFIX.size + length
         position = behind
+
+    # Length and channel of each message.
     offset = np.concatenate(offsets) if offsets else np.zeros(0, np.int64)
     length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64) if len(offset) else offset
     channel = (

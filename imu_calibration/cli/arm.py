@@ -41,6 +41,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.choices import log_options, readings_of
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of, sources_without
 
+    # Two topics, or two frames on one topic.
     if len(options.imu_topic) != 2:
         raise InputError(
             f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both'
@@ -65,6 +66,8 @@ def run(options: Options) -> VerbResult:
             key='frame_id',
             code='same_imu',
         )
+
+    # Read both IMUs; joints are not used.
     imus = []
     for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
@@ -73,6 +76,8 @@ def run(options: Options) -> VerbResult:
         imus.append(recording.imu)
         findings = visible_findings(recording.findings)
         warn(finding.named(str(topic.imu)).to_mapping() for finding in findings)
+
+    # The arm from A to B, in mm as on a drawing.
     first, second = imus
     result = estimate_arm(first, second)
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):

@@ -26,6 +26,8 @@ def run(options: Options) -> VerbResult:
     result = comparison.compare(
         files.read_calibration(options.first), files.read_calibration(options.second)
     )
+
+    # Each parameter in a unit for people, with as many digits as its sd has.
     out = Terminal.of()
     numbers = ('A', 'B', 'B - A', 'combined sd', 'in sd')
     shown = []

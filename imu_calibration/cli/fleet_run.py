@@ -150,6 +150,7 @@ CSV_KEYS = (
 
 def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
+    # One unit per folder or file, each with its recordings and its exclusions.
     found = find_units(options.folder, options.output)
     recordings = []
     names_of_recordings = {}
@@ -176,6 +177,8 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
         )
     if not options.force:
         _require_same_units(Path(options.output), units, report=not options.no_report)
+
+    # Calibrate them here or on a cluster; files of each unit are written as it ends.
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
         step = FleetStep(table, settings, None if options.no_report else calibration_report)
@@ -191,6 +194,8 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
             reasons += [f'{result.name}: {line}' for line in result.reasons]
             if result.files:
                 files.write_texts(folder / result.name, result.files)
+
+        # The spread over the units, as tables and as a page.
         parameter_rows = fleet_parameter_rows(spreads)
         unit_rows = fleet_unit_rows(results)
         files.write_texts(

@@ -395,6 +395,8 @@ class CalibrationHealth:
 
         From the variance of its mean, (6,), and the corrected bias with its variance, or None.
         """
+        # Rate and gravity at rest, in standard deviations beyond the Earth's rate and the local
+        # differences of gravity.
         total = self._known + np.diag(of_mean)
         along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
         rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])
@@ -415,6 +417,8 @@ class CalibrationHealth:
         measured_length, measured_rate = (
             float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6))
         )
+
+        # Readings in another unit have no other state.
         unit = unit_of_rest(measured_length)
         if unit:
             return LiveState(
@@ -423,6 +427,8 @@ class CalibrationHealth:
                 ' it must be m/s^2; correct the driver',
                 values,
             )
+
+        # Changes since the calibration, and the bias that would correct them.
         lines = []
         if rate_off[axis] > LIMIT:
             lines.append(

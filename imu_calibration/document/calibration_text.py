@@ -284,6 +284,7 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
     names = covariance.get('names') or []
     require(document, CALIBRATION, _entries_of(model, names))
 
+    # Values, status and covariance in the order of the model; names in a file may have another.
     entries = [document[effect.section][effect.name] for effect in model.effects]
     values = _joined(entry['value'] for entry in entries)
     status = _joined((entry['status'] for entry in entries), str)
@@ -293,6 +294,7 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
     else:
         matrix = np.diag(_joined(entry['sd'] for entry in entries) ** 2)
 
+    # Reasons of held parameters, and centres of columns, are entries of their effects.
     held_reason, centre = {}, {}
     for effect, entry in zip(model.effects, entries):
         reasons = np.ravel(np.array(entry.get('held_reason', ''), dtype=object)).tolist()
@@ -304,6 +306,8 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
             offset = np.asarray(value, float)
             slope = np.asarray(slopes.get(group, np.zeros((len(offset), 3))), float)
             centre[group] = ColumnCentre(offset, slope, INPUT_OF[effect.sensor])
+
+    # The parts of the variance and the proof of each sensor.
     terms = {}
     for name, variance in (document.get('covariance_terms') or {}).items():
         terms[str(name)] = np.asarray(variance, float)[order]
@@ -311,6 +315,8 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
     for sensor, entry in (document.get('proof') or {}).items():
         if sensor in SENSORS:
             proof[sensor] = ProofEntry.from_mapping(entry)
+
+    # The fields; some are copied without change.
     found: dict[str, Any] = {
         'model': replace(model.at(values), centre=centre),
         'values': values,
@@ -410,6 +416,8 @@ def calibration_mapping(calibration: Calibration) -> dict:
         'frame_id': calibration.frame_id,
         'gauge': dict(calibration.gauge),
     }
+
+    # First the differences from a complete IMU in SI units and its own axes.
     if calibration.absent:
         document['absent'] = list(calibration.absent)
     readings = calibration.readings
@@ -417,6 +425,8 @@ def calibration_mapping(calibration: Calibration) -> dict:
         document['readings'] = readings.to_mapping()
     if calibration.model.definitions:
         document['effects'] = plain(calibration.model.definitions)
+
+    # The parameters of each sensor and of the reference, and their covariance.
     for section in SECTIONS:
         document[section] = _section(calibration, section)
     document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)
@@ -433,6 +443,8 @@ def calibration_mapping(calibration: Calibration) -> dict:
     document['undetermined_directions'] = [
         dict(direction) for direction in calibration.undetermined
     ]
+
+    # Statistics, conditions and provenance; empty parts are omitted.
     for name in ('statistics', 'conditions', *_WHERE_KNOWN, 'provenance'):
         part = getattr(calibration, name)
         if name == 'proof':

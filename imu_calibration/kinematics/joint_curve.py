@@ -237,6 +237,8 @@ def fit_joint_curve(
         if np.any(np.abs(np.diff(position, axis=0)) > np.pi)
         else position
     )
+
+    # A knot per time; joints at rest need no curve.
     stamps = time[np.concatenate([[True], np.diff(time) > 0])]
     knots = _place_knots(stamps)
     still = np.all(position == position[0], axis=0)

@@ -95,6 +95,8 @@ class CompensatorDiagnostics:
         node.look_for_correction()
         node.return_from_harm()
         compensation = node.compensation
+
+        # Present faults, also for the log; a doubt about stamps is repeated less often.
         unready = self._unready()
         serious, notes = self._lines(compensation, unready)
         notes += self._stream(compensation) + [
@@ -110,6 +112,8 @@ class CompensatorDiagnostics:
         notes += doubts
         adopted: Adopted | None = node.adopted
         notes += [] if adopted is None else adopted.caveats
+
+        # The worst of them is the level.
         level = WARN if notes else OK
         if serious:
             level = ERROR

@@ -218,6 +218,7 @@ def wrong_rate_unit(text: str, unit: str = 'counts:NUMBER/(deg/s)') -> CheckFind
 
 def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Angular rate is in rad/s: gravity turns by the integral of the rates."""
+    # Turns are compared with the rotation of gravity; without turns the largest rate decides.
     turning = evidence.turning
     stated = evidence.readings.gyroscope
     ends_of_rates = chain.from_iterable(evidence.ends[3:])

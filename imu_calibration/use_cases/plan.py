@@ -223,6 +223,7 @@ def plan(
 
     """
     report('planning')
+    # The moving joints, their limits, and the noise that is expected of the IMU.
     options = calibration_options(choices)
     reference = reference_of(stand, options=options)
     table = reference.table_for('a plan of motions needs a table or a robot description')
@@ -231,6 +232,8 @@ def plan(
     start = None
     if around or reach is not None:
         limits, start = _neighbourhood(limits, table.joint_names, around or {}, reach)
+
+    # Prior knowledge, and the effects to separate if a diagnosis named several.
     known = _known(calibration, table, options)
     causes = tuple(separate)
     sizes = {}
@@ -240,6 +243,8 @@ def plan(
             if isinstance(diagnosis, Mapping)
             else files.read_mapping(diagnosis, 'diagnosis', class_in)
         )
+
+    # Separate effects, or determine every parameter.
     if causes:
         if known is None:
             raise InputError(

@@ -156,6 +156,7 @@ class RecordingFile:
 
 def _with_gyroscope(blocks, path, topic):
     """Return one block: those of a recording, with the rates of another Imu topic."""
+    # All of the first topic.
     parts: dict[str, list] = {'imu': [], 'joints': [], 'temperature': []}
     dropped: Counter[str] = Counter()
     notes: Counter[str] = Counter()
@@ -165,6 +166,8 @@ def _with_gyroscope(blocks, path, topic):
                 samples.append(getattr(block, name))
         dropped.update(block.dropped or {})
         notes.update(block.notes or {})
+
+    # The rates of the other one, at the stamps of the first.
     other = _imu_messages(path, Topics(imu=topic))
     gyroscope = other.imu
     dropped.update(other.lost)
