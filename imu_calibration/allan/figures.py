@@ -21,7 +21,7 @@ from imu_calibration.allan.terms import GAUSS_MARKOV, PROCESSES, TIME_KEY, AxisN
 from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.estimation.sensor_noise import BiasProcess
 
 HORIZON = 100.0
 """

@@ -19,7 +19,7 @@ from imu_calibration.document.statistics import (
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import judged
 from imu_calibration.effects.forward_equations import centred
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.estimation.solution import (
     REJECTED,
     Solution,
@@ -206,7 +206,7 @@ def document(
     return judged(calibration, tolerances)
 
 
-def noise_entry(noise: NoiseModel) -> SensorEntry:
+def noise_entry(noise: SensorNoise) -> SensorEntry:
     """Return the statistics of the noise of one sensor and of the scatter of its means."""
     return SensorEntry(
         noise_sd=noise.white_sd,

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.allan.figures import NoiseFigures, bias_processes
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.preprocessing.window import WindowSettings
 
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import dof_factor
 from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.sensor_noise import dof_factor
 from imu_calibration.estimation.solution import DRIFT, MODEL_ERROR
 
 MIN_SCATTER_BLOCKS = 8

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_calibration.estimation.noise_model import BiasProcess, means_beside_middles
+from imu_calibration.estimation.sensor_noise import BiasProcess, means_beside_middles
 from imu_calibration.estimation.whitening import (
     RestrictedLikelihood,
     eliminate,

@@ -14,8 +14,8 @@ import numpy as np
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.sensor_noise import SensorNoise
 
 Terms = Mapping[str, np.ndarray]
 """Term -> covariance matrix, shape (n_params, n_params)."""
@@ -351,7 +351,7 @@ class Solution:
     """Their covariance as named terms, each of shape (n_params, n_params)."""
     held: np.ndarray
     """True where a parameter is fixed at its prior, shape (n_params,)."""
-    noise: dict[str, NoiseModel]
+    noise: Mapping[str, SensorNoise]
     """Sensor -> its noise."""
     chi2_per_dof: dict
     """

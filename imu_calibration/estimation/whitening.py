@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import lapack, solve_triangular
 
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.scaled_solve import JITTER, triangular_of_band
+from imu_calibration.estimation.sensor_noise import BiasProcess
 
 
 class Whitening:
@@ -227,39 +227,6 @@ def _gains_of_one(
             'the covariance of the window means must be positive definite; variances are not finite'
         )
     return total, (1 - variance / total)[:, None]
-
-
-def predict_session_offsets(
-    misfit: np.ndarray,
-    variance: np.ndarray,
-    times: np.ndarray,
-    *,
-    sessions: list[np.ndarray],
-    noise: NoiseModel,
-) -> np.ndarray:
-    """
-    Return the offset of each session, shape (n_sessions, 3).
-
-    The weighted mean of its residuals, drawn towards zero by its noise.
-
-    Parameters
-    ----------
-    misfit, variance : ndarray, shape (n, 3)
-        Residuals of the window means and the independent part of their variance.
-    noise : NoiseModel
-
-    """
-    rows = Whitening(variance, times, sessions, processes=noise.bias_processes)(
-        np.stack([np.ones_like(misfit), misfit], axis=2)
-    )
-    ones, rest = np.moveaxis(rows, 2, 0)
-    parts = ((ones[index], rest[index]) for index in sessions)
-    return np.array(
-        [
-            (one * left).sum(axis=0) / ((one**2).sum(axis=0) + 1 / noise.session_variance)
-            for one, left in parts
-        ]
-    )
 
 
 class RestrictedLikelihood:

@@ -13,7 +13,6 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import HELD, tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits
 from imu_calibration.kinematics.table import Table
@@ -22,6 +21,7 @@ from imu_calibration.planning.motion_library import MotionLibrary
 from imu_calibration.planning.planner import Decision, Planner
 from imu_calibration.planning.planning_problem import PlanningProblem
 from imu_calibration.planning.posterior import exact_information
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.selection.questions import special
 from imu_calibration.simulation.profiles import make_profile
 

@@ -14,7 +14,6 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.progress import report
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints, limits_of
 from imu_calibration.kinematics.table import Table
@@ -34,6 +33,7 @@ from imu_calibration.references.gravity.advice import (
     knowledge_at_first,
 )
 from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.turntable.noise_model import NoiseModel, ReferenceNoise
 from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 

@@ -16,7 +16,7 @@ from imu_calibration.allan.figures import NoiseFigures, bias_processes
 from imu_calibration.core.distributions import chi2_isf
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.planning.coordinates import Coordinates, Goal, WithinTolerances
 from imu_calibration.planning.motion_library import MotionKind, MotionLibrary, PlannedMotion
 from imu_calibration.planning.posterior import (
@@ -31,6 +31,7 @@ from imu_calibration.planning.posterior import (
     least_bias_variance,
     relax,
 )
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.window_statistics import BATCH_DOF
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise

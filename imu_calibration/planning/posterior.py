@@ -11,13 +11,13 @@ import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, columns
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.simulation.motion_builder import Profile, Segment
 
 MAX_WEIGHT_STEPS = 600

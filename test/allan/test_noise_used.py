@@ -27,13 +27,14 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files
 from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.solution import DETERMINED, HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.live_poses import LiveByHand
 from imu_calibration.references.turntable.estimation.noise_search import estimate_offsets
 from imu_calibration.references.turntable.live_diagnosis import question_about
 from imu_calibration.references.turntable.live_windows import LiveCalibration
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from msg_adapters.imu import FIELDS
 from validation.imu_messages import parse_imu
 

@@ -7,14 +7,10 @@ import pytest
 
 from imu_calibration.estimation import scaled_solve
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, dof_factor
 from imu_calibration.estimation.scaled_solve import triangular, triangular_of_band
-from imu_calibration.estimation.whitening import (
-    RestrictedLikelihood,
-    Whitening,
-    predict_session_offsets,
-    profile,
-)
+from imu_calibration.estimation.sensor_noise import BiasProcess, dof_factor
+from imu_calibration.estimation.whitening import RestrictedLikelihood, Whitening, profile
+from imu_calibration.references.turntable.noise_model import NoiseModel, predict_session_offsets
 
 STEP = 1.3
 """Standard deviation of the bias from recording to recording."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.whitening import Whitening
 
 

@@ -38,7 +38,7 @@ NOISE = _of(
     ),
     (
         'noise at low frequency taken for white',
-        'NoiseModel.low_variance',
+        'SensorNoise.low_variance',
         'self.inflation',
         '1.0',
         'test_noise_model.py::test_means_scatter_by_the_noise_at_low_frequency_over_their_number',

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.planning.coordinates import Coordinates
@@ -17,6 +17,7 @@ from imu_calibration.planning.posterior import (
     least_bias_variance,
     relax,
 )
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.requested_model import choose_model
 from imu_calibration.simulation.sensor_noise import GRADES
 

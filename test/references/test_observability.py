@@ -9,10 +9,11 @@ from imu_calibration.core.units import DEG
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.motions import SENSOR_MOTIONS, TABLE_MOTIONS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.references.turntable import observability
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.observability import (
     added_information,
     needed_motions,

@@ -7,11 +7,11 @@ import pytest
 
 from imu_calibration.calibration.diagnosis.traces import DistanceSums
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.preprocessing.window import Window, WindowKind
 
-NOISE = {sensor: NoiseModel(np.full(3, 0.01**2), np.ones(3)) for sensor in SENSORS}
+NOISE = {sensor: SensorNoise(np.full(3, 0.01**2), np.ones(3)) for sensor in SENSORS}
 
 
 def window(kind, n, start):

@@ -15,8 +15,9 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_likelihood import FLICKER_MARK, NoiseLikelihood
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.references.turntable.estimation.noise_search import BiasProcessSearch
+from imu_calibration.references.turntable.noise_model import NoiseModel, ReferenceNoise
 from imu_calibration.references.turntable.residuals import unexplained_windows as rests
 from imu_calibration.references.turntable.residuals.find_onset import _passed_once
 from imu_calibration.references.turntable.selection import investigation, window_gain

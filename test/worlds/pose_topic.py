@@ -30,7 +30,7 @@ from imu_calibration.document.trust import Uncorrected
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import output_of_effects
 from imu_calibration.effects.sensor_model import BASE, SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
@@ -212,7 +212,7 @@ def solve(data, model, left_out=None):
     start = PoseState(reference.nominal)
     found = estimate_rows(reference, start, fallback=np.array([ATTITUDE_SD**2]))
     sd = np.sqrt(found.scatter.variance[0])
-    noise = NoiseModel(np.full(3, sd**2), np.ones(3))
+    noise = SensorNoise(np.full(3, sd**2), np.ones(3))
     solution = Solution(
         model,
         found.state.values,

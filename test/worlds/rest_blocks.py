@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.references.turntable.residuals.residual_blocks import RestBlocks
 from imu_calibration.selection.stamp_jitter import StampJitter
 

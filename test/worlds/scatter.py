@@ -9,9 +9,10 @@ import numpy as np
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.forward_equations import References, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation import noise_model
+from imu_calibration.estimation import sensor_noise
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.turntable import noise_model
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.window_statistics import reduce_windows
@@ -156,7 +157,7 @@ def cramer_rao(system, model):
     """Return the variances that an estimator reaches which knows the noise exactly."""
     known = {
         sensor: noise_model.NoiseModel(
-            np.full(3, sd**2), np.ones(3), bias_processes=(noise_model.BiasProcess(wander, 100.0),)
+            np.full(3, sd**2), np.ones(3), bias_processes=(sensor_noise.BiasProcess(wander, 100.0),)
         )
         for sensor, sd, wander in zip(
             ('accelerometer', 'gyroscope'),

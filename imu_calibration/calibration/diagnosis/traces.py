@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, gain_of
 
@@ -125,7 +125,7 @@ class DistanceSums:
         self,
         window: Window,
         residuals: Sequence[Mapping[str, np.ndarray]],
-        noise: Mapping[str, NoiseModel],
+        noise: Mapping[str, SensorNoise],
     ) -> None:
         """
         Add a window with its residuals and the noise of each sensor.

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.samples import AlignedArrays
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import zero_sum_rows
+from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.kinematics.rotations import cross, skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -61,7 +61,7 @@ class Poses(AlignedArrays):
     """Middle of each interval, seconds since the first sample, shape (k,)."""
     temperature_c: np.ndarray | None = None
     """Mean temperature, shape (k,), when it was recorded."""
-    noise: dict[str, NoiseModel] = field(default_factory=dict)
+    noise: dict[str, SensorNoise] = field(default_factory=dict)
     """Sensor -> noise within the intervals."""
     period: float = 0.0
     """Time from sample to sample, s."""

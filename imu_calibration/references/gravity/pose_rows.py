@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import BASE
-from imu_calibration.estimation.noise_model import NATURAL
+from imu_calibration.estimation.sensor_noise import NATURAL
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import Poses, TurnData, between_middles, tangent

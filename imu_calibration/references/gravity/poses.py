@@ -10,7 +10,7 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, rounding_variance, runs_of, smallest_step
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.strapdown import total_rotation
 from imu_calibration.preprocessing.dead_band import dead_bands
@@ -60,11 +60,11 @@ def average_poses(
         'gyroscope': rounding_variance(imu.rate_s),
     }
     noise = {sensor: _pooled_noise(part, rounding[sensor]) for sensor, part in parts.items()}
-    count, kinds = np.array([b - a for a, b in ranges]), ['static'] * len(ranges)
+    count = np.array([b - a for a, b in ranges])
     means, sems = [], []
     for sensor in SENSORS:
         means.append(np.array([part.mean(0) for part in parts[sensor]]))
-        variance = noise[sensor].mean_variance(kinds, count)
+        variance = noise[sensor].low_variance / count[:, None]
         sems.append(np.sqrt(_with_rounding(variance, parts[sensor], rounding[sensor])))
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
@@ -123,7 +123,7 @@ def _hidden_rates(
     return HiddenRates(tuple(bands.tolist()), tuple(rounding_sd.tolist()), tuple(step.tolist()))
 
 
-def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: NoiseModel) -> np.ndarray:
+def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: SensorNoise) -> np.ndarray:
     """
     Return the rates at which the attitude creeps in each pose, as observable from gravity, rad/s.
 
@@ -154,9 +154,11 @@ def noise_statistics(poses: Poses) -> dict:
     return found | {'period': poses.period, 'sway': poses.sway}
 
 
-def _pooled_noise(parts: Sequence[np.ndarray], rounding: np.ndarray, pieces: int = 8) -> NoiseModel:
+def _pooled_noise(
+    parts: Sequence[np.ndarray], rounding: np.ndarray, pieces: int = 8
+) -> SensorNoise:
     """
-    Return the NoiseModel of samples.
+    Return the SensorNoise of samples.
 
     From the median of the intervals and how much means of pieces scatter more than white noise.
     """
@@ -172,9 +174,9 @@ def _pooled_noise(parts: Sequence[np.ndarray], rounding: np.ndarray, pieces: int
             # differences of neighbours: a slow drift belongs to the scatter between poses, not here
             ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * length / within**2)
     if not ratios:
-        return NoiseModel(within**2, np.ones(3))
+        return SensorNoise(within**2, np.ones(3))
     ratio, margin = np.mean(ratios, axis=0), 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
-    return NoiseModel(within**2, np.where(ratio > 1 + margin, ratio, 1.0))
+    return SensorNoise(within**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
 
 def distinct_attitudes(force: np.ndarray) -> int:

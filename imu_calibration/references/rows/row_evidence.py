@@ -13,8 +13,8 @@ import numpy as np
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
-from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.selection.evidence import Evidence, ParameterFit
 

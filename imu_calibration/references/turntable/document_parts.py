@@ -11,6 +11,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.turntable.mount_check import common_turn_deg
+from imu_calibration.references.turntable.noise_model import noise_of_windows
 from imu_calibration.references.turntable.session_data import SessionData
 
 
@@ -29,7 +30,7 @@ def gauge_of(model: SensorModel) -> dict[str, Any]:
 def statistics(solution: Solution, gathered: SessionData) -> RecordingStatistics:
     """Return the statistics of windows: noise, residuals, chi-square, dropped samples."""
     sensors = {}
-    for sensor, noise in solution.noise.items():
+    for sensor, noise in noise_of_windows(solution).items():
         attitude = None
         if sensor in solution.attitude:
             dependence = solution.attitude[sensor]

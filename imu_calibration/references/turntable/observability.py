@@ -1,6 +1,6 @@
 """Observability of parameters: what standard motions add to the information of a recording."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -11,8 +11,8 @@ from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.effects.sensor_model import ColumnLayout, SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.references.turntable.standard_motions import MOTIONS, OTHER_MOUNT, Motion
@@ -26,7 +26,7 @@ SAMPLES_PER_POINT = 2.0
 def added_information(
     model: SensorModel,
     values: np.ndarray,
-    noise: dict[str, NoiseModel],
+    noise: Mapping[str, SensorNoise],
     *,
     motion: Motion,
     gravity: float,
@@ -92,7 +92,7 @@ class _MotionColumns:
     Sum of squares about the means of all samples, shape (n_columns, n_columns); None of rests.
     """
 
-    def information(self, slope: np.ndarray, noise: NoiseModel) -> np.ndarray:
+    def information(self, slope: np.ndarray, noise: SensorNoise) -> np.ndarray:
         """
         Return the information, shape (n_params, n_params).
 

@@ -29,6 +29,7 @@ from imu_calibration.references.turntable.accumulator import (
     stack,
 )
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.noise_model import noise_of_windows
 from imu_calibration.references.turntable.window_statistics import (
     N_AXES,
     WindowStatistics,
@@ -338,7 +339,8 @@ def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution, prior: Prior
         if block.accumulator.rows:
             system = WeightedSystem(block.accumulator, solution.model)
             factors = {
-                sensor: system.factors(sensor, solution.noise[sensor]) for sensor in solution.noise
+                sensor: system.factors(sensor, noise)
+                for sensor, noise in noise_of_windows(solution).items()
             }
             residuals = system.residuals(solution.values, factors)[: -len(prior.root)]
             rows.append(np.column_stack([system.jacobian(solution.values, factors), residuals]))

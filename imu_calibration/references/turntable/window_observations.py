@@ -34,7 +34,6 @@ from imu_calibration.effects.forward_equations import (
     sensor_output,
 )
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import GRAVITY, Solution, common_scale, with_term
@@ -48,6 +47,7 @@ from imu_calibration.references.turntable import latitude_check, mount_check
 from imu_calibration.references.turntable.document_parts import gauge_of, statistics
 from imu_calibration.references.turntable.held_out_windows import HeldOutWindows, nominal_values
 from imu_calibration.references.turntable.needs import motions_needed, weak_on_table
+from imu_calibration.references.turntable.noise_model import noise_of_windows, sessions_of
 from imu_calibration.references.turntable.observability import tolerance_scaled_singular_values
 from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
 from imu_calibration.references.turntable.residuals.residual_blocks import residuals
@@ -200,9 +200,8 @@ def parameter_shifts(
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(sources), len(solution.values)))
-    for sensor in solution.noise:
+    for sensor, noise in noise_of_windows(solution).items():
         slope = coefficient_jacobian(solution.model, sensor, solution.values)
-        noise = solution.noise[sensor]
         designs = [np.einsum('nq,qap->nap', own[sensor].columns, slope) for own in outputs]
 
         # The means of all windows, correlated through the bias.

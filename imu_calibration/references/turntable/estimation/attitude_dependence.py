@@ -5,11 +5,11 @@ import numpy as np
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian
-from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.estimation.solution import AttitudeDependence
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.noise_model import NoiseModel, sessions_of
 
 MIN_SPARE = 6
 """Fewest degrees of freedom that must remain after the fit of the attitude."""

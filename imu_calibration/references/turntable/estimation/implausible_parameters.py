@@ -3,8 +3,8 @@
 import numpy as np
 
 from imu_calibration.effects.base import Effect, Role
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.noise_model import NoiseModel
 
 MAX_PRIOR_SDS = 3.0
 """Prior standard deviations beyond which an entry of a matrix needs a reason that is not misfit."""

@@ -10,8 +10,8 @@ from imu_calibration.estimation.model_error import (
     errors_of_waves,
     waves_of_blocks,
 )
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.noise_model import NoiseModel
 
 COMMON_MEAN_FACTOR = 1.5
 """

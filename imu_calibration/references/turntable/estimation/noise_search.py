@@ -15,7 +15,7 @@ from imu_calibration.estimation.noise_likelihood import (
     NoiseLikelihood,
     NoiseShape,
 )
-from imu_calibration.estimation.noise_model import BiasProcess, dof_factor
+from imu_calibration.estimation.sensor_noise import BiasProcess, dof_factor
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
 """

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.effects.forward_equations import coefficient_jacobian
-from imu_calibration.estimation.noise_model import (
-    BiasProcess,
+from imu_calibration.estimation.prior import fixed_parameters
+from imu_calibration.estimation.sensor_noise import BiasProcess
+from imu_calibration.references.turntable.estimation.accumulated_rows import MeanRows
+from imu_calibration.references.turntable.estimation.noise_search import estimate_offsets
+from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.noise_model import (
     MovingFactors,
     NoiseModel,
     ReferenceNoise,
 )
-from imu_calibration.estimation.prior import fixed_parameters
-from imu_calibration.references.turntable.estimation.accumulated_rows import MeanRows
-from imu_calibration.references.turntable.estimation.noise_search import estimate_offsets
-from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
 
 MIN_VARIANCE_RATIO = 2.0
 """

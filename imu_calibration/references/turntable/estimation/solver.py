@@ -9,15 +9,14 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.gauss_newton import gauss_newton, halved
 from imu_calibration.estimation.held_parameters import Factors, undetermined_parameters, weak_alone
-from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.prior import fixed_parameters
 from imu_calibration.estimation.scaled_solve import covariance_with_held, scaled_lstsq
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.solution import (
     AttitudeDependence,
     Solution,
     terms_of_fit,
 )
-from imu_calibration.estimation.whitening import predict_session_offsets
 from imu_calibration.references.turntable.estimation.accumulated_rows import (
     AccumulatedRows,
     not_separable,
@@ -34,6 +33,7 @@ from imu_calibration.references.turntable.estimation.session_noise import (
 )
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
 from imu_calibration.references.turntable.estimation.window_outliers import outlier_windows
+from imu_calibration.references.turntable.noise_model import NoiseModel, predict_session_offsets
 
 NOISE_ROUNDS = 6
 """Largest number of alternating estimates of noise and parameters."""

@@ -12,7 +12,6 @@ import scipy.linalg
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.whitening import Whitening
@@ -20,6 +19,7 @@ from imu_calibration.references.turntable.estimation.accumulated_rows import (
     AccumulatedRows,
     CentredRows,
 )
+from imu_calibration.references.turntable.noise_model import NoiseModel, sessions_of
 
 EXCLUDED_MEAN_SD_FACTOR = 1e3
 """Sd factor of an excluded mean over the largest sd of all means."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.distributions import chance_of_fall
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.outliers import Outliers, find_outliers
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.noise_model import NoiseModel
 
 MAX_WINDOW_OUTLIERS = 0.15
 """

@@ -14,13 +14,13 @@ from scipy.linalg import cholesky, solve_triangular, svd
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.effects.forward_equations import References
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, chunks, sensors_of
 from imu_calibration.references.turntable.estimation.session_noise import LEAST_NOISE
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.residuals.jitter_of_blocks import (
     jitter_ratio,
     stamp_jitter,

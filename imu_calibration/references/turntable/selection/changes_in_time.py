@@ -5,8 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.selection.parameter_space import (
     ParameterSpace,
     mean_whitening,

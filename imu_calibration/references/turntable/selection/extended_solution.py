@@ -7,10 +7,10 @@ import numpy as np
 
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import SAMPLE_NOISE, Solution
 from imu_calibration.references.turntable.estimation.session_noise import WEIGHTLESS
 from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.selection.parameter_space import ParameterSpace
 from imu_calibration.references.turntable.selection.saturation import Saturation
 from imu_calibration.selection.questions import Question

@@ -9,14 +9,8 @@ import numpy as np
 
 from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
-from imu_calibration.estimation.noise_model import (
-    NATURAL,
-    BiasProcess,
-    MovingFactors,
-    NoiseModel,
-    ReferenceNoise,
-)
 from imu_calibration.estimation.scaled_solve import solve_normal
+from imu_calibration.estimation.sensor_noise import NATURAL, BiasProcess
 from imu_calibration.references.turntable.estimation.noise_search import (
     CORRELATION_TIMES,
     BiasProcessSearch,
@@ -27,6 +21,11 @@ from imu_calibration.references.turntable.estimation.session_noise import (
     misfit_along,
     shaken_means,
     white_noise,
+)
+from imu_calibration.references.turntable.noise_model import (
+    MovingFactors,
+    NoiseModel,
+    ReferenceNoise,
 )
 from imu_calibration.references.turntable.selection.parameter_space import (
     ParameterSpace,

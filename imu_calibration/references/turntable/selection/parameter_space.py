@@ -10,8 +10,8 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.selection.reduced_recording import ReducedRecording
 from imu_calibration.selection.questions import Question
 

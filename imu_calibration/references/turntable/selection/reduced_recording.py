@@ -19,7 +19,6 @@ from imu_calibration.effects.forward_equations import (
     effect_slopes,
 )
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, chunks, sensors_of
@@ -28,6 +27,7 @@ from imu_calibration.references.turntable.accumulator import (
     restricted_window,
     selected_columns,
 )
+from imu_calibration.references.turntable.noise_model import sessions_of
 from imu_calibration.references.turntable.packed_factors import packed, unpacked
 from imu_calibration.references.turntable.window_statistics import WindowStatistics, reduce_windows
 from imu_calibration.selection.evidence import Recent

@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
-from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, solve_normal, solve_scaled
 from imu_calibration.estimation.solution import CONVENTION_SHARE
+from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.selection.parameter_space import (
     ParameterSpace,
     normal_matrix,

@@ -1,59 +1,22 @@
 """
-The noise of one sensor.
+The noise of one sensor in windows on a table.
 
-White noise within windows, offsets of windows, bias processes, excess variance of moving windows.
+Noise within windows, offsets of windows, excess variance of moving windows, steps of the encoders.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 
 from imu_calibration.core.units import STANDARD_GRAVITY
+from imu_calibration.estimation.sensor_noise import BiasProcess, SensorNoise, means_beside_middles
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.whitening import Whitening
 
-NATURAL = 0.5
-"""
-Least sd of every bias process over the white noise of one second, with the first of these
-correlation times.
-"""
-HOUR = 3600.0
-"""s; sessions are hardly longer, and changes of a bias over days are constant within a session."""
 SAME_VARIANCE = 0.05
 """Relative change of variance up to which two noise models weigh rows alike."""
-DOF_FACTOR_MOST = 3.0
-"""Largest factor by which a variance grows because it was itself estimated."""
-
-
-@dataclass(frozen=True)
-class BiasProcess:
-    """
-    First-order Gauss-Markov process of the bias.
-
-    Covariance ``sd^2 exp(-|dt| / time)``, the same on all axes, independent.
-    """
-
-    sd: float
-    """Standard deviation, m/s^2 or rad/s."""
-    time: float
-    """
-    Correlation time, s; a random walk if long compared with the session; several processes at
-    spaced times approximate flicker noise.
-    """
-
-    def within(self, duration: float) -> float:
-        """
-        Return the standard deviation about the mean over a duration, s.
-
-        The part visible in a session.
-
-        ``sd^2 (1 - 2 r (1 - r (1 - exp(-1 / r))))`` with r the correlation time over the duration.
-        """
-        ratio = self.time / duration
-        return (
-            self.sd * float(np.sqrt(1 + 2 * ratio * (ratio * -np.expm1(-1 / ratio) - 1)))
-            if ratio > 1e-6
-            else self.sd
-        )
 
 
 @dataclass(frozen=True)
@@ -116,9 +79,9 @@ class MovingFactors:
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseModel:
+class NoiseModel(SensorNoise):
     """
-    Noise of one sensor.
+    Noise of one sensor in windows.
 
     The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with
     its neighbours in the same recording, the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) +
@@ -126,16 +89,6 @@ class NoiseModel:
     of the bias within a window adds the variance `means_beside_middles` to its mean.
     """
 
-    white_variance: np.ndarray
-    """Variance of single samples at rest, shape (3,)."""
-    inflation: np.ndarray
-    """
-    Factor by which the noise at low frequency exceeds white noise of that variance, shape (3,).
-    """
-    offset_sd: float = 0.0
-    """Standard deviation of an independent offset per window."""
-    bias_processes: tuple[BiasProcess, ...] = ()
-    """Processes of the bias between windows."""
     known: tuple[BiasProcess, ...] = ()
     """The ones that were measured separately, on a recording at rest."""
     middle_wander: float = 0.0
@@ -161,21 +114,6 @@ class NoiseModel:
     """
     left_out: frozenset[tuple[int, float]] = frozenset()
     """(recording, middle in s) of outlying windows: their means have no weight."""
-
-    @property
-    def white_sd(self) -> np.ndarray:
-        """Standard deviation of single samples at rest, shape (3,)."""
-        return np.sqrt(self.white_variance)
-
-    @property
-    def low_variance(self) -> np.ndarray:
-        """Variance of white noise that would scatter the means of samples as much, shape (3,)."""
-        return self.white_variance * self.inflation
-
-    @property
-    def bias_variance(self) -> float:
-        """Variance of all bias processes together, of slow ones within an hour."""
-        return sum(process.sd**2 * min(1.0, HOUR / process.time) for process in self.bias_processes)
 
     @property
     def bias_time(self) -> float | None:
@@ -308,33 +246,9 @@ class NoiseModel:
         return True
 
 
-def means_beside_middles(
-    processes: Sequence[BiasProcess], durations: np.ndarray | float
-) -> np.ndarray:
-    """
-    Return the relative variance of the mean of a bias process over windows.
-
-    The windows have these lengths (s). The variance is relative to the value of the process in
-    their middles.
-
-    For a random walk with ``2 sd^2 / time`` per second it is ``sd^2 T / (6 time)``. It decreases in
-    windows longer than the correlation time, where the value in the middle overstates the variance
-    of the mean.
-    """
-    total = np.zeros(np.shape(durations))
-    for process in processes:
-        step = np.asarray(durations, float) / (6 * process.time)
-        total = total + process.sd**2 * step / (1 + (3 * step) ** 2)
-    return total
-
-
-def dof_factor(dof: np.ndarray | float) -> np.ndarray:
-    """
-    Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST.
-
-    Factor on a variance from few data.
-    """
-    return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
+def noise_of_windows(solution: Solution) -> dict[str, NoiseModel]:
+    """Return the noise of a solution on a table: sensor -> NoiseModel."""
+    return cast(dict[str, NoiseModel], solution.noise)
 
 
 def sessions_of(rows: Sequence) -> list[np.ndarray]:
@@ -345,3 +259,36 @@ def sessions_of(rows: Sequence) -> list[np.ndarray]:
         np.flatnonzero(numbers == number)[np.argsort(times[numbers == number], kind='stable')]
         for number in np.unique(numbers)
     ]
+
+
+def predict_session_offsets(
+    misfit: np.ndarray,
+    variance: np.ndarray,
+    times: np.ndarray,
+    *,
+    sessions: list[np.ndarray],
+    noise: NoiseModel,
+) -> np.ndarray:
+    """
+    Return the offset of each session, shape (n_sessions, 3).
+
+    The weighted mean of its residuals, drawn towards zero by its noise.
+
+    Parameters
+    ----------
+    misfit, variance : ndarray, shape (n, 3)
+        Residuals of the window means and the independent part of their variance.
+    noise : NoiseModel
+
+    """
+    rows = Whitening(variance, times, sessions, processes=noise.bias_processes)(
+        np.stack([np.ones_like(misfit), misfit], axis=2)
+    )
+    ones, rest = np.moveaxis(rows, 2, 0)
+    parts = ((ones[index], rest[index]) for index in sessions)
+    return np.array(
+        [
+            (one * left).sum(axis=0) / ((one**2).sum(axis=0) + 1 / noise.session_variance)
+            for one, left in parts
+        ]
+    )

@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 
 from imu_calibration.core.samples import rounding_variance
-from imu_calibration.estimation.noise_model import (
-    BiasProcess,
-    MovingFactors,
-    NoiseModel,
-    ReferenceNoise,
-    dof_factor,
-)
+from imu_calibration.estimation.sensor_noise import BiasProcess, dof_factor
 from imu_calibration.references.turntable.estimation.session_noise import (
     least_misfit,
     misfit_along,
     white_noise,
+)
+from imu_calibration.references.turntable.noise_model import (
+    MovingFactors,
+    NoiseModel,
+    ReferenceNoise,
 )
 from imu_calibration.references.turntable.selection.saturation import sample_sd_at_rest
 from imu_calibration.simulation.sensor_noise import gauss_markov_samples

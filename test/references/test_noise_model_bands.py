@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.estimation.session_noise import band_misfit, misfit_along
 from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.noise_model import MovingFactors, NoiseModel
 from imu_calibration.references.turntable.window_statistics import reduce_window, slow_part
 
 TABLE = Table.from_mapping(
