@@ -7,7 +7,7 @@ import yaml
 
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.references.gravity.hand_recording import read_by_hand
+from imu_calibration.preprocessing.sample_recording import read_recording
 from msg_adapters.bag import open_recording
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,7 +51,7 @@ def gravity_of(folder, name):
 def load(folder, name, topic=None):
     """Return the cleaned ImuSamples of a recording, in SI."""
     with open_recording(folder / name, topic, want_joints=False) as recording:
-        imu = read_by_hand(recording.blocks()).imu
+        imu = read_recording(recording.blocks()).imu
     nominal = nominal_of(folder, name)
     return imu if nominal is None else nominal.apply(imu)
 

@@ -37,7 +37,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.show import warn
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, visible_findings
-    from imu_calibration.references.gravity.hand_recording import read_by_hand
+    from imu_calibration.preprocessing.sample_recording import read_recording
     from imu_calibration.use_cases.choices import log_options, readings_of
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of, sources_without
 
@@ -72,7 +72,7 @@ def run(options: Options) -> VerbResult:
     for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
         (source,) = sources_without([source_of(options.bag, topic)], [options.bag], options.exclude)
-        recording = read_by_hand(source, readings, Preflight())
+        recording = read_recording(source, readings, Preflight())
         imus.append(recording.imu)
         findings = visible_findings(recording.findings)
         warn(finding.named(str(topic.imu)).to_mapping() for finding in findings)

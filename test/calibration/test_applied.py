@@ -20,8 +20,8 @@ from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.forward_equations import centred, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import Reference
+from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
-from imu_calibration.references.gravity.hand_recording import read_by_hand
 from imu_calibration.references.gravity.pose_readings import prove_hand_readings
 from imu_calibration.references.turntable.held_out_windows import HeldOutWindows
 from imu_calibration.use_cases.recordings import Topics, source_of
@@ -103,7 +103,7 @@ def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
     checked = imu.check(tmp_path / 'bag', known, gravity=GRAVITY)
     imu.compensate(tmp_path / 'bag', known, output=tmp_path / 'corrected', anyway=True)
     raw, corrected = (
-        read_by_hand(source_of(tmp_path / 'corrected', Topics(topic), want_joints=False)).imu
+        read_recording(source_of(tmp_path / 'corrected', Topics(topic), want_joints=False)).imu
         for topic in ('/imu/data_raw', '/imu/data_corrected')
     )
     written = prove_hand_readings(gather_by_hand(raw), raw, corrected, gravity=GRAVITY)

@@ -13,7 +13,7 @@ from imu_calibration.preprocessing.counter_overflow import (
     longer_gaps,
     without_overflows,
 )
-from imu_calibration.references.gravity.hand_recording import read_by_hand
+from imu_calibration.preprocessing.sample_recording import read_recording
 from msg_adapters.csv_log import read_csv
 
 from worlds.calibrated_by_hand import calibrated
@@ -64,7 +64,7 @@ def test_stamps_of_a_bag_that_overflow_give_the_usual_result(clean, usual):
     away = found.calibration.values - usual.calibration.values
     assert (np.abs(away) <= 0.5 * found.calibration.sd).all()
     assert exit_code(found.calibration) == 0
-    notes = read_by_hand(
+    notes = read_recording(
         [SampleBlock(replace(clean, stamp_ns=stamps))], preflight=Preflight(GRAVITY)
     ).findings
     assert ('stamps', 'note') in [(f.check, f.severity) for f in notes]
@@ -89,7 +89,7 @@ def test_temperatures_follow_the_parts():
     stamps = imu.stamp_ns + 400_000_000_000
     stamps[200:] -= 300_000_000_000
     warm = TemperatureSamples(stamps.copy(), np.where(np.arange(400) < 200, 20.0, 30.0))
-    found = read_by_hand([SampleBlock(replace(imu, stamp_ns=stamps), temperature=warm)])
+    found = read_recording([SampleBlock(replace(imu, stamp_ns=stamps), temperature=warm)])
     assert (np.diff(found.imu.stamp_ns) > 0).all()
     assert found.temperature_c[:200] == pytest.approx(20.0)
     assert found.temperature_c[200:] == pytest.approx(30.0)

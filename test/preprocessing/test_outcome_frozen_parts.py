@@ -14,8 +14,8 @@ from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
-from imu_calibration.references.gravity.hand_recording import read_by_hand
 from imu_calibration.references.gravity.pose_readings import errors_by_hand
 from imu_calibration.references.turntable.collector import GatherStep
 from imu_calibration.use_cases.compensate import compensate_recording
@@ -118,7 +118,7 @@ def test_noise_is_that_of_the_readings():
 def test_ranges_are_left_out_whatever_the_blocks(clean):
     bad = without_output(clean, 31.0, 44.0)
     preflight = Preflight(GRAVITY)
-    whole = read_by_hand([SampleBlock(bad)], preflight=preflight).imu
+    whole = read_recording([SampleBlock(bad)], preflight=preflight).imu
     pieces = [SampleBlock(bad.select(slice(a, a + 37))) for a in range(0, len(bad), 37)]
     cleaner = BlockCleaner(without=preflight.without_readings)
     cut = [imu for cleaned in cleaner.all_of(pieces) for _, imu in cleaned.imu]

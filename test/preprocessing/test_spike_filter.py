@@ -13,10 +13,10 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.references.gravity.hand_recording import read_by_hand
 from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 
 from worlds.candidates import FEW
@@ -67,9 +67,9 @@ def test_one_corrupt_sample_is_dropped_wherever_it_is(session):
 
 def test_how_the_stream_is_cut_does_not_matter(session):
     spoiled = with_spikes(session, 0.01, 4)
-    whole = read_by_hand([SampleBlock(spoiled)])
+    whole = read_recording([SampleBlock(spoiled)])
     for size in (1, 7, 31, 500):
-        pieces = read_by_hand(
+        pieces = read_recording(
             [SampleBlock(spoiled.select(slice(a, a + size))) for a in range(0, len(spoiled), size)]
         )
         np.testing.assert_array_equal(pieces.imu.stamp_ns, whole.imu.stamp_ns)
@@ -137,7 +137,7 @@ def test_fast_twisting_at_a_low_rate_is_no_spike():
 
 def test_one_per_cent_of_spikes_does_not_matter_by_hand(session):
     clean, spoiled = (
-        calibrate_by_hand(read_by_hand([SampleBlock(imu)]).imu, HandOptions(GRAVITY))
+        calibrate_by_hand(read_recording([SampleBlock(imu)]).imu, HandOptions(GRAVITY))
         for imu in (session, with_spikes(session, 0.01, 5))
     )
     assert np.all(np.abs(spoiled.values - clean.values)[clean.sd > 0] < clean.sd[clean.sd > 0])

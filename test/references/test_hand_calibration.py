@@ -527,10 +527,10 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
 
 
 def load(recordings, name, topic=None):
-    from imu_calibration.references.gravity.hand_recording import read_by_hand
+    from imu_calibration.preprocessing.sample_recording import read_recording
     from msg_adapters.bag import open_recording
 
-    return read_by_hand(open_recording(recordings / name, topic, want_joints=False).blocks()).imu
+    return read_recording(open_recording(recordings / name, topic, want_joints=False).blocks()).imu
 
 
 def heldout_norm_rms(imu, ranges, gravity, **options):

@@ -21,6 +21,7 @@ from imu_calibration.estimation.solution import of_fit, reasons_held, with_weak_
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import find_still
+from imu_calibration.preprocessing.sample_recording import SampleRecording, read_recording
 from imu_calibration.references.gravity.advice import missing_motion
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
@@ -31,7 +32,6 @@ from imu_calibration.references.gravity.hand_parameters import (
     HandOptions,
     hand_options,
 )
-from imu_calibration.references.gravity.hand_recording import HandRecording, read_by_hand
 from imu_calibration.references.gravity.hand_workflow import calibrate_poses
 from imu_calibration.references.gravity.poses import (
     at_range_end,
@@ -63,7 +63,7 @@ def session():
 
 
 def calibrated(imu):
-    return calibrate_by_hand(read_by_hand([SampleBlock(imu)]).imu, HandOptions(GRAVITY))
+    return calibrate_by_hand(read_recording([SampleBlock(imu)]).imu, HandOptions(GRAVITY))
 
 
 def rate_error(found, truth, factor=1.0):
@@ -79,7 +79,7 @@ def rate_error(found, truth, factor=1.0):
 
 
 def looked_at(imu):
-    return read_by_hand([SampleBlock(imu)], preflight=Preflight(GRAVITY, strict=False)).findings
+    return read_recording([SampleBlock(imu)], preflight=Preflight(GRAVITY, strict=False)).findings
 
 
 # a gyroscope at the wrong full-scale setting
@@ -138,7 +138,7 @@ def test_a_large_bias_does_not_spoil_the_gyroscope(session, bias):
 def test_a_scale_far_from_one_is_questioned_and_applied_where_the_data_support_it(session):
     halved = replace(session[0], force_s=0.52 * session[0].force_s, rate_s=2.2 * session[0].rate_s)
     options = CalibrationOptions(gravity=GRAVITY)
-    result = calibrate_poses(read_by_hand([SampleBlock(halved)]), options)
+    result = calibrate_poses(read_recording([SampleBlock(halved)]), options)
     _, matrix_f, _, matrix_w = unpack(session[2])
     for sensor, wanted in (('accelerometer', 0.52 * matrix_f), ('gyroscope', 2.2 * matrix_w)):
         part = result.calibration.model.slices[sensor, 'matrix']
@@ -343,7 +343,7 @@ def test_what_was_left_out_does_not_come_back_in_the_proof():
     rate[ranges[3].stop + 20 : ranges[3].stop + 25, 1] += 4.0
     clean, found = (
         calibrate_poses(
-            HandRecording(samples, None, {}), CalibrationOptions(gravity=GRAVITY), stills=ranges
+            SampleRecording(samples, None, {}), CalibrationOptions(gravity=GRAVITY), stills=ranges
         )
         for samples in (imu, replace(imu, rate_s=rate))
     )
@@ -433,7 +433,7 @@ def test_repeated_stamps_are_spread_over_the_step_that_follows():
 def test_times_are_those_of_the_clock_that_jittering_stamps_follow():
     steady, jittering = (
         clean(4, rests=10)[0],
-        read_by_hand([SampleBlock(jitter(4, rests=10)[0])]).imu,
+        read_recording([SampleBlock(jitter(4, rests=10)[0])]).imu,
     )
     off = sample_times(jittering) - 1e-9 * (steady.stamp_ns - steady.stamp_ns[0])
     # Over a turn: of 3 ms, and 0.3 ms in the times that the cleaning draws over 64 samples.
@@ -468,7 +468,7 @@ def test_the_error_budget_lists_an_unknown_gravity_and_not_a_given_one():
     imu, ranges, _ = hold_and_turn(3, n_poses=14)
     unknown, given = (
         calibrate_poses(
-            HandRecording(imu, None, {}),
+            SampleRecording(imu, None, {}),
             CalibrationOptions(gravity=gravity, as_asked=True),
             stills=ranges,
         )

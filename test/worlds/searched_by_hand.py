@@ -5,13 +5,13 @@ import numpy as np
 from imu_calibration.calibration.by_evidence import solve_by_evidence
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.references.gravity.hand_recording import HandRecording
+from imu_calibration.preprocessing.sample_recording import SampleRecording
 from imu_calibration.references.gravity.hand_workflow import PoseRecording
 from imu_calibration.references.gravity.pose_observations import PoseObservations
 
 from worlds.hand_sessions import GRAVITY
 
-NO_SAMPLES = HandRecording(ImuSamples(np.zeros(0, np.int64), *np.zeros((2, 0, 3))), None, {})
+NO_SAMPLES = SampleRecording(ImuSamples(np.zeros(0, np.int64), *np.zeros((2, 0, 3))), None, {})
 """The search needs the means only."""
 
 

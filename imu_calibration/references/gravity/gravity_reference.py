@@ -18,9 +18,9 @@ from imu_calibration.document.rest_noise import motions_at_rest
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.recording_evidence import REFUSE
+from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandOptions, hand_options
-from imu_calibration.references.gravity.hand_recording import read_by_hand
 from imu_calibration.references.gravity.hand_workflow import PoseRecording, gather_poses
 from imu_calibration.references.gravity.live_poses import EMPTY_SCAN, LiveByHand, hand_coverage
 from imu_calibration.references.gravity.pose_observations import HandResult, PoseObservations
@@ -99,7 +99,7 @@ class GravityReference:
         preflight = Preflight(strict=False, one_sensor=True)
         calibrated: HandResult | ImuCalibrationError | None = None
         try:
-            recording = read_by_hand(lenient, options.nominal, preflight)
+            recording = read_recording(lenient, options.nominal, preflight)
             if not any(finding.severity == REFUSE for finding in recording.findings):
                 asked = hand_options(options)
                 poses = PoseRecording(PoseObservations.of(recording, asked))

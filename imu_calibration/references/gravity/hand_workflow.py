@@ -9,9 +9,9 @@ from imu_calibration.calibration.solved import Solved
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import BlockSource
 from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.sample_recording import SampleRecording, read_recording
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import hand_options
-from imu_calibration.references.gravity.hand_recording import HandRecording, read_by_hand
 from imu_calibration.references.gravity.pose_observations import HandResult, PoseObservations
 
 
@@ -66,12 +66,12 @@ def gather_poses(
             ' separately and compare the results'
         )
     preflight = Preflight(options.gravity, one_sensor=one_sensor)
-    recording = read_by_hand(sources[0], options.nominal, preflight)
+    recording = read_recording(sources[0], options.nominal, preflight)
     return PoseRecording(PoseObservations.of(recording, hand_options(options)))
 
 
 def calibrate_poses(
-    recording: HandRecording,
+    recording: SampleRecording,
     options: CalibrationOptions = CalibrationOptions(),
     provenance: dict | None = None,
     *,

@@ -51,6 +51,7 @@ from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.absent_sensor import without_sensor
 from imu_calibration.preprocessing.checks import frozen_text
 from imu_calibration.preprocessing.rest_detection import find_still
+from imu_calibration.preprocessing.sample_recording import SampleRecording, late_gyroscope
 from imu_calibration.preprocessing.sensor_join import delay_of
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
@@ -65,7 +66,6 @@ from imu_calibration.references.gravity.advice import (
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.hand_calibration import MIN_ATTITUDES, POSES_FULL
 from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions, hand_options
-from imu_calibration.references.gravity.hand_recording import HandRecording, late_gyroscope
 from imu_calibration.references.gravity.hand_workflow import calibrate_poses
 from imu_calibration.references.gravity.pose_observations import HandResult, PoseObservations
 from imu_calibration.references.gravity.poses import (
@@ -512,7 +512,7 @@ class LiveByHand(LiveSession):
             imu = without_sensor(imu, sensor)
         delay = delay_of(imu)
         findings = tuple(late_gyroscope(delay))
-        recording = HandRecording(imu, None, self.counts, findings, delay, frozen_sensors)
+        recording = SampleRecording(imu, None, self.counts, findings, delay, frozen_sensors)
         self.result = calibrate_poses(recording, self.options, provenance, stills=self.found.rests)
         return self.result
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import common_scale
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
+from imu_calibration.preprocessing.sample_recording import SampleRecording
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.advice import missing_motion
 from imu_calibration.references.gravity.bias_movement import notes
@@ -37,7 +39,6 @@ from imu_calibration.references.gravity.hand_parameters import (
     HandOptions,
     hand_options,
 )
-from imu_calibration.references.gravity.hand_recording import HandRecording
 from imu_calibration.references.gravity.held_out_poses import (
     TURNS_LEAST,
     HeldOutPoses,
@@ -57,7 +58,7 @@ class PoseObservations:
 
     data: HandData
     """Poses and turns."""
-    recording: HandRecording
+    recording: SampleRecording
     """The samples, with counts and findings."""
     gravity: float
     """Gravity that was given, or the standard one, m/s^2."""
@@ -69,7 +70,7 @@ class PoseObservations:
     @classmethod
     def of(
         cls,
-        recording: HandRecording,
+        recording: SampleRecording,
         options: HandOptions,
         stills: Sequence[slice] | None = None,
     ) -> 'PoseObservations':
@@ -77,10 +78,19 @@ class PoseObservations:
         data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
         return cls(data, recording, options.gravity)
 
-    @property
+    @cached_property
     def gathered(self) -> GatheredData:
         """Counts and conditions of the recording."""
-        return self.recording.gathered
+        imu, warm = self.recording.imu, self.recording.temperature_c
+        return GatheredData(
+            counts=self.recording.counts,
+            frame_id=imu.frame_id,
+            first_stamp_ns=int(imu.stamp_ns[0]),
+            last_stamp_ns=int(imu.stamp_ns[-1]),
+            largest_rate=float(np.sqrt(np.einsum('ij,ij->i', imu.rate_s, imu.rate_s).max())),
+            largest_force=float(max(imu.force_s.max(), -imu.force_s.min())),
+            temperature_c=None if warm is None else (float(warm.min()), float(warm.max())),
+        )
 
     @property
     def period(self) -> float:

@@ -19,9 +19,9 @@ from imu_calibration.effects.base import UNITS
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
+from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.hand_calibration import HandData, gather_by_hand
-from imu_calibration.references.gravity.hand_recording import read_by_hand
 from imu_calibration.references.gravity.held_out_poses import (
     TURN_ANGLE_UNIT,
     TURNS_LEAST,
@@ -68,7 +68,7 @@ def errors_by_hand(
             ' differs',
         )
     preflight = Preflight(options.gravity, one_sensor=True)
-    recording = read_by_hand(source, options.nominal, preflight)
+    recording = read_recording(source, options.nominal, preflight)
     errors = ReadingErrors(
         proof={},
         # A table compares components, rests by hand the length: only these errors are alike.

@@ -21,8 +21,8 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import JOINT_STATES, Preflight
+from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.preprocessing.window_finder import session_truth
-from imu_calibration.references.gravity.hand_recording import read_by_hand
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.live_windows import LiveCalibration
 from imu_calibration.references.turntable.selection.investigation import too_few_windows
@@ -121,7 +121,7 @@ class TableReference:
         if not preflight.streams:  # not read to its end
             preflight = Preflight(gravity, strict=False)
             with suppress(ImuCalibrationError):
-                read_by_hand(lenient, options.nominal, preflight)
+                read_recording(lenient, options.nominal, preflight)
         findings = preflight.findings
         if isinstance(calibrated, ImuCalibrationError) and calibrated.code == 'on_table':
             # Joints that rest while the IMU turns follow from the cause that the error states,

@@ -1,12 +1,10 @@
-"""A recording without joints: cleaned samples with the findings of its checks."""
+"""The samples of a recording: cleaned, with the findings of the checks of the recording."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 
-from imu_calibration.calibration.gathered_data import GatheredData
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, JoinedParts, SampleBlock, TemperatureSamples
@@ -18,8 +16,8 @@ from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, Continue
 
 
 @dataclass(frozen=True, eq=False)
-class HandRecording:
-    """A recording without joints, cleaned."""
+class SampleRecording:
+    """The samples of a recording, cleaned; its joints are not read."""
 
     imu: ImuSamples
     """Accepted samples."""
@@ -34,28 +32,14 @@ class HandRecording:
     unusable: dict[str, str] = field(default_factory=dict)
     """Sensor with readings that cannot be used -> why; `imu` marks it as absent."""
 
-    @cached_property
-    def gathered(self) -> GatheredData:
-        """Data of the recording for the document, without parameters."""
-        imu, warm = self.imu, self.temperature_c
-        return GatheredData(
-            counts=self.counts,
-            frame_id=imu.frame_id,
-            first_stamp_ns=int(imu.stamp_ns[0]),
-            last_stamp_ns=int(imu.stamp_ns[-1]),
-            largest_rate=float(np.sqrt(np.einsum('ij,ij->i', imu.rate_s, imu.rate_s).max())),
-            largest_force=float(max(imu.force_s.max(), -imu.force_s.min())),
-            temperature_c=None if warm is None else (float(warm.min()), float(warm.max())),
-        )
 
-
-def read_by_hand(
+def read_recording(
     blocks: Iterable[SampleBlock],
     nominal: RawReadings | None = None,
     preflight: Preflight | None = None,
-) -> HandRecording:
+) -> SampleRecording:
     """
-    Return the `HandRecording` of a complete stream of SampleBlock.
+    Return the `SampleRecording` of a complete stream of SampleBlock.
 
     With the findings of `preflight`; `nominal` as for the `BlockCleaner`.
 
@@ -109,7 +93,7 @@ def read_by_hand(
     counts = cleaner.lost | {
         reason: count for reason, count in cleaner.counts.items() if reason.startswith('imu ')
     }
-    return HandRecording(
+    return SampleRecording(
         imu,
         warm,
         {reason: count for reason, count in counts.items() if count},
