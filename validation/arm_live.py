@@ -16,10 +16,12 @@ from scipy.spatial.transform import Rotation
 from examples.processes import NodeProcesses, local_environment
 from imu_calibration.between_imus.arm import RelativeArm, estimate_arm
 from imu_calibration.between_imus.pair import clipped
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.compensation.compensate import Transfer, compensated_samples
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
-from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
+from imu_calibration.references.gravity.gravity_reference import GravityReference
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS
 from msg_adapters.write import encode_imu
@@ -79,7 +81,8 @@ def prepare(folder, name, arm_from, *, seconds, pair=PAIR):
     found = []
     for topic in topics:
         with open_recording(folder / name, topic, want_joints=False) as recording:
-            result = calibrate_without_table([recording.blocks()])
+            poses = GravityReference().gather([recording.blocks()], CalibrationOptions())
+            result = calibrate_by_evidence(poses)
             found.append((result.calibration, result.applied))
     arm = estimate_arm(*(load(folder, arm_from, topic) for topic in topics))
     a, b = imus

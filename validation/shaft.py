@@ -1,19 +1,22 @@
 """One joint is a table too: a motor shaft with a coarse encoder."""
 
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 from msg_adapters.bag import open_recording
 from validation.recordings import SHAFT
 from validation.section import Section, text
 
 KNOWN = {'shaft_pitch_slow': ('yy', 0.985), 'shaft_yaw_medium': ('zz', 1.005)}
 """Which entry lies along the shaft, and its known value."""
-WITH_LAG = CalibrationOptions('bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset')
+WITH_LAG = CalibrationOptions(
+    'bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset', as_asked=True
+)
 LAG = ('gyroscope.gyro_bandwidth.time_constant', 'reference.time_offset.offset')
 
 
@@ -28,9 +31,10 @@ def calibrations(folder, name):
     """Return {'default', 'with lag': Calibration or the refusal as text}."""
     table, blocks = read(folder, name)
     found: dict[str, Calibration | str] = {}
-    for what, options in (('default', CalibrationOptions()), ('with lag', WITH_LAG)):
+    for what, options in (('default', CalibrationOptions(as_asked=True)), ('with lag', WITH_LAG)):
         try:
-            found[what] = calibrate_on_table([blocks], table, options).calibration
+            recordings = TableReference(table).gather([blocks], options)
+            found[what] = calibrate_by_evidence(recordings, options).calibration
         except ImuCalibrationError as error:
             found[what] = str(error)
     return found

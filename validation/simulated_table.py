@@ -13,10 +13,12 @@ from unittest import mock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.calibration.calibrate import calibrate_by_evidence
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 from validation.figures import new_figure
@@ -129,7 +131,9 @@ def calibrate_through_a_bag(imu, joints):
         write_session(path, imu, joints)
         with open_recording(path) as recording:
             blocks = list(recording.blocks(table.joint_names))
-    return calibrate_on_table([blocks], table).calibration
+    options = CalibrationOptions(as_asked=True)
+    recordings = TableReference(table).gather([blocks], options)
+    return calibrate_by_evidence(recordings, options).calibration
 
 
 def compare(calibration):

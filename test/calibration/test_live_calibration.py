@@ -19,13 +19,13 @@ from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.references.turntable import collector
 from imu_calibration.references.turntable.live_windows import LiveCalibration
 from imu_calibration.references.turntable.table_calibration import (
-    calibrate_on_table,
     solved_windows,
 )
 from imu_calibration.references.turntable.window_observations import WindowObservations
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
+from worlds.calibrated import calibrated_on_table
 from worlds.tables import three_axis_table
 
 TABLE = three_axis_table(height=150.0, mount={'rpy_deg': [0, 0, 0], 'xyz': None})
@@ -80,7 +80,7 @@ def blocks(*streams, seed=0, mean_seconds=0.5):
 
 def offline(*sessions, options=CalibrationOptions()):
     """Return what the offline tool says."""
-    return calibrate_on_table([[SampleBlock(*s)] for s in sessions], TABLE, options)
+    return calibrated_on_table([[SampleBlock(*s)] for s in sessions], TABLE, options)
 
 
 def run(live, *streams, seed=0):

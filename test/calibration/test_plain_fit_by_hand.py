@@ -15,9 +15,9 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
-from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 from imu_calibration.references.gravity.pose_readings import errors_by_hand
 
+from worlds.calibrated import calibrated_by_hand
 from worlds.compensation_cases import with_values
 from worlds.hand_sessions import GRAVITY, simulate
 
@@ -85,7 +85,7 @@ def test_turns_of_a_second_session_are_no_worse_than_with_least_squares():
     second = simulate(16401, n_poses=12, spoil=twisted, pose_sd=0.002, drift_sd=1e-4, truth=truth)[
         0
     ]
-    result = calibrate_without_table([source(first)], OPTIONS)
+    result = calibrated_by_hand([source(first)], OPTIONS)
     plain = with_plain_values(result.calibration, first)
     errors = []
     for calibration in (result.calibration, plain):

@@ -31,9 +31,9 @@ from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.reference_texts import ACCELEROMETER_AXES
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from msg_adapters.write import write_session
 
+from worlds.calibrated import calibrated_on_table
 from worlds.compensation_cases import random_calibration
 
 ENTRY = ProofEntry(0.2, 0.01, (0.03, 0.08), unit='m/s^2', windows=8)
@@ -165,7 +165,7 @@ def test_a_rest_in_one_attitude_is_unproven():
     from worlds.live_sessions import OPTIONS, TABLE, make_session
 
     imu, joints, _, _ = make_session(3, seconds=8.0)
-    found = calibrate_on_table([[SampleBlock(imu, joints)]], TABLE, OPTIONS).calibration
+    found = calibrated_on_table([[SampleBlock(imu, joints)]], TABLE, OPTIONS).calibration
     assert set(found.decisions.values()) == {UNPROVEN}
     assert any('accelerometer' in line for line in found.notes)
     assert calibration_from_text(calibration_to_text(found)).decisions == found.decisions

@@ -15,9 +15,9 @@ from imu_calibration.kinematics.signal_history import TemperatureSlope
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.turntable.residuals.formulas import grammar
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.references.turntable.table_reference import TableReference
 
+from worlds.calibrated import calibrated_on_table
 from worlds.candidates import FEW
 from worlds.physics import make_session
 
@@ -78,7 +78,7 @@ def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
         gyroscope_model='bias+matrix+bias_while_warming',
         catalogue=CATALOGUE.with_effects(FOLLOWS).with_candidates(FEW),
     )
-    result = calibrate_on_table([[block]], table, options)
+    result = calibrated_on_table([[block]], table, options)
     value = result.calibration.value('gyroscope', 'bias_while_warming')
     np.testing.assert_allclose(value, SIZE, rtol=0.2)
     # Compensation replaces it by its mean: the slope of another session is another one.
@@ -87,7 +87,7 @@ def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
 
     without = replace(block, temperature=None)
     with pytest.raises(InputError) as refused:
-        calibrate_on_table([[without]], table, options)
+        calibrated_on_table([[without]], table, options)
     assert refused.value.key == 'temperature_topic' and refused.value.code == 'temperature_missing'
 
 

@@ -17,7 +17,6 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SESSION_START_NS
@@ -25,10 +24,10 @@ from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
 from worlds import physics
+from worlds.calibrated import calibrated_by_hand, calibrated_on_table
 from worlds.live_sessions import OPTIONS, TABLE, assert_same, make_session
 
 pytest.importorskip('rclpy')
-from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 
 from ros.live_station import Station, taken
 
@@ -82,7 +81,7 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
         assert answer.success, answer.message
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bags / 'session') as recording:
-            expected = calibrate_on_table(
+            expected = calibrated_on_table(
                 [list(recording.blocks(TABLE.joint_names))], TABLE, OPTIONS
             ).calibration
         check_the_answer(station, live, expected)
@@ -285,7 +284,7 @@ def test_poses_by_hand_through_the_node(tmp_path):
         assert answer.success, answer.message
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bag, want_joints=False) as recording:
-            expected = calibrate_without_table(
+            expected = calibrated_by_hand(
                 [recording.blocks()], replace(OPTIONS, gravity=GRAVITY)
             ).calibration
         assert (

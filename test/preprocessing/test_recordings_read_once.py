@@ -18,13 +18,13 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files, verdict
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.references.gravity.gravity_reference import GravityReference
-from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 from imu_calibration.references.turntable import needs
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.bag import Recording
+
+from worlds.calibrated import calibrated_by_hand, calibrated_on_table
 
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'sample_session'
 PLAIN = CalibrationOptions(reference_model='none')
@@ -57,13 +57,13 @@ def seen(monkeypatch):
 
 
 def test_calibration_cleans_each_sample_once_for_windows_and_checks(table, seen):
-    calibrate_on_table([source_of(BAG, Topics(), table.joint_names)], table, PLAIN)
+    calibrated_on_table([source_of(BAG, Topics(), table.joint_names)], table, PLAIN)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
 
 
 def test_calibration_by_hand_cleans_each_sample_once(seen):
     try:
-        calibrate_without_table([source_of(BAG, Topics())])
+        calibrated_by_hand([source_of(BAG, Topics())])
     except ImuCalibrationError:
         pass  # what matters here was read
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
@@ -105,7 +105,7 @@ def test_verdict_and_needed_motions_are_worked_out_once_per_solution(table, monk
         counting(monkeypatch, verdict, 'judge'),
         counting(monkeypatch, needs, 'needed_motions'),
     )
-    result = calibrate_on_table(
+    result = calibrated_on_table(
         [source_of(BAG, Topics(), table.joint_names)],
         table,
         CalibrationOptions(reference_model='table_tilt'),

@@ -17,8 +17,8 @@ from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 
+from worlds.calibrated import calibrated_on_table
 from worlds.candidates import FEW
 from worlds.cleaning import clean_samples
 from worlds.hand_sessions import GRAVITY
@@ -150,7 +150,7 @@ def test_one_per_cent_of_spikes_does_not_matter_on_the_table():
     table = Table.from_mapping(session.table)
 
     def result(imu):
-        return calibrate_on_table(
+        return calibrated_on_table(
             [[SampleBlock(imu, session.joints, session.temperature)]],
             table,
             CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW)),

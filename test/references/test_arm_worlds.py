@@ -9,10 +9,10 @@ import pytest
 
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.estimation.solution import HELD, WEAK
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 
 from worlds.arm_worlds import calibrated, deviations, in_our_axes, make_arm_world, truth
 from worlds.arms import SEVEN_AXES, SIX_AXES
+from worlds.calibrated import calibrated_on_table
 
 pytest.importorskip('pinocchio', reason='Pinocchio makes these worlds: make oracles')
 
@@ -71,7 +71,7 @@ def test_joints_taken_at_their_word_spoil_the_calibration(world):
     true = {name: value for name, value in truth(world).items() if '.matrix.' in name}
     errors = []
     at_their_word = CalibrationOptions(reference_model='table_tilt')
-    spoilt = calibrate_on_table([[world.block]], world.table, at_their_word).calibration
+    spoilt = calibrated_on_table([[world.block]], world.table, at_their_word).calibration
     for calibration in (calibrated(world), spoilt):
         found = dict(
             zip(

@@ -19,9 +19,9 @@ from imu_calibration.core.errors import DocumentError, InputError, NotObservable
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.references.gravity.advice import missing_motion
-from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 from imu_calibration.references.gravity.live_poses import FACE_DIRECTIONS, LiveByHand, unseen
 
+from worlds.calibrated import calibrated_by_hand
 from worlds.candidates import FEW
 from worlds.physics_table import stand_up
 
@@ -48,7 +48,7 @@ def run(live, imu, seed=0):
 
 def offline(imu, gravity=GRAVITY):
     """What the offline tool says."""
-    return calibrate_without_table([[SampleBlock(imu)]], replace(OPTIONS, gravity=gravity))
+    return calibrated_by_hand([[SampleBlock(imu)]], replace(OPTIONS, gravity=gravity))
 
 
 def all_kept(live):
@@ -298,6 +298,6 @@ def test_further_effects_are_estimated_as_offline(session):
         options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0
     )
     run(live, session)
-    expected = calibrate_without_table([[SampleBlock(session)]], replace(options, gravity=GRAVITY))
+    expected = calibrated_by_hand([[SampleBlock(session)]], replace(options, gravity=GRAVITY))
     assert any('accel_quadratic' in name for name in expected.calibration.param_names)
     assert_same(live.solve(pending=True), expected)

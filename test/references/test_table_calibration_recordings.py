@@ -12,9 +12,10 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import from_text
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.references.turntable.table_reference import TableReference
 from msg_adapters.bag import open_recording
+
+from worlds.calibrated import calibrated_on_table
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
@@ -38,7 +39,7 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings):
     the lag in the model.
     """
     table, blocks = opened(recordings / 'shaft_yaw_medium')
-    calibration = calibrate_on_table([blocks], table, BOTH).calibration
+    calibration = calibrated_on_table([blocks], table, BOTH).calibration
     values, sds = (
         dict(zip(calibration.param_names, numbers))
         for numbers in (calibration.values, calibration.sd)
@@ -91,7 +92,7 @@ def test_what_one_axis_cannot_show_is_held(recordings):
     folder = recordings / 'shaft_yaw_medium'
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
     with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-        result = calibrate_on_table([recording.blocks(table.joint_names)], table)
+        result = calibrated_on_table([recording.blocks(table.joint_names)], table)
     status = dict(zip(result.calibration.param_names, result.calibration.status))
     assert all(
         status[f'gyroscope.matrix.{name}'] == 'held'

@@ -14,7 +14,6 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import NOTE
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import (
@@ -26,6 +25,7 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics
 
+from worlds.calibrated import calibrated_on_table
 from worlds.candidates import FEW
 from worlds.tables import joints_about
 
@@ -131,7 +131,7 @@ def test_an_added_delay_gives_the_result_of_a_requested_one(session):
         replace(OPTIONS, added=(('reference', 'time_offset'),)),
         replace(OPTIONS, reference_model='table_tilt+earth_rate+time_offset'),
     ):
-        found = calibrate_on_table([[block]], TABLE, options).calibration
+        found = calibrated_on_table([[block]], TABLE, options).calibration
         results.append({n: (v, sd) for n, v, sd in zip(found.param_names, found.values, found.sd)})
     added, requested = results
     assert added.keys() == requested.keys()

@@ -16,7 +16,6 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.references.turntable.collector import GatherStep
 from imu_calibration.references.turntable.estimation.solver import solve
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.references.turntable.window_observations import (
     JOINT_POSITION_SD,
     _faster,
@@ -30,6 +29,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
+from worlds.calibrated import calibrated_on_table
 from worlds.tables import three_axis_table
 
 TABLE = three_axis_table(gravity=9.81)
@@ -58,7 +58,7 @@ def recording():
 def calibrated(recording, table, options=NO_TILT):
     """Calibrate against a table, without a search for effects."""
     options = replace(options, as_asked=True)
-    return calibrate_on_table([[recording]], table, options)
+    return calibrated_on_table([[recording]], table, options)
 
 
 @pytest.fixture(scope='module')

@@ -22,9 +22,7 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics import strapdown
-from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 from imu_calibration.references.turntable.accumulator import restrict
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.report import figures
 from imu_calibration.report.calibration_sections import (
     autocorrelation,
@@ -42,6 +40,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
+from worlds.calibrated import calibrated_by_hand, calibrated_on_table
 from worlds.candidates import FEW
 from worlds.tables import three_axis_table
 
@@ -86,19 +85,19 @@ def quick():
 @pytest.fixture(scope='module')
 def on_table(quick):
     """Its calibration on the table."""
-    return calibrate_on_table([[quick]], TABLE, OPTIONS, provenance=PROVENANCE)
+    return calibrated_on_table([[quick]], TABLE, OPTIONS, provenance=PROVENANCE)
 
 
 @pytest.fixture(scope='module')
 def by_hand(quick):
     """The same recording calibrated by hand."""
-    return calibrate_without_table([[SampleBlock(quick.imu)]], OPTIONS, provenance=PROVENANCE)
+    return calibrated_by_hand([[SampleBlock(quick.imu)]], OPTIONS, provenance=PROVENANCE)
 
 
 @pytest.fixture(scope='module')
 def demanding(quick):
     """The recording judged by tolerances on the arms that it does not meet."""
-    return calibrate_on_table(
+    return calibrated_on_table(
         [[quick]],
         TABLE,
         replace(OPTIONS, tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
@@ -311,7 +310,7 @@ def test_a_recording_with_an_unmodelled_effect_recommends_a_diagnosis(quick):
         quick.imu,
         rate_s=np.concatenate([np.repeat(quick.imu.rate_s[:1], 2, axis=0), quick.imu.rate_s[:-2]]),
     )
-    result = calibrate_on_table([[SampleBlock(late, quick.joints)]], TABLE, OPTIONS)
+    result = calibrated_on_table([[SampleBlock(late, quick.joints)]], TABLE, OPTIONS)
     assert 'imu_calibration diagnose' in without_layout(result)
 
 

@@ -34,6 +34,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, ImuNoise, read_encoders, realistic
 
 from worlds.arms import SIX_AXES
+from worlds.calibrated import calibrated_on_table
 from worlds.physics_draw import draw_imu, generator, to_ns
 from worlds.physics_sensor import Triad
 
@@ -264,9 +265,8 @@ def truth(world):
 @lru_cache(maxsize=1)
 def calibrated(world):
     """Return the calibration of a world, which several tests judge."""
-    from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 
-    return calibrate_on_table([[world.block]], world.table).calibration
+    return calibrated_on_table([[world.block]], world.table).calibration
 
 
 def deviations(world):

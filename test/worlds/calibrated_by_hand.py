@@ -2,8 +2,8 @@
 
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.references.gravity.hand_workflow import calibrate_without_table
 
+from worlds.calibrated import calibrated_by_hand
 from worlds.hand_sessions import GRAVITY
 
 OPTIONS = CalibrationOptions(gravity=GRAVITY, as_asked=True)
@@ -11,4 +11,4 @@ OPTIONS = CalibrationOptions(gravity=GRAVITY, as_asked=True)
 
 def calibrated(imu):
     """Return the result for ImuSamples of one recording."""
-    return calibrate_without_table([[SampleBlock(imu)]], OPTIONS)
+    return calibrated_by_hand([[SampleBlock(imu)]], OPTIONS)

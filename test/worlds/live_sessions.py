@@ -11,11 +11,11 @@ from imu_calibration.core import documents
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.table_calibration import calibrate_on_table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 from ros.live_station import TABLE as TABLE_FILE
+from worlds.calibrated import calibrated_on_table
 
 TABLE = Table.from_mapping(documents.from_text(TABLE_FILE.read_text()))
 TOLERANCES = documents.from_text((TABLE_FILE.parent / 'tolerances.yaml').read_text())
@@ -44,7 +44,7 @@ def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='qui
 
 def offline(*sessions):
     """Return the offline answer for (imu, joints) as they were sent."""
-    return calibrate_on_table([[SampleBlock(*s)] for s in sessions], TABLE, OPTIONS).calibration
+    return calibrated_on_table([[SampleBlock(*s)] for s in sessions], TABLE, OPTIONS).calibration
 
 
 def assert_same(live, expected, share=1e-6):

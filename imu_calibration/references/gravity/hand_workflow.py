@@ -27,38 +27,19 @@ class PoseRecording:
         return Solved(solve_by_hand(self.data.data, hand_options(options)), self.data)
 
 
-def calibrate_without_table(
-    sources: Sequence[BlockSource],
-    options: CalibrationOptions = CalibrationOptions(),
-    provenance: dict | None = None,
-) -> HandResult:
+def gather_poses(
+    sources: Sequence[BlockSource], options: CalibrationOptions, *, one_sensor: bool = True
+) -> PoseRecording:
     """
-    Calibrate by hand and return the HandResult: gravity is the reference (see `calibrate_by_hand`).
+    Return the poses and turns of one recording.
 
-    Parameters
-    ----------
-    sources : sequence of BlockSource
-        One recording.
-    options : CalibrationOptions
-    provenance : dict, optional
-        Bag names, hashes and options for the document.
+    `one_sensor`: whether one usable sensor suffices.
 
     Raises
     ------
     InputError
         When more than one recording is given, or a requested effect needs a table.
 
-    """
-    return calibrate_by_evidence(gather_poses(sources, options), options, provenance=provenance)
-
-
-def gather_poses(
-    sources: Sequence[BlockSource], options: CalibrationOptions, *, one_sensor: bool = True
-) -> PoseRecording:
-    """
-    Return the poses and turns of one recording; raises as `calibrate_without_table`.
-
-    `one_sensor`: whether one usable sensor suffices.
     """
     if len(sources) != 1:
         raise InputError(
@@ -80,7 +61,7 @@ def calibrate_poses(
     """
     Return the HandResult of a recording that was read.
 
-    `stills` as in `calibrate_by_hand`, the other arguments as in `calibrate_without_table`.
+    `stills` as in `calibrate_by_hand`.
     """
     observations = PoseObservations.of(recording, hand_options(options), stills)
     return calibrate_by_evidence(PoseRecording(observations), options, provenance=provenance)

@@ -315,7 +315,7 @@ class LiveByHand(LiveSession):
     One live session without a table: `push` arriving samples, `solve` when due.
 
     The samples are cleaned, searched and solved by the functions for recordings, and all are kept
-    up to the memory limit: the result equals `calibrate_without_table` on the same samples. Beyond
+    up to the memory limit: the result equals `calibrate` on the same samples. Beyond
     the limit (`hand_samples`) it is the result for the kept samples. A clock reset, for which a
     recording is refused, is treated as a pause.
 

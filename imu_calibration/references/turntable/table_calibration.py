@@ -32,53 +32,12 @@ from imu_calibration.references.turntable.requested_model import choose_model, s
 from imu_calibration.references.turntable.session_data import KeptWindows, SessionData, join
 from imu_calibration.references.turntable.shrinkage import shrunk
 from imu_calibration.references.turntable.uncorrected_windows import end_of
-from imu_calibration.references.turntable.window_observations import TableResult, WindowObservations
+from imu_calibration.references.turntable.window_observations import WindowObservations
 from imu_calibration.references.turntable.window_statistics import reduce_window
 from imu_calibration.selection.questions import at_time_constants
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
     from typing_extensions import Self
-
-
-def calibrate_on_table(
-    sources: Sequence[BlockSource],
-    table: Table,
-    options: CalibrationOptions = CalibrationOptions(),
-    *,
-    provenance: dict | None = None,
-    jobs: int = 1,
-    names: Sequence[str] | None = None,
-) -> TableResult:
-    """
-    Calibrate from one or several recordings of the same IMU on a table.
-
-    Parameters
-    ----------
-    sources : sequence of BlockSource
-        Read again when effects must be linearised again.
-    table : Table
-        The reference.
-    options : CalibrationOptions
-    provenance : dict, optional
-        Bag names, hashes and options for the document.
-    jobs : int
-        Number of processes that read recordings.
-    names : sequence of str, optional
-        Names of the recordings for messages.
-
-    Returns
-    -------
-    TableResult
-
-    Raises
-    ------
-    InputError
-        When a recording cannot be used or is of another frame, with its name when there are
-        several.
-
-    """
-    recordings = recordings_on_table(sources, table, jobs=jobs, names=names)
-    return conclude(recordings.solved(options), options, provenance=provenance)
 
 
 @dataclass(frozen=True, eq=False)
