@@ -576,13 +576,13 @@ BEYOND = _of(
         'False',
         'test_beyond_catalogue.py',
     ),
-    ('a gradual change is an onset', 'SUDDEN', '...', '-1e9', 'test_onset.py'),
+    ('a gradual change is an onset', 'SUDDEN', '...', '-1e9', 'test_find_onset.py'),
     (
         'the time of a step is moved to its prior',
         'SensorModel.prior',
         '_1.located',
         'False',
-        'test_onset.py',
+        'test_find_onset.py',
     ),
     (
         'a place is known to its bins only',
@@ -604,14 +604,14 @@ BEYOND = _of(
         'stamp_jitter',
         'max(min(..., *...), 0.0)',
         'max(..., 0.0)',
-        'test_stamp_jitter.py::test_scatter_of_one_sensor_is_no_error_of_the_stamps',
+        'test_jitter_of_blocks.py::test_scatter_of_one_sensor_is_no_error_of_the_stamps',
     ),
     (
         'scatter by the stamps counts as an incomplete model',
         'misfit_ratios',
         '_1 / _2.get(_3, 1.0)',
         '_1',
-        'test_stamp_jitter.py::test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model',
+        'test_verdict_stamp_jitter.py::test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model',
     ),
     (
         'of what scatters the whole range is told',
