@@ -1088,13 +1088,8 @@ class _Table:
 
     def values_of(self, name, where):
         """Return the different cells of a column in the rows that fulfil `where`, sorted."""
-        column = self.column(name)
-        found = set()
-        for line in self._selected(self._rows, where):
-            cells = self._cells(line) if '"' in line else line.split(self.delimiter)
-            if len(cells) > column:
-                found.add(cells[column].strip())
-        return sorted(found)
+        rows = self._selected(self._rows, where)
+        return sorted({cell for _, cell in self._column_of(rows, name)})
 
     def _as_numbers(self, line):
         """Return a line without comment, with cells that have no quotes, and decimal points."""
@@ -1130,6 +1125,15 @@ class _Table:
                 self.n_dropped += 1
         return complete
 
+    def _column_of(self, lines, name):
+        """Yield (line, its cell in a column) of the lines that have the column."""
+        column = self.column(name)
+        for line in lines:
+            # Cells without quotes are quick to tell apart.
+            cells = self._cells(line) if '"' in line else line.lstrip('# ').split(self.delimiter)
+            if column < len(cells):
+                yield line, cells[column].strip()
+
     def _selected(self, lines, where):
         """Return the lines that fulfil all conditions COLUMN=VALUE; values as text or numbers."""
         for condition in where:
@@ -1139,15 +1143,10 @@ class _Table:
                     f'a condition must be COLUMN=VALUE, got {condition!r}; correct it',
                     code='where',
                 )
-            column = self.column(name.strip())
             value = value.strip()
             kept = []
             seen = Counter()
-            for line in lines:
-                cells = self._cells(line)
-                if column >= len(cells):
-                    continue
-                cell = cells[column].strip()
+            for line, cell in self._column_of(lines, name.strip()):
                 seen[cell] += 1
                 if any(_same(cell, each) for each in (value, *value.split(','))):
                     kept.append(line)
