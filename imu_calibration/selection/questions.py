@@ -53,7 +53,9 @@ def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ..
 
 
 def sort_effects(
-    model: SensorModel, why_not: Callable, sensors: Sequence[str] = SENSORS
+    model: SensorModel,
+    why_not: Callable[[Effect], tuple[str, str] | None],
+    sensors: Sequence[str] = SENSORS,
 ) -> tuple[list[Effect], list[dict]]:
     """
     Return (testable effects, list of {'effect', 'why', 'needs'}).
