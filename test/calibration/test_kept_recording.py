@@ -6,10 +6,8 @@ import pytest
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable import session_data
-from imu_calibration.references.turntable.table_calibration import (
-    KeptRecording,
-    recordings_on_table,
-)
+from imu_calibration.references.turntable.table_calibration import KeptRecording
+from imu_calibration.references.turntable.table_reference import TableReference
 
 from worlds.misfit_coverage import COARSE
 from worlds.misfit_worlds import make_pair
@@ -39,14 +37,14 @@ def late():
 def test_a_single_recording_is_read_once_and_a_long_one_by_each_pass(late, monkeypatch):
     block, table = late
     source = Source(block)
-    recording = recordings_on_table([source], table)
+    recording = TableReference(table).gather([source], LAGS)
     kept = recording.solved(LAGS).solution
     assert source.n_reads == 1
     assert sum(len(window.time) for window in recording.windows.windows) > 0.5 * len(block.imu)
 
     monkeypatch.setattr(session_data, 'KEPT_IN_MEMORY', 1000)
     source = Source(block)
-    recording = recordings_on_table([source], table)
+    recording = TableReference(table).gather([source], LAGS)
     read_again = recording.solved(LAGS).solution
     assert source.n_reads > 1 and not recording.windows.windows
     np.testing.assert_array_equal(kept.values, read_again.values)
@@ -56,14 +54,15 @@ def test_a_single_recording_is_read_once_and_a_long_one_by_each_pass(late, monke
 def test_several_recordings_are_read_by_each_pass(late):
     """Their windows together would have no limit."""
     block, table = late
-    assert not isinstance(recordings_on_table([[block], [block]], table), KeptRecording)
+    recordings = TableReference(table).gather([[block], [block]], LAGS)
+    assert not isinstance(recordings, KeptRecording)
 
 
 def test_a_recording_that_is_refused_leaves_no_windows_of_itself(late):
     """Those of a reading that an error has ended are not used by the next one."""
     block, table = late
     source = Source(block)
-    recording = recordings_on_table([source], table)
+    recording = TableReference(table).gather([source], LAGS)
 
     class Broken(Source):
         def __iter__(self):
@@ -76,5 +75,5 @@ def test_a_recording_that_is_refused_leaves_no_windows_of_itself(late):
     n_left = len(recording.windows.windows)
     found = recording.solved(LAGS).solution
     assert n_left and source.n_reads == 1
-    fresh = recordings_on_table([[block]], table).solved(LAGS).solution
+    fresh = TableReference(table).gather([[block]], LAGS).solved(LAGS).solution
     np.testing.assert_array_equal(found.values, fresh.values)

@@ -29,7 +29,7 @@ from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.references.turntable.table_calibration import recordings_on_table
+from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.references.turntable.window_readings import errors_on_table
 from imu_calibration.references.turntable.window_statistics import reduce_window
 
@@ -117,7 +117,7 @@ def world(kind, seed, gyroscope_model='bias+matrix'):
         gyroscope_model=gyroscope_model,
         reference_model='none',
     )
-    solved = recordings_on_table([source(pair.first)], table).solved(options)
+    solved = TableReference(table).gather([source(pair.first)], options).solved(options)
     return pair, table, solved, options
 
 
@@ -279,7 +279,7 @@ def test_a_formula_is_applied_where_a_second_session_confirms_it(kind, seed, col
     pair, table, solved, options = world(kind, seed)
     effect = formula('bend', column, unit)
     result = conclude(with_changes(solved, unexplained=UNEXPLAINED), options)
-    recordings = recordings_on_table([source(pair.first)], table)
+    recordings = TableReference(table).gather([source(pair.first)], options)
     extension = ProposedExtension(result, SimpleNamespace(unexplained={}), options)
     extended = _with_proposals(recordings, extension, [effect])
     applied = helpful_formulas([effect], extended, result.calibration)

@@ -148,7 +148,7 @@ def test_a_delay_is_taken_at_its_size_like_offline():
         live.push(block)
     live.solve(pending=True)
     assert live.adopt(question_about(live).answer().extension)
-    recordings = TableRecordings.of([[pair.first.block]], table, keep_windows=True)
+    recordings = TableRecordings.of([[pair.first.block]], table)
     expected = calibrate_by_evidence(recordings, OPTIONS).calibration
     found = live.solve(pending=True).calibration
     assert 'time_offset' in found.statistics['added']

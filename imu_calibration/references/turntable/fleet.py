@@ -102,9 +102,7 @@ class FleetStep:
 
     def _calibrated(self, unit: Unit) -> UnitResult:
         provenance = unit.provenance()
-        recordings = TableRecordings.of(
-            unit.sources, self.table, names=unit.bags or None, keep_windows=True
-        )
+        recordings = TableRecordings.of(unit.sources, self.table, names=unit.bags or None)
         result = calibrate_by_evidence(recordings, self.options, provenance=provenance)
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         report_of = self.report

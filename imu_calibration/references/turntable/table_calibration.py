@@ -86,7 +86,7 @@ class TableRecordings:
     """Names of the recordings for messages."""
     jobs: int = 1
     """Number of processes that read them."""
-    keep_windows: bool = False
+    keep_windows: bool = True
     """Whether windows are kept for the search of effects."""
 
     @classmethod
@@ -97,11 +97,10 @@ class TableRecordings:
         *,
         jobs: int = 1,
         names: Sequence[str] | None = None,
-        keep_windows: bool = False,
     ) -> 'Self':
         """Return recordings with their numbers as names where none are given."""
         numbered = [f'recording {number}' for number in range(1, len(sources) + 1)]
-        return cls(sources, table, tuple(names or numbered), jobs, keep_windows)
+        return cls(sources, table, tuple(names or numbered), jobs)
 
     def solved(self, options: CalibrationOptions) -> SolvedWindows:
         """Return the solution of the model that options request, at a valid linearisation."""
@@ -188,19 +187,6 @@ class WatchedRecording(KeptRecording):
     def checks(self, step: GatherStep) -> Preflight:
         """Return the given checks, of the first pass only."""
         return super().checks(step) if self.preflight.streams else self.preflight
-
-
-def recordings_on_table(
-    sources: Sequence[BlockSource],
-    table: Table,
-    *,
-    jobs: int = 1,
-    names: Sequence[str] | None = None,
-    keep_windows: bool = False,
-) -> TableRecordings:
-    """Return recordings of one IMU; a single one is read once if it is not long."""
-    kind = KeptRecording if len(sources) == 1 else TableRecordings
-    return kind.of(sources, table, jobs=jobs, names=names, keep_windows=keep_windows)
 
 
 def solve_in_passes(

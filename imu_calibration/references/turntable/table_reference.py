@@ -28,10 +28,10 @@ from imu_calibration.references.turntable.live_windows import LiveCalibration
 from imu_calibration.references.turntable.selection.investigation import too_few_windows
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.table_calibration import (
+    KeptRecording,
     StoredRecording,
     TableRecordings,
     WatchedRecording,
-    recordings_on_table,
 )
 from imu_calibration.references.turntable.table_coverage import table_coverage
 from imu_calibration.references.turntable.table_errors import calibrate_with_table_errors
@@ -68,7 +68,8 @@ class TableReference:
         jobs: int = 1,
     ) -> TableRecordings:
         """Return the recordings: several, or a long one, are read by each pass."""
-        return recordings_on_table(sources, self.table, jobs=jobs, names=names, keep_windows=True)
+        kind = KeptRecording if len(sources) == 1 else TableRecordings
+        return kind.of(sources, self.table, jobs=jobs, names=names)
 
     def errors(
         self,
@@ -83,7 +84,7 @@ class TableReference:
 
     def stored(self, source: BlockSource, options: CalibrationOptions) -> StoredRecording:
         """Return the recording; its first pass keeps the windows."""
-        return StoredRecording.of([source], self.table, keep_windows=True)
+        return StoredRecording.of([source], self.table)
 
     def too_few(self, result: TableResult) -> NotObservableError:
         """Return the error with the number of windows."""
@@ -107,10 +108,11 @@ class TableReference:
         gravity = self.table.gravity_value
         preflight = Preflight(gravity, one_sensor=True)
         recordings = WatchedRecording.of([source], self.table)
+        recordings = replace(recordings, preflight=preflight, keep_windows=False)
         calibrated: TableResult | ImuCalibrationError
         shown = []
         try:
-            found = calibrate_with_table_errors(replace(recordings, preflight=preflight), options)
+            found = calibrate_with_table_errors(recordings, options)
             calibrated = found.result
             for finding in calibrated.gathered.findings:
                 if finding.check in STATED_CHECKS:
