@@ -195,7 +195,7 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
     What they would add to the information is added, one after the other; the first is the next one.
     """
     from imu_calibration.estimation.prior import make_prior
-    from imu_calibration.references.turntable.observability import added_information
+    from imu_calibration.references.turntable.observability import MotionInformation
 
     live, result = begun
     shown, solution = live.coverage(), result.solution
@@ -212,9 +212,9 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
     )
     if shown.seconds == pytest.approx(lengths[first]):
         [motion] = [motion for motion in MOTIONS if motion.text == first]
-        more = added_information(
-            solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity
-        )
+        more = MotionInformation(
+            solution.model, solution.values, solution.noise, result.gravity
+        ).added_by(motion)
         before, after = (_sd_after(solution.information + each, prior) for each in (0 * more, more))
         sd = after * np.maximum(result.calibration.sd / before, 1)
         assert (sd <= result.tolerances)[np.array(result.model.requested)].all()

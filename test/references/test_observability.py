@@ -15,7 +15,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.references.turntable import observability
 from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.observability import (
-    added_information,
+    MotionInformation,
     needed_motions,
     tolerance_scaled_singular_values,
     weak_directions,
@@ -38,7 +38,7 @@ BY_NAME = {motion.name: motion for motion in MOTIONS}
 
 
 def added(name, model=MODEL, noise=NOISE):
-    return added_information(model, model.start(), noise, motion=BY_NAME[name], gravity=GRAVITY)
+    return MotionInformation(model, model.start(), noise, GRAVITY).added_by(BY_NAME[name])
 
 
 def test_a_rest_adds_what_means_of_five_seconds_say():

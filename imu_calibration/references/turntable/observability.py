@@ -1,8 +1,8 @@
 """Observability of parameters: what standard motions add to the information of a recording."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy.linalg
@@ -23,38 +23,39 @@ SAMPLES_PER_POINT = 2.0
 """Samples of a moving piece for each of its points in time: 100 Hz."""
 
 
-def added_information(
-    model: SensorModel,
-    values: np.ndarray,
-    noise: Mapping[str, SensorNoise],
-    *,
-    motion: Motion,
-    gravity: float,
-    slopes: dict[str, np.ndarray] | None = None,
-) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class MotionInformation:
     """
-    Return the information matrix that one minute of a standard motion would add.
-
-    Shape (n_params, n_params).
+    What standard motions would add to the information about the parameters of a model.
 
     Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this
-    session. `slopes` is the result of `coefficient_slopes` where it is known already.
+    session.
     """
-    total = np.zeros((len(values), len(values)))
-    slopes = coefficient_slopes(model, values, noise) if slopes is None else slopes
-    for sensor in noise:
-        columns = _motion_columns(_HashableLayout.of(model.layout(sensor)), motion, gravity)
-        total += columns.information(slopes[sensor], noise[sensor])
-    return total
 
+    model: SensorModel
+    """The effects."""
+    values: np.ndarray
+    """Their parameters."""
+    noise: Mapping[str, SensorNoise]
+    """Sensor -> its noise."""
+    gravity: float
+    """m/s^2."""
 
-def coefficient_slopes(
-    model: SensorModel, values: np.ndarray, sensors: Iterable[str]
-) -> dict[str, np.ndarray]:
-    """
-    Return the derivative of the coefficients of each sensor, (n_columns, 3, n_params).
-    """
-    return {sensor: coefficient_jacobian(model, sensor, values) for sensor in sensors}
+    @cached_property
+    def _slopes(self) -> dict[str, np.ndarray]:
+        """Derivative of the coefficients of each sensor, (n_columns, 3, n_params)."""
+        return {
+            sensor: coefficient_jacobian(self.model, sensor, self.values) for sensor in self.noise
+        }
+
+    def added_by(self, motion: Motion) -> np.ndarray:
+        """Return the information of one minute of a motion, shape (n_params, n_params)."""
+        total = np.zeros((len(self.values), len(self.values)))
+        for sensor, noise in self.noise.items():
+            layout = _HashableLayout.of(self.model.layout(sensor))
+            columns = _motion_columns(layout, motion, self.gravity)
+            total += columns.information(self._slopes[sensor], noise)
+        return total
 
 
 @dataclass(frozen=True)
@@ -216,18 +217,10 @@ def needed_motions(
     base = _information_of(solution, prior_sd)
     # The model error remains: a motion reduces the noise only.
     remaining = np.maximum(solution.sd / _sd_of(base), 1.0)
-    slopes = coefficient_slopes(solution.model, solution.values, solution.noise)
+    information = MotionInformation(solution.model, solution.values, solution.noise, gravity)
     predicted = {}
     for motion in MOTIONS if possible is None else possible:
-        total = base + added_information(
-            solution.model,
-            solution.values,
-            solution.noise,
-            motion=motion,
-            gravity=gravity,
-            slopes=slopes,
-        )
-        predicted[motion] = _sd_of(total) * remaining
+        predicted[motion] = _sd_of(base + information.added_by(motion)) * remaining
     return {
         solution.param_names[k]: _best(solution, k, predicted, one_joint=possible is not None)
         for k in lacking.tolist()

@@ -7,7 +7,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.motions import TABLE_MOTIONS
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.references.turntable.observability import added_information, coefficient_slopes
+from imu_calibration.references.turntable.observability import MotionInformation
 from imu_calibration.references.turntable.standard_motions import MOTIONS, OTHER_MOUNT
 from imu_calibration.selection.questions import Question
 
@@ -54,11 +54,9 @@ def separating_motion(
     values = np.where(np.isfinite(values), values, 0.0)
     prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
     own = model.slices[question.sensor, question.name]
-    slopes = coefficient_slopes(model, values, solution.noise)
+    information = MotionInformation(model, values, solution.noise, gravity)
     for motion in MOTIONS:
-        total = np.diag(1 / prior_sd**2) + added_information(
-            model, values, solution.noise, motion=motion, gravity=gravity, slopes=slopes
-        )
+        total = np.diag(1 / prior_sd**2) + information.added_by(motion)
         left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
         if left > best[0]:
             best = left, motion.text

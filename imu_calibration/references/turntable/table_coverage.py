@@ -12,7 +12,7 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import LACKING, REMEDY_KEYS
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.references.turntable.needs import possible_motions
-from imu_calibration.references.turntable.observability import added_information, coefficient_slopes
+from imu_calibration.references.turntable.observability import MotionInformation
 from imu_calibration.references.turntable.standard_motions import MOTIONS, REST_WITH_UP, Motion
 from imu_calibration.references.turntable.window_observations import TableResult, WindowObservations
 
@@ -70,18 +70,9 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     def left(information: np.ndarray) -> np.ndarray:
         return sd_excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
 
-    slopes = coefficient_slopes(solution.model, solution.values, solution.noise)
-
-    def added(motion: Motion) -> np.ndarray:
-        return added_information(
-            solution.model,
-            solution.values,
-            solution.noise,
-            motion=motion,
-            gravity=result.gravity,
-            slopes=slopes,
-        )
-
+    added = MotionInformation(
+        solution.model, solution.values, solution.noise, result.gravity
+    ).added_by
     after = np.array([left(base + added(rest)) for rest in REST_WITH_UP])
     worth = share_gained(left(base), after)
     possible = possible_motions(cast(WindowObservations, result.data).table)
