@@ -12,8 +12,6 @@ LINEAR_STEPS = 25
 Steps of a numerical derivative (5 ms of a delay) up to which a linearisation is valid in weakly
 determined directions.
 """
-
-
 LEAST_TIME_CONSTANT = 0.3
 """Least time constant after a step, as a share of that before it."""
 
