@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -73,12 +73,18 @@ class AlignedArrays:
     A field may hold another such object, or None.
     """
 
+    unaligned: ClassVar[frozenset[str]] = frozenset()
+    """Fields whose arrays belong to all rows together."""
+
     def __len__(self) -> int:
         return next(len(value) for value in vars(self).values() if isinstance(value, np.ndarray))
 
     def select(self, index: Any) -> Any:
         """Return the rows at `index` (slice, mask or integer array)."""
-        return type(self)(**{name: _selected(value, index) for name, value in vars(self).items()})
+        fields = {}
+        for name, value in vars(self).items():
+            fields[name] = value if name in self.unaligned else _selected(value, index)
+        return type(self)(**fields)
 
     @classmethod
     def concatenate(cls, parts: Iterable[Any]) -> Any:

@@ -1,17 +1,15 @@
-"""Restricted likelihood of mean rows as a function of the shape of their noise."""
+"""Restricted likelihood of rows as a function of the shape of their noise."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import lapack
 
+from imu_calibration.estimation.rows import Rows, flat
+from imu_calibration.estimation.scaled_solve import JITTER
 from imu_calibration.estimation.sensor_noise import BiasProcess, means_beside_middles
-from imu_calibration.estimation.whitening import (
-    RestrictedLikelihood,
-    eliminate,
-    profile,
-    profile_each,
-)
 
 FLICKER_MARK, FLICKER_TIMES = 0.0, (1.0, 5.0, 25.0, 125.0, 625.0)
 """
@@ -35,18 +33,12 @@ class NoiseShape(NamedTuple):
 
 class NoiseLikelihood:
     """
-    Restricted likelihood of mean rows over shapes of the noise (`NoiseShape`).
+    Restricted likelihood of rows over shapes of the noise (`NoiseShape`).
 
     Parameters
     ----------
-    rows, times, sessions, information
-        As in `RestrictedLikelihood`.
-    white : ndarray, shape (n, n_axes)
-        Variance of the means by the noise within windows.
-    known : tuple of BiasProcess
-        Processes that are always included.
-    durations : ndarray, shape (n,), optional
-        Lengths of the windows, s.
+    rows : Rows
+        With the variance by the noise within windows; their processes are always included.
     common : int
         The first parameters, which are part of every choice: eliminated once per shape.
     choices : sequence of sequences of int, optional
@@ -57,25 +49,17 @@ class NoiseLikelihood:
 
     def __init__(
         self,
-        rows: np.ndarray,
-        white: np.ndarray,
-        times: np.ndarray,
+        rows: Rows,
         *,
-        sessions: list[np.ndarray],
-        information: np.ndarray | None = None,
-        known: tuple[BiasProcess, ...] = (),
-        durations: np.ndarray | float = 0.0,
         common: int = 0,
         choices: Sequence[Sequence[int]] = (),
     ):
-        self.typical = float(np.sqrt(np.median(white)))
+        self.typical = float(np.sqrt(np.median(rows.variance)))
         """Noise of a typical window mean, in the unit of the rows."""
         self.many = len(rows) >= MIN_PROCESS_WINDOWS
         """Whether the windows are enough for the estimate of a bias process."""
-        self.known = known
-        self._common, self._durations = common, np.broadcast_to(durations, len(rows))
-        self._rows, self._white, self._times, self._sessions = rows, white, times, sessions
-        self._likelihood = RestrictedLikelihood(rows, times, sessions, information=information)
+        self._rows = rows
+        self._common = common
         self._whitened: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
         self._profiles: dict[tuple, float] = {}
         self._choices = [tuple(choice) for choice in choices]
@@ -112,15 +96,24 @@ class NoiseLikelihood:
             units = (self.typical, self.typical, 1.0, self.typical)
             offset, bias, time, step = np.multiply(key, units)
             processes = self.processes(bias, time)
-            variance = self._white + self._scatter_in_windows(processes) + offset**2
-            logs, normal = self._likelihood.whitened(variance, processes, step**2)
+            rows = self._with_errors(self._rows, offset, processes)
+            logs, normal = whitened(replace(rows, session_variance=step**2))
             of_common, normal = eliminate(normal, self._common)
             self._whitened[key] = logs + of_common, normal
         return self._whitened[key]
 
-    def _scatter_in_windows(self, processes: tuple[BiasProcess, ...]) -> np.ndarray:
-        """Return the variance of a mean about the process in the middle, shape (n, 1)."""
-        return means_beside_middles(processes, self._durations)[:, None]
+    @staticmethod
+    def _with_errors(rows: Rows, offset: float, processes: tuple[BiasProcess, ...]) -> Rows:
+        """Return rows with the variance of offsets, and of means about the processes, added."""
+        durations = np.zeros(len(rows)) if rows.duration is None else rows.duration
+        about_middles = means_beside_middles(processes, durations)[:, None]
+        variance = rows.variance + about_middles + offset**2
+        return replace(rows, variance=variance, processes=processes, session_variance=0.0)
+
+    @property
+    def known(self) -> tuple[BiasProcess, ...]:
+        """Processes that are always included."""
+        return self._rows.processes
 
     def of_axis(self, axis: int, shape: NoiseShape) -> 'NoiseLikelihood':
         """
@@ -131,19 +124,10 @@ class NoiseLikelihood:
         # The other axes are the information on the parameters, with which this axis begins.
         offset, bias = shape.offset * self.typical, shape.bias * self.typical
         processes = self.processes(bias, shape.time)
-        other_axes = np.arange(self._white.shape[1]) != axis
-        variance = self._white[:, other_axes] + self._scatter_in_windows(processes) + offset**2
-        _, information = self._likelihood.of_axes(other_axes).whitened(variance, processes)
-        return NoiseLikelihood(
-            self._rows[:, [axis]],
-            self._white[:, [axis]],
-            self._times,
-            sessions=self._sessions,
-            information=information,
-            known=self.known,
-            durations=self._durations,
-            common=self._common,
-        )
+        others = self._rows.of_axes(np.arange(self._rows.variance.shape[1]) != axis)
+        _, normal = whitened(self._with_errors(others, offset, processes))
+        own = replace(self._rows.of_axes(np.array([axis])), products=normal)
+        return NoiseLikelihood(own, common=self._common)
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
         """
@@ -162,3 +146,57 @@ def _chosen(normal: np.ndarray, choices: Sequence[tuple[int, ...]]) -> np.ndarra
     """Return the normal equations of each choice of the same size, shape (k, m + 1, m + 1)."""
     at = np.array([[*choice, len(normal) - 1] for choice in choices])
     return normal[at[:, :, None], at[:, None, :]]
+
+
+def whitened(rows: Rows) -> tuple[float, np.ndarray]:
+    """
+    Return log|V| and the normal matrix of ``[design | residual]`` of rows of the covariance V.
+
+    The matrix is weighted with V^-1, and contains the products of the reduced rows. Minus twice the
+    restricted log likelihood is log|V| plus the `profile` of the matrix.
+    """
+    whitening = rows.whitening()
+    white = flat(whitening(rows.equations))
+    normal = white.T @ white
+    if rows.products is not None:
+        normal = rows.products + normal
+    return whitening.log_determinant, normal
+
+
+def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
+    """
+    Return ``log|A|`` and the Schur complement ``C - B' A^-1 B``.
+
+    They are of a normal matrix ``[[A, B], [B', C]]``, A its first `count` rows.
+    """
+    if not count:
+        return 0.0, normal
+    scale = np.sqrt(np.maximum(normal.diagonal()[:count], 1e-300))
+    scaled = normal[:count, :count] / (scale[:, None] * scale)
+    scaled.flat[:: count + 1] += JITTER
+    factor = np.linalg.cholesky(scaled)
+    solved = lapack.dtrtrs(factor, normal[:count, count:] / scale[:, None], lower=1)[0]
+    logs = 2 * np.log(factor.diagonal()).sum() + 2 * np.log(scale).sum()
+    return float(logs), normal[count:, count:] - solved.T @ solved
+
+
+def profile(normal: np.ndarray) -> float:
+    """Return ``y'y - b' A^-1 b + log|A|`` of the normal matrix ``[[A, b], [b', y'y]]``."""
+    logs, left = eliminate(normal, len(normal) - 1)
+    return logs + float(left[0, 0])
+
+
+def profile_each(normal: np.ndarray) -> np.ndarray:
+    """
+    Return the `profile` of several small normal matrices, shape (k, m + 1, m + 1).
+
+    Of few parameters each, the calls for one after the other would take most of the time.
+    """
+    information, right = normal[:, :-1, :-1], normal[:, :-1, -1]
+    scale = np.sqrt(np.maximum(np.einsum('kii->ki', information), 1e-300))
+    scaled = information / (scale[:, :, None] * scale[:, None, :])
+    np.einsum('kii->ki', scaled)[:] += JITTER
+    factor = np.linalg.cholesky(scaled)
+    solved = np.linalg.solve(factor, (right / scale)[:, :, None])[:, :, 0]
+    logs = 2 * np.log(np.einsum('kii->ki', factor) * scale).sum(axis=1)
+    return logs + normal[:, -1, -1] - (solved**2).sum(axis=1)

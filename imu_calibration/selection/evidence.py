@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.distributions import chi2_sf
+from imu_calibration.estimation.rows import Rows, weights_of
 from imu_calibration.estimation.scaled_solve import (
     quadratic,
     solve_normal,
@@ -58,14 +59,16 @@ class Recent(dict):
 
 class Evidence:
     """
-    Evidence for choices of parameters, each a sequence of indices.
+    Evidence for choices of parameters, each a sequence of indices, from rows in folds.
 
-    From rows of known noise in folds.
-
-    Losses are minus twice log likelihoods, up to a constant.
+    Losses are minus twice log likelihoods, up to a constant; here those of known noise.
 
     Parameters
     ----------
+    blocks : sequence of Rows
+        Explicit rows.
+    folds : sequence of array, each shape (m,)
+        Fold of each row of each block.
     total : array, shape (q + 1, q + 1)
         Normal matrix ``[design | residual]' V^-1 [design | residual]`` of all rows.
     without : array, shape (n_folds, q + 1, q + 1)
@@ -77,16 +80,20 @@ class Evidence:
 
     def __init__(
         self,
+        blocks: Sequence[Rows],
+        folds: Sequence[np.ndarray],
+        *,
         total: np.ndarray,
         without: np.ndarray,
-        *,
         prior_sd: np.ndarray,
         prior_mean: np.ndarray,
     ):
+        self.blocks = blocks
+        self.folds = folds
         self.total = total
         self.without = without
-        self._prior_sd = prior_sd
-        self._prior_mean = prior_mean
+        self.prior_sd = prior_sd
+        self.prior_mean = prior_mean
         self._fits: dict[tuple, tuple] = Recent(MOST_FITS)
         self._losses: dict[tuple, float] = {}
         self._predictions: dict[tuple, np.ndarray] = Recent(MOST_FITS)
@@ -97,28 +104,25 @@ class Evidence:
 
         With the prior.
         """
-        known = 1 / self._prior_sd**2
+        known = 1 / self.prior_sd**2
         matrix = self.total[:-1, :-1] + np.diag(known)
-        right = self.total[:-1, -1] + known * self._prior_mean
+        right = self.total[:-1, -1] + known * self.prior_mean
         return matrix, right
 
-    def fit(self, used: Sequence[int], number: int | None = None) -> ParameterFit:
-        """
-        Return (values, covariance) of the parameters `used`.
-
-        They are fitted to all folds or to all but fold `number`.
-        """
+    def fit(self, used: Sequence[int]) -> ParameterFit:
+        """Return (values, covariance) of the parameters `used`, fitted to all folds."""
         ordered = tuple(sorted(used))
-        if (ordered, number) not in self._fits:
-            normal = self.total if number is None else self.without[number]
-            self._fits[ordered, number] = solve_normal(
-                normal, np.array(ordered), self._prior_sd, prior_mean=self._prior_mean
-            )
-        values, covariance = self._fits[ordered, number]
+        if ordered not in self._fits:
+            self._fits[ordered] = self._fitted(self.total, ordered)
+        values, covariance = self._fits[ordered]
         if ordered == tuple(used):
             return values, covariance
         places = np.searchsorted(ordered, used)
         return values[places], covariance[np.ix_(places, places)]
+
+    def _fitted(self, normal: np.ndarray, used: Sequence[int]) -> ParameterFit:
+        """Return the same from the normal matrix of some rows."""
+        return solve_normal(normal, np.array(used), self.prior_sd, prior_mean=self.prior_mean)
 
     def loss(self, used: Sequence[int]) -> float:
         """Return the loss of the best fit to all rows."""
@@ -153,6 +157,23 @@ class Evidence:
         """Return the fits of parameters to the first and second half of the rows, and to both."""
         raise NotImplementedError
 
+    def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
+        """Return the residuals of each block under the fit to all rows, shape (m, n_axes)."""
+        weights = weights_of(used, self.fit(used)[0], len(self.prior_sd))
+        return [block.residuals_at(weights) for block in self.blocks]
+
+    def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
+        """
+        Return the residual of every row under the fit without its fold.
+
+        Shape (m, n_axes) per block.
+        """
+        left = self.left_by_others(used)
+        found = []
+        for block, fold in zip(self.blocks, self.folds):
+            found.append(block.residuals_at(left[fold]))
+        return found
+
     def left_by_others(self, used: Sequence[int]) -> np.ndarray:
         """
         Return the vectors that map rows of all parameters to residuals, per fold.
@@ -179,11 +200,11 @@ class Evidence:
         """
         if used not in self._predictions:
             at = np.array(used)
-            known = 1 / self._prior_sd[at] ** 2
+            known = 1 / self.prior_sd[at] ** 2
             places = np.append(at, -1)
             normal = self.without[:, places[:, None], places]
             matrix = normal[:, :-1, :-1] + np.diag(known)
-            values = solve_scaled(matrix, normal[:, :-1, -1] + known * self._prior_mean[at])
+            values = solve_scaled(matrix, normal[:, :-1, -1] + known * self.prior_mean[at])
             # A residual is the last column less the prediction.
             self._predictions[used] = np.column_stack([-values, np.ones(len(values))])
         return self._predictions[used]

@@ -8,8 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from imu_calibration.selection.order_of_tests import without_weakest
-from imu_calibration.selection.questions import Question
+from imu_calibration.selection.questions import Question, without_weakest
 from imu_calibration.selection.search import Search
 
 MIN_EXPLAINED_SHARE = 0.7

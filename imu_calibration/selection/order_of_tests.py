@@ -1,27 +1,46 @@
 """The order in which a choice of effects is tested, for data of any reference."""
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
-from imu_calibration.selection.questions import Question
+from imu_calibration.selection.explained_share import Explained, pruned
+from imu_calibration.selection.questions import Question, without_weakest
 
 
-class EffectTests(Protocol):
+@dataclass(eq=False)
+class EffectTests(ABC):
     """Tests of a choice of effects on the data of a reference."""
 
-    @property
-    def problem(self) -> Any:
-        """Rows with their `search`."""
+    problem: Any
+    """Rows with their `search`."""
+    explained: Explained
+    """Excess over noise, and the share of it that effects remove."""
 
     def explaining(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the effects of which each explains most of the excess variance."""
+        return self.preferred(pruned(chosen, self.explained.share))
 
     def predicting(self, named: Sequence[Question]) -> list[Question]:
         """Return the effects that improve the prediction of held-out data."""
+        return without_weakest(self.admissible(named), self.least_predicting)
+
+    @abstractmethod
+    def preferred(self, named: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects, or others that explain the excess better or more simply."""
+
+    def admissible(self, named: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects whose prediction is tested, here all."""
+        return named
+
+    @abstractmethod
+    def least_predicting(self, kept: list[Question]) -> int | None:
+        """Return the place of the effect that predicts least; None where all predict."""
 
     def significant(self, named: Sequence[Question]) -> Sequence[Question]:
-        """Return the effects that are significant without those that were removed."""
+        """Return the effects that are significant without those that were removed, here all."""
+        return named
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +74,3 @@ def select_findings(tests: EffectTests, chosen: Sequence[Question]) -> Findings:
     if unstable:
         named = tests.predicting([question for question in named if question not in unstable])
     return Findings(tests.significant(named), unstable)
-
-
-def without_weakest(
-    chosen: Sequence[Question], weakest: Callable[[list[Question]], int | None]
-) -> list[Question]:
-    """
-    Return a choice by backward elimination: without its weakest effect, until none is weak.
-
-    `weakest` returns the place of the effect that is removed next, None where all remain.
-    """
-    kept = list(chosen)
-    while kept:
-        place = weakest(kept)
-        if place is None:
-            break
-        del kept[place]
-    return kept

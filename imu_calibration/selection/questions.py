@@ -134,3 +134,20 @@ def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> li
         replace(model, point={**model.point, effect.name: effect.at_time_constant(constant)})
         for constant in time_constants(duration, STARTS)
     ]
+
+
+def without_weakest(
+    chosen: Sequence[Question], weakest: Callable[[list[Question]], int | None]
+) -> list[Question]:
+    """
+    Return a choice by backward elimination: without its weakest effect, until none is weak.
+
+    `weakest` returns the place of the effect that is removed next, None where all remain.
+    """
+    kept = list(chosen)
+    while kept:
+        place = weakest(kept)
+        if place is None:
+            break
+        del kept[place]
+    return kept

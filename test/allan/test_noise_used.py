@@ -27,6 +27,7 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files
 from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.solution import DETERMINED, HELD
 from imu_calibration.kinematics.table import Table
@@ -107,13 +108,11 @@ def wandering(seed, size, count=20):
         [flicker(20 * count, 1.0, size, rng).reshape(count, 20).mean(axis=1) for _ in range(3)]
     )
     rows = np.stack([np.ones((count, 3)), 1e-4 * rng.standard_normal((count, 3)) + wander], axis=2)
-    return rows, np.full((count, 3), 1e-8), times, [np.arange(count)]
+    return Rows(equations=rows, variance=np.full((count, 3), 1e-8), time=times)
 
 
-def offsets_of(rows, white, times, sessions, known):
-    return estimate_offsets(
-        rows, white, times, sessions=sessions, information=np.zeros((2, 2)), known=known
-    )
+def offsets_of(rows, known):
+    return estimate_offsets(replace(rows, processes=known))
 
 
 def test_known_processes_are_taken_and_the_rest_is_not_blamed_on_the_bias():
@@ -126,13 +125,13 @@ def test_known_processes_are_taken_and_the_rest_is_not_blamed_on_the_bias():
         noise_of({'white_noise': 1e-5, 'bias_instability': 1e-3}, {'white_noise': 1e-5})
     )['accelerometer']
     for seed in range(4):
-        found = offsets_of(*wandering(seed, 1e-3), known)
+        found = offsets_of(wandering(seed, 1e-3), known)
         assert found['bias_processes'] == known and found['offset_sd'] < 6e-4
 
 
 def test_a_bias_that_moves_much_more_than_was_measured_is_believed():
     known = (BiasProcess(1e-5, 100.0),)
-    found = offsets_of(*wandering(5, 3e-3, 60), known)
+    found = offsets_of(wandering(5, 3e-3, 60), known)
     assert (
         found['bias_processes'][:1] == known
         and len(found['bias_processes']) == 2

@@ -236,7 +236,7 @@ def test_the_variance_of_a_long_turn_includes_that_of_its_bias():
         turns = build_rows(
             solve_by_hand(data, HandOptions(GRAVITY)), data.turns, [], constants=np.zeros(0)
         )[0][-1]
-        ratios.append(np.mean(turns.rows[:, :, -1] ** 2 / turns.known))
+        ratios.append(np.mean(turns.equations[:, :, -1] ** 2 / turns.variance))
     assert turns.name == 'turns' and 0.5 < np.mean(ratios) < 1.3, ratios
 
 

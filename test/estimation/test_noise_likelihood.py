@@ -2,15 +2,19 @@
 Whitening, its adjoint and the restricted likelihood in linear time against the dense covariance.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from imu_calibration.estimation import scaled_solve
-from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
+from imu_calibration.estimation.noise_likelihood import NoiseLikelihood, profile, whitened
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.scaled_solve import triangular, triangular_of_band
 from imu_calibration.estimation.sensor_noise import BiasProcess, dof_factor
-from imu_calibration.estimation.whitening import RestrictedLikelihood, Whitening, profile
-from imu_calibration.references.turntable.noise_model import NoiseModel, predict_session_offsets
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.references.rows.group_variances import scoring
+from imu_calibration.references.turntable.estimation.window_means import predict_session_offsets
 
 STEP = 1.3
 """Standard deviation of the bias from recording to recording."""
@@ -40,9 +44,16 @@ def rows():
     )
 
 
-def value(likelihood, *noise):
+def as_rows(parts):
+    """Return the same as `Rows`."""
+    values, times, variance, sessions = parts
+    session = np.repeat(np.arange(3), [len(index) for index in sessions])
+    return Rows(equations=values, variance=variance, time=times, session=session)
+
+
+def value(rows):
     """Return minus twice the restricted log likelihood."""
-    logs, normal = likelihood.whitened(*noise)
+    logs, normal = whitened(rows)
     return logs + profile(normal)
 
 
@@ -107,9 +118,8 @@ def test_one_process_in_two_halves_is_the_same_process(rows):
 def test_likelihood_is_that_of_the_dense_covariance(rows, processes):
     """Log determinant and normal matrix in linear time equal the dense ones."""
     values, times, variance, sessions = rows
-    logs, normal = RestrictedLikelihood(values, times, sessions).whitened(
-        variance, processes, STEP**2
-    )
+    wandering = replace(as_rows(rows), processes=processes, session_variance=STEP**2)
+    logs, normal = whitened(wandering)
     matrices = dense(times, variance, sessions, processes)
     np.testing.assert_allclose(
         logs, sum(np.linalg.slogdet(matrix)[1] for matrix in matrices), rtol=1e-10
@@ -131,11 +141,12 @@ def test_the_restricted_likelihood_is_that_of_contrasts_free_of_the_parameters(r
     They are contrasts that no parameter reaches (Harville 1974).
     """
     values, times, variance, sessions = rows
-    likelihood, found, expected = RestrictedLikelihood(values, times, sessions), [], []
+    wandering = replace(as_rows(rows), processes=processes, session_variance=STEP**2)
+    found, expected = [], []
     design = values[:, :, :-1].transpose(1, 0, 2).reshape(60, 3)
     contrasts = np.linalg.svd(design)[0][:, 3:]
     for factor in (1.0, 3.0):
-        found.append(value(likelihood, factor * variance, processes, STEP**2))
+        found.append(value(replace(wandering, variance=factor * variance)))
         whole = np.zeros((60, 60))
         for axis, matrix in enumerate(dense(times, factor * variance, sessions, processes)):
             whole[20 * axis : 20 * axis + 20, 20 * axis : 20 * axis + 20] = matrix
@@ -148,10 +159,13 @@ def test_offsets_of_sessions_are_conditional_means(rows, processes):
     """The prediction equals the regression of the offsets on the residuals."""
     values, times, variance, sessions = rows
     misfit = values[:, :, 0]
-    noise = NoiseModel(
-        np.ones(3), np.ones(3), bias_processes=processes, session_sd=STEP, session_variance=STEP**2
+    of_misfit = replace(
+        as_rows(rows),
+        equations=misfit[:, :, None],
+        processes=processes,
+        session_variance=STEP**2,
     )
-    found = predict_session_offsets(misfit, variance, times, sessions=sessions, noise=noise)
+    found = predict_session_offsets(of_misfit)
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
         weighted = np.linalg.solve(covariance, misfit[:, axis])
         np.testing.assert_allclose(
@@ -160,12 +174,10 @@ def test_offsets_of_sessions_are_conditional_means(rows, processes):
 
 
 def test_fewer_parameters_are_fewer_columns_of_the_same_normal_matrix(rows):
-    values, times, variance, sessions = rows
     shape = (0.3, 0.5, 60.0)
-    few, all_columns = (
-        NoiseLikelihood(v, variance, times, sessions=sessions)
-        for v in (values[:, :, [0, 2, 3]], values)
-    )
+    every = as_rows(rows)
+    all_columns = NoiseLikelihood(every)
+    few = NoiseLikelihood(every.of_parameters(np.array([True, False, True])))
     np.testing.assert_allclose(
         all_columns.loss(shape, np.array([0, 2])), few.loss(shape), rtol=1e-9
     )
@@ -191,28 +203,25 @@ def test_scoring_is_the_derivative_of_the_likelihood(rows):
 
     The covariance is over many draws, to the scatter of 4000 draws.
     """
-    values, times, _, sessions = rows
+    values = rows[0]
     group = np.arange(60) % 3
     members, noise = np.array([group == k for k in range(3)], float), np.full(60, 0.3)
-    likelihood = RestrictedLikelihood(values, times, sessions)
 
-    def variance(extra):
-        return (noise + extra[group]).reshape(20, 3)
+    def with_variance(extra, equations=values):
+        variance = (noise + extra[group]).reshape(20, 3)
+        return replace(as_rows(rows), equations=equations, variance=variance)
 
     at, step = np.array([0.5, 1.0, 2.0]), 1e-5 * np.eye(3)
-    score, information = likelihood.scoring(variance(at), members)
+    score, information = scoring(with_variance(at), members)
     slopes = [
-        -0.5 * (value(likelihood, variance(at + h)) - value(likelihood, variance(at - h))) / 2e-5
-        for h in step
+        -0.5 * (value(with_variance(at + h)) - value(with_variance(at - h))) / 2e-5 for h in step
     ]
     np.testing.assert_allclose(score, slopes, rtol=1e-5)
     rng, scores = np.random.default_rng(1), []
     for _ in range(4000):
         drawn = values.copy()
-        drawn[:, :, -1] = rng.normal(size=(20, 3)) * np.sqrt(variance(at))
-        scores.append(
-            RestrictedLikelihood(drawn, times, sessions).scoring(variance(at), members)[0]
-        )
+        drawn[:, :, -1] = rng.normal(size=(20, 3)) * np.sqrt(with_variance(at).variance)
+        scores.append(scoring(with_variance(at, drawn), members)[0])
     np.testing.assert_allclose(
         np.cov(np.array(scores).T), information, rtol=0.12, atol=0.03 * information.max()
     )

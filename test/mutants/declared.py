@@ -182,9 +182,9 @@ COVARIANCE = _of(
 SEARCH = _of(
     (
         'offsets of windows left out of the evidence',
-        'mean_whitening',
-        '_1 + _2.offset_sd ** 2',
-        '_1',
+        'WindowMeans.mean_rows',
+        'self.mean_variance(_1) + _1.offset_sd ** 2',
+        'self.mean_variance(_1)',
         'test_search.py::test_offsets_of_windows_are_in_the_weights_of_the_evidence',
     ),
     (
@@ -214,6 +214,20 @@ SEARCH = _of(
         '_1 | ~_2',
         '~_2',
         'test_saturation.py::test_a_limit_that_one_window_alone_shows_is_seen',
+    ),
+    (
+        'the products of all rows are cut with them',
+        'AlignedArrays.select',
+        '_1 in self.unaligned',
+        'False',
+        'test_rows.py::test_some_rows_keep_the_products_of_all',
+    ),
+    (
+        'a prior scatters with a component',
+        'Rows.with_prior',
+        'NO_COMPONENT',
+        '0',
+        'test_rows.py::test_a_prior_draws_the_parameters_to_its_mean',
     ),
     (
         'cross-validation that leaks',
@@ -423,7 +437,7 @@ SEARCH = _of(
     ),
     (
         'how far windows agree is not asked',
-        'WindowTests.predicting',
+        'WindowTests.admissible',
         '_1.search.allowed(_2, _3) and _1.windows_agree(_2, _3)',
         '_1.search.allowed(_2, _3)',
         'test_search.py::test_what_the_windows_disagree_on_is_not_named',
@@ -440,7 +454,7 @@ SEARCH = _of(
     ),
     (
         'all windows of a kind scatter alike',
-        'mean_whitening',
+        'mean_rows',
         '_1 - 1',
         '0 * (_1 - 1)',
         'test_search.py::test_a_window_that_scatters_more_within_has_a_less_certain_mean',
@@ -475,7 +489,7 @@ SEARCH = _of(
     ),
     (
         'a finding need not lower the residual in its own unit',
-        'WindowTests.predicting',
+        'WindowTests.least_predicting',
         'not _1 > _needed_reduction(..., ..., ..., ...)',
         'False',
         (

@@ -16,6 +16,7 @@ from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.rows import Rows, flat
 from imu_calibration.kinematics.rotations import normal_gravity
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.preprocessing.rest_detection import find_still
@@ -153,7 +154,7 @@ def test_system_is_the_derivative_of_its_residuals():
     turns = [TurnData(*data, 0, 1), TurnData(*data, 1, 2), known]
     reference = GravityRows(FULL, poses, turns)
     system = reference.linearise(state)
-    design = np.hstack([system.nuisance, system.main])
+    design = flat(system.equations)[:, :-1]
     size = 1e-6
     slopes = []
     for step in size * np.eye(design.shape[1]):
@@ -196,16 +197,22 @@ def test_norm_rows_are_minus_the_derivative_of_the_norm():
         np.testing.assert_allclose(columns[:, k], -slope, rtol=1e-6, atol=1e-7)
 
 
+def scattered_rows(design, residual, noise, group):
+    """Return rows of one axis in groups of scatter."""
+    return Rows(
+        equations=np.column_stack([design, residual])[:, None],
+        variance=noise[:, None],
+        component=group,
+    )
+
+
 def test_scatter_is_found_beside_the_noise():
     rng = np.random.default_rng(4)
     noise, group = rng.uniform(0.5, 1.5, 4000), np.repeat([0, 1, -1, 0], 1000)
     design = rng.normal(size=(4000, 5))
     error = rng.normal(size=4000) * np.sqrt(noise + np.array([2.0, 0.0, 0.0])[group])
     found = estimate_group_variances(
-        design,
-        design @ np.ones(5) + error,
-        noise,
-        group=group,
+        scattered_rows(design, design @ np.ones(5) + error, noise, group),
         start=np.array([1.0, 1.0]),
         fallback=np.array([9.0, 9.0]),
     )
@@ -272,19 +279,13 @@ def test_misfit_of_inseparable_groups_counts_for_each():
     design, group = np.tile(np.eye(8), (2, 1)), np.repeat([0, 1], 8)
     residual = np.concatenate([rng.normal(0, 3.0, 8), np.zeros(8)])
     found = estimate_group_variances(
-        design,
-        residual,
-        np.full(16, 1e-4),
-        group=group,
+        scattered_rows(design, residual, np.full(16, 1e-4), group),
         start=np.ones(2) * 1e-4,
         fallback=np.ones(2) * 1e-4,
     )
     assert np.all(found.upper >= found.variance)
     few = estimate_group_variances(
-        design[:11],
-        residual[:11],
-        np.full(11, 1e-4),
-        group=group[:11],
+        scattered_rows(design[:11], residual[:11], np.full(11, 1e-4), group[:11]),
         start=np.ones(2) * 1e-4,
         fallback=np.ones(2) * 1e-4,
     )

@@ -79,7 +79,7 @@ def test_a_course_of_the_temperature_that_predicts_better_replaces_a_drift(
         named=[question],
         rests={'gyroscope': SimpleNamespace(significant=False)},
         proposals={'gyroscope': None},
-        problem=SimpleNamespace(recording=SimpleNamespace(sessions=[time] * sessions)),
+        problem=SimpleNamespace(recording=SimpleNamespace(session=np.arange(sessions))),
         blocks={
             'gyroscope': SimpleNamespace(
                 time=time, ref=SimpleNamespace(temperature_c=warm), means=lambda rows: rows

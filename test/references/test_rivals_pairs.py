@@ -38,7 +38,14 @@ def searched(signal, alike, size=1e-6):
     )
     total, parts = rows.T @ rows, np.array([part.T @ part for part in np.split(rows, 6)])
     return Search(
-        Evidence(total, total - parts, prior_sd=np.full(5, 1e3), prior_mean=np.zeros(5)),
+        Evidence(
+            [],
+            [],
+            total=total,
+            without=total - parts,
+            prior_sd=np.full(5, 1e3),
+            prior_mean=np.zeros(5),
+        ),
         (0,),
         ASKED,
     )

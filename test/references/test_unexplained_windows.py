@@ -21,14 +21,13 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
     monkeypatch.setattr(unexplained_windows, '_explanations', lambda recording: {})
     n = 40
     noise = SimpleNamespace(
-        variance_beside_bias=lambda kind, count, duration, keys: np.full((n, 3), 4e-6),
         bias_variance=1e-2,
     )
     problem = SimpleNamespace(
         space=SimpleNamespace(
             mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]
         ),
-        recording=SimpleNamespace(kind=None, count=None, duration=None, keys=(), time=np.arange(n)),
+        recording=SimpleNamespace(mean_variance=lambda noise: np.full((n, 3), 4e-6)),
     )
     explained = SimpleNamespace(
         floor=SimpleNamespace(noise={'gyroscope': noise}),

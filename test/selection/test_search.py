@@ -15,6 +15,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_likelihood import FLICKER_MARK, NoiseLikelihood
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.references.turntable.estimation.noise_search import BiasProcessSearch
 from imu_calibration.references.turntable.noise_model import NoiseModel, ReferenceNoise
@@ -31,9 +32,9 @@ from imu_calibration.references.turntable.selection.noise_beside_effects import 
 )
 from imu_calibration.references.turntable.selection.parameter_space import (
     ParameterSpace,
+    mean_rows,
     parameter_space,
     scatter_of_each,
-    white_means,
 )
 from imu_calibration.references.turntable.selection.window_evidence import (
     WindowEvidence,
@@ -46,6 +47,8 @@ from imu_calibration.selection.explained_share import SHOWS, Explained, pruned
 from imu_calibration.selection.order_of_tests import select_findings
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import MIN_GAIN_NATS, Search
+
+from worlds.stub_windows import StubWindows
 
 KINDS = np.array(['static'] * 20 + ['spin'] * 12)
 
@@ -71,7 +74,12 @@ class Known(Evidence):
 
     def __init__(self, loss=dict, values=None, p=1e-12):
         super().__init__(
-            np.zeros((10, 10)), np.zeros((0, 10, 10)), prior_sd=np.ones(9), prior_mean=np.zeros(9)
+            [],
+            [],
+            total=np.zeros((10, 10)),
+            without=np.zeros((0, 10, 10)),
+            prior_sd=np.ones(9),
+            prior_mean=np.zeros(9),
         )
         self.loss_of, self.values, self.p = loss, values, p
 
@@ -83,7 +91,7 @@ class Known(Evidence):
     def p_value(self, smaller, larger):
         return self.p
 
-    def fit(self, used, number=None):
+    def fit(self, used):
         values = np.full(len(used), 1e-9) if self.values is None else np.asarray(self.values)
         return values, 1e-18 * np.eye(len(values))
 
@@ -158,6 +166,13 @@ def test_windows_of_each_kind_are_locked_and_dealt_out_in_turn():
         assert locked[kind == KINDS].any() and len(set(fold[kind == KINDS])) >= 5
 
 
+def evidence_of_folds(parts, size):
+    """Return the evidence of normal matrices of folds, without explicit rows."""
+    total = parts.sum(axis=0)
+    wide = {'prior_sd': np.full(size, 1e3), 'prior_mean': np.zeros(size)}
+    return Evidence([], [], total=total, without=total - parts, **wide)
+
+
 def test_noise_gains_nothing_where_it_was_not_fitted():
     """
     Columns of noise fit the windows that they see, and predict others worse than one column does.
@@ -169,8 +184,7 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
         parts = np.array(
             [rows.T @ rows for rows in np.random.default_rng(seed).normal(size=(6, 6, 5))]
         )
-        total = parts.sum(axis=0)
-        evidence = Evidence(total, total - parts, prior_sd=np.full(4, 1e3), prior_mean=np.zeros(4))
+        evidence = evidence_of_folds(parts, 4)
         gained.append(
             (
                 evidence.loss([0]) - evidence.loss(range(4)),
@@ -188,12 +202,7 @@ def test_memory_of_a_search_does_not_grow_with_the_choices_it_tried():
     Only their losses are kept, and the last fits and predictions, which come out the same again.
     """
     parts = np.array([rows.T @ rows for rows in np.random.default_rng(1).normal(size=(6, 20, 11))])
-    evidence = Evidence(
-        parts.sum(axis=0),
-        parts.sum(axis=0) - parts,
-        prior_sd=np.full(10, 1e3),
-        prior_mean=np.zeros(10),
-    )
+    evidence = evidence_of_folds(parts, 10)
     tried = list(combinations(range(10), 4))
     first = evidence.left_by_others(tried[0])
     for choice in tried:
@@ -208,20 +217,23 @@ def test_memory_of_a_search_does_not_grow_with_the_choices_it_tried():
 
 
 def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
-    recording = SimpleNamespace(
+    recording = StubWindows(
         kind=np.array(['static'] * 4),
         count=np.full(4, 100.0),
         duration=np.ones(4),
         keys=(),
         time=np.arange(4.0),
-        sessions=[np.arange(4)],
+        session=np.zeros(4),
     )
-    space = SimpleNamespace(recording=recording, mean={'gyroscope': [np.ones((4, 2))] * 3})
+    space = SimpleNamespace(
+        recording=recording,
+        mean={'gyroscope': [np.ones((4, 2))] * 3},
+        places=lambda sensor, axis: np.arange(2),
+    )
     for offset, weight in ((0.0, 10.0), (3.0, 1 / np.sqrt(9.01))):
-        white = white_means(
-            space, {'gyroscope': NoiseModel(np.ones(3), np.ones(3), offset)}, 'gyroscope'
-        )
-        np.testing.assert_allclose(white, weight, rtol=1e-9)
+        noise = {'gyroscope': NoiseModel(np.ones(3), np.ones(3), offset)}
+        for rows in mean_rows(space, noise, 'gyroscope'):
+            np.testing.assert_allclose(rows.white(), weight, rtol=1e-9)
 
 
 class Squares:
@@ -231,9 +243,13 @@ class Squares:
     Shares of 97 about the means and of 0.15 in the means that a finding leaves.
     """
 
-    evidence = SimpleNamespace(fold=np.arange(30) % 6, fit=lambda used, number=None: (used, None))
-    search = SimpleNamespace(indices=len)
-    space = SimpleNamespace(reduced=lambda used, values: np.array([float(values)]))
+    evidence = SimpleNamespace(
+        fold=np.arange(30) % 6,
+        fit=lambda used: (-np.ones(len(used)), None),
+        left_by_others=lambda used: np.tile([float(len(used)), 1.0], (6, 1)),
+    )
+    search = SimpleNamespace(indices=lambda chosen: list(range(len(chosen))))
+    space = SimpleNamespace(size=1)
 
     def __init__(self, within=0.4, means=0.12):
         self.all_samples, self.locked_samples = (30, within, means), (10, 0.9, 0.01)
@@ -500,7 +516,7 @@ def test_a_wander_is_as_large_as_on_the_middle_axis(loud):
     for k in range(1, n):
         wander[k] = decay * wander[k - 1] + np.sqrt(1 - decay**2) * drive[k]
     rows = np.stack([np.ones((n, 3)), wander * loud + rng.normal(0.0, 1.0, (n, 3))], axis=2)
-    likelihood = NoiseLikelihood(rows, np.ones((n, 3)), time, sessions=[np.arange(n)])
+    likelihood = NoiseLikelihood(Rows(equations=rows, variance=np.ones((n, 3)), time=time))
     search = BiasProcessSearch(likelihood, 1.0)
     shape = search.best([0])[0]
     assert shape[1] > 4.0
@@ -622,13 +638,13 @@ def evidence_of(rows, noise_within, scatter=None):
     Products of one column with itself, the residual and both.
     """
     count = len(rows)
-    recording = SimpleNamespace(
+    recording = StubWindows(
         kind=np.array(['spin'] * count),
         count=np.full(count, 100.0),
         duration=np.ones(count),
         keys=(),
         time=np.arange(float(count)),
-        sessions=[np.arange(count)],
+        session=np.zeros(count),
         moving=np.ones(count, bool),
     )
     products = np.array(
@@ -645,7 +661,6 @@ def evidence_of(rows, noise_within, scatter=None):
         mean={sensor: [still + [0.0, 0.5]] * 3 for sensor in ('accelerometer', 'gyroscope')},
         within_sum=lambda sensor, axis, at: products[at].sum(axis=0),
         slopes_within=lambda sensor, axis, weights: products @ weights,
-        reduced=lambda used, values: np.append(-values, 1.0),
     )
     noise = NoiseModel(np.full(3, noise_within), np.ones(3))
     return WindowEvidence(
@@ -702,8 +717,10 @@ def test_what_only_one_window_tells_is_not_held_against_it():
     )
     Evidence.__init__(
         evidence,
-        parts.sum(axis=0),
-        parts.sum(axis=0) - parts,
+        [],
+        [],
+        total=parts.sum(axis=0),
+        without=parts.sum(axis=0) - parts,
         prior_sd=np.full(1, 1e3),
         prior_mean=np.zeros(1),
     )
@@ -728,14 +745,14 @@ def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it()
             12,
             np.array([[100.0, 100.0 * slope], [100.0 * slope, 100.0 * (slope**2 + 1.0)]]),
         )
-        recording = SimpleNamespace(
+        recording = StubWindows(
             kind=np.array(['spin'] * count),
             count=np.full(count, 101.0),
             duration=np.ones(count),
             keys=(),
             time=np.arange(float(count)),
             moving=np.ones(count, bool),
-            sessions=[np.arange(count)],
+            session=np.zeros(count),
             mean=lambda sensor: np.tile([1.0, 3.0], (12, 1)),
             product_sum=lambda sensor, part, rows: rows.sum() * each,
             factors_of=lambda sensor, part, rows: [
@@ -760,7 +777,7 @@ def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it()
 
 def test_flicker_is_as_much_of_each_time():
     likelihood = NoiseLikelihood.__new__(NoiseLikelihood)
-    likelihood.known = ()
+    likelihood._rows = SimpleNamespace(processes=())
     made = likelihood.processes(3.0, FLICKER_MARK)
     assert (
         len(made) > 3
@@ -838,8 +855,10 @@ def test_halves_agree_within_chance(apart, agree):
     evidence = WindowEvidence.__new__(WindowEvidence)
     Evidence.__init__(
         evidence,
-        np.zeros((2, 2)),
-        np.array(halves),
+        [],
+        [],
+        total=np.zeros((2, 2)),
+        without=np.array(halves),
         prior_sd=np.full(1, 1e6),
         prior_mean=np.zeros(1),
     )
@@ -929,7 +948,7 @@ def rest_of(sigma, residual):
     Return the Unexplained of a residual whose windows exceed noise by so many standard deviations.
     """
     count = len(residual)
-    recording = SimpleNamespace(
+    recording = StubWindows(
         kind=np.array(['static'] * count),
         moving=np.zeros(count, bool),
         count=np.full(count, 100.0),

@@ -30,12 +30,12 @@ from imu_calibration.document.trust import Uncorrected
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import output_of_effects
 from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.estimation.rows import Rows, flat
 from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
-from imu_calibration.references.rows.row_estimate import RowSet, estimate_rows
-from imu_calibration.references.rows.row_evidence import RowBlock, RowSpace
+from imu_calibration.references.rows.row_estimate import estimate_rows
 from imu_calibration.references.rows.row_search import RowProblem, choose_effects
 from imu_calibration.selection.questions import Question
 
@@ -189,14 +189,13 @@ class PoseRows:
         noise = np.full((count, 3), READING_SD**2)
         if self.left_out is not None:
             noise[self.left_out] = 1e6
-        number = np.repeat(np.arange(count), 3)
-        return RowSet(
-            np.concatenate(residual),
+        return Rows.of_columns(
             np.concatenate(late_columns),
             np.concatenate(main),
-            noise.ravel(),
-            np.zeros(3 * count, int),
-            np.column_stack([number, number]),
+            np.concatenate(residual),
+            variance=noise.ravel(),
+            component=np.zeros(3 * count, int),
+            group=np.repeat(np.arange(count), 3),
         )
 
 
@@ -276,27 +275,25 @@ def select(data, solution, state):
     values = wide.start_from(solution.model, solution.values)
     rows = PoseRows(data, wide).linearise(replace(state, values=values))
     own = np.flatnonzero(~PoseRows(data, wide).fixed)
-    columns = np.column_stack([rows.main[:, own], rows.nuisance, rows.residual])
+    columns = np.column_stack([rows.columns[:, own], flat(rows.equations)[:, [0, -1]]])
     count = len(data.blocks)
     known = np.full((count, 3), solution.noise['gyroscope'].white_variance)
-    block = RowBlock(
-        'blocks',
-        'gyroscope',
-        columns.reshape(count, 3, -1) / BLOCK,
-        known / BLOCK**2,
-        known / BLOCK**2,
-        np.arange(count),
-        np.array([data.time[part].mean() for part, _ in data.blocks]),
+    block = Rows(
+        name='blocks',
+        sensor='gyroscope',
+        equations=columns.reshape(count, 3, -1) / BLOCK,
+        variance=known / BLOCK**2,
+        group=np.arange(count),
+        time=np.array([data.time[part].mean() for part, _ in data.blocks]),
     )
     # Places of the parameters in the columns: bias, matrix, effects, and last the lag.
     place = {int(index): column for column, index in enumerate(own)}
     lag = len(own)
     prior_sd = np.append(PoseRows(data, wide).priors[own], 1.0)
-    questions, parts = [], {}
+    questions = []
     for name in CANDIDATES:
         part = wide.slices['gyroscope', name]
         columns_of = tuple(place[index] for index in range(part.start, part.stop))
-        parts[name] = slice(columns_of[0], columns_of[-1] + 1)
         effect = next(effect for effect in wide.effects if effect.name == name)
         questions.append(Question(effect, columns_of, len(columns_of), name))
     of_effects = set()
@@ -304,8 +301,7 @@ def select(data, solution, state):
         of_effects.update(question.parameters)
     base = [column for column in range(lag) if column not in of_effects]
     prior_sd[base] *= 1e3
-    space = RowSpace(parts, prior_sd, lag + 1)
-    return choose_effects(RowProblem([block], space, questions, baseline=(*base, lag)))
+    return choose_effects(RowProblem([block], prior_sd, questions, baseline=(*base, lag)))
 
 
 def calibrate(data, options=CalibrationOptions()):

@@ -7,6 +7,7 @@ import numpy as np
 from imu_calibration.calibration.diagnosis.applied_gain import compensated_findings, sd_of_chosen
 from imu_calibration.document.trust import judged_from_of, latest_settling, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.held_out_poses import (
     corrected_with,
@@ -14,7 +15,6 @@ from imu_calibration.references.gravity.held_out_poses import (
     turn_errors,
 )
 from imu_calibration.references.gravity.model_selection import HandInvestigation
-from imu_calibration.references.rows.row_evidence import RowBlock
 from imu_calibration.references.rows.row_search import gain_of_groups
 from imu_calibration.selection.gain import APPLIED, Gain
 from imu_calibration.selection.questions import Question
@@ -40,7 +40,7 @@ def gain_by_hand(
     block = found.problem.clearest(compensated.before, compensated.after, sensor)
     poses = found.baseline.poses
     end = end_by_hand(poses)
-    n_columns = 1 if block.duration is not None else block.known.shape[1]
+    n_columns = 1 if block.duration is not None else block.variance.shape[1]
     errors_before = np.zeros((len(block.group), n_columns))
     errors_after = np.zeros((len(block.group), n_columns))
 
@@ -71,7 +71,7 @@ def gain_by_hand(
 
 def _pose_errors(
     found: HandInvestigation,
-    block: RowBlock,
+    block: Rows,
     rows: np.ndarray,
     model: HandModel,
     values: np.ndarray,

@@ -12,11 +12,11 @@ import numpy as np
 
 from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.estimation.prior import zero_sum_rows
+from imu_calibration.estimation.rows import NO_COMPONENT, Rows
 from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.kinematics.rotations import cross, skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.rows.row_estimate import RowSet
 
 COMPONENTS = ('pose', 'drift', 'turn')
 """
@@ -168,7 +168,7 @@ class GravityRows:
         up = state.up + np.einsum('kij,kj->ki', tangent(state.up), own[:, :2])
         return State(state.values + step[own.size :], unit_rows(up), state.drift + own[:, 2:])
 
-    def linearise(self, state: State) -> RowSet:
+    def linearise(self, state: State) -> Rows:
         """Return the rows of poses, bias drifts, calm drifts and turns at a state."""
         equations = _Equations(self.model, self.poses, state, self.memory)
         rows = [
@@ -182,18 +182,7 @@ class GravityRows:
                 rows.append(equations.of_turn(turn, number))
             else:
                 rows.append(equations.of_known_turn(turn, turn.rotation, turn.rotation_cov))
-        return RowSet(
-            residual=np.concatenate([part.residual for part in rows]),
-            nuisance=np.concatenate([part.nuisance for part in rows]),
-            main=np.concatenate([part.main for part in rows]),
-            noise=np.concatenate([part.noise for part in rows]),
-            component=np.concatenate([part.component for part in rows]),
-            group=np.concatenate([part.group for part in rows]),
-        )
-
-
-NO_COMPONENT = -1
-"""Component of rows without scatter beyond the noise."""
+        return Rows.concatenate(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +226,7 @@ class _Equations:
         self.force_bias, self.force_matrix, self.gyro_bias, self.gyro_matrix = linear
         self.further_of_gyroscope = model.extra_index('gyroscope')
 
-    def of_poses(self) -> RowSet:
+    def of_poses(self) -> Rows:
         """
         Return ``force = bias + matrix @ (gravity * up) + further effects``.
 
@@ -260,7 +249,7 @@ class _Equations:
             component=COMPONENTS.index('pose'),
         )
 
-    def of_drifts(self) -> RowSet:
+    def of_drifts(self) -> Rows:
         """Return ``rate = bias + further effects (gravity * up) + drift`` at rest."""
         rate, main = self.model.rate_rows(
             self.state.values, self.true_force, self.poses.rate, **self.poses.conditions
@@ -274,7 +263,7 @@ class _Equations:
             component=NO_COMPONENT,
         )
 
-    def of_calm_drifts(self) -> RowSet:
+    def of_calm_drifts(self) -> Rows:
         """Return ``0 = drift`` within the scatter of the drifts."""
         return self._of_each_pose(
             -self.state.drift,
@@ -294,21 +283,21 @@ class _Equations:
         place: slice,
         blocks: np.ndarray,
         component: int,
-    ) -> RowSet:
+    ) -> Rows:
         """Return three rows per pose; `blocks`: their columns of its own nuisances at `place`."""
         own, size = np.arange(len(residual)), residual.size
         nuisance = np.zeros((*residual.shape, len(residual), 5))
         nuisance[own, :, own, place] = blocks
-        return RowSet(
-            residual.ravel(),
+        return Rows.of_columns(
             nuisance.reshape(size, -1),
             main.reshape(size, -1),
-            noise.ravel(),
-            np.full(size, component),
-            np.repeat(own, 3)[:, None].repeat(2, axis=1),
+            residual.ravel(),
+            variance=noise.ravel(),
+            component=np.full(size, component),
+            group=np.repeat(own, 3),
         )
 
-    def of_zero_sums(self) -> RowSet:
+    def of_zero_sums(self) -> Rows:
         """
         Return ``0 = sum / tolerance`` of `Effect.zero_sums`.
 
@@ -318,16 +307,16 @@ class _Equations:
         model = self.model
         sums = zero_sum_rows(model.model)
         count, n_poses = len(sums), len(self.state.up)
-        return RowSet(
-            -sums @ self.state.values,
+        return Rows.of_columns(
             np.zeros((count, 5 * n_poses)),
             sums,
-            np.ones(count),
-            np.full(count, NO_COMPONENT),
-            np.full((count, 2), n_poses),
+            -sums @ self.state.values,
+            variance=np.ones(count),
+            component=np.full(count, NO_COMPONENT),
+            group=np.full(count, n_poses),
         )
 
-    def of_turn(self, data: TurnData, number: int) -> RowSet:
+    def of_turn(self, data: TurnData, number: int) -> Rows:
         """
         Return the direction before a turn, rotated by the gyroscope, against that after it.
 
@@ -356,13 +345,14 @@ class _Equations:
         nuisance[:, i, OF_DIRECTION] = across_j.T @ mat_ji @ across_i
         nuisance[:, j, OF_DIRECTION] = -(carried @ state.up[j]) * np.eye(2)
         nuisance[:, [i, j], OF_DRIFT] = 0.5 * main[:, None, model.gyro_bias]
-        return RowSet(
-            -across_j.T @ carried,
+        return Rows.of_columns(
             nuisance.reshape(2, -1),
             main,
-            np.full(2, data.noise_variance),
-            np.full(2, COMPONENTS.index('turn')),
-            np.tile([i, j], (2, 1)),
+            -across_j.T @ carried,
+            variance=np.full(2, data.noise_variance),
+            component=np.full(2, COMPONENTS.index('turn')),
+            group=np.full(2, i),
+            end_group=np.full(2, j),
         )
 
     def _integrated(self, data: TurnData, bias: np.ndarray, number: int) -> tuple[np.ndarray, Turn]:
@@ -387,7 +377,7 @@ class _Equations:
         self.memory[number] = _RememberedTurn(bias, self.gyro_matrix, further, turn)
         return turn.mat_ji, turn
 
-    def of_known_turn(self, data: TurnData, known: np.ndarray, known_cov: np.ndarray) -> RowSet:
+    def of_known_turn(self, data: TurnData, known: np.ndarray, known_cov: np.ndarray) -> Rows:
         """
         Return the equation of a turn by a known rotation about a fixed body axis, three rows.
 
@@ -415,13 +405,13 @@ class _Equations:
 
         variance = known_cov + data.noise_variance * np.eye(3)
         white = np.linalg.inv(np.linalg.cholesky(variance))
-        return RowSet(
-            white @ (known - rotation),
+        return Rows.of_columns(
             np.zeros((3, 5 * count)),
             white @ main,
-            np.ones(3),
-            np.full(3, NO_COMPONENT),
-            np.full((3, 2), count),
+            white @ (known - rotation),
+            variance=np.ones(3),
+            component=np.full(3, NO_COMPONENT),
+            group=np.full(3, count),
         )
 
     def _further_of_turn(self, data: TurnData, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -33,6 +33,7 @@ from imu_calibration.document.trust import (
 )
 from imu_calibration.effects.base import UNITS
 from imu_calibration.estimation.gauss_newton import after_one_step
+from imu_calibration.estimation.rows import flat
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.rotations import unit_rows
@@ -217,19 +218,18 @@ def values_without(
     system = GravityRows(model, hand.used_poses, turns).linearise(
         replace(hand.state, values=hand.values)
     )
-    scatter = np.array([*(hand.statistics[f'{name}_scatter_sd'] ** 2 for name in COMPONENTS), 0.0])
+    scatter = np.array([hand.statistics[f'{name}_scatter_sd'] ** 2 for name in COMPONENTS])
     free = ~hand.held & ~model.fixed
-    rows = np.column_stack([system.design(free), system.residual])
-    rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
+    rows = flat(system.of_parameters(free).with_scatter(scatter).white())
     prior = np.column_stack(
         [np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors]
     )[free][:, np.append(free, True)]
-    n_nuisances = system.nuisance.shape[1]
     found = []
     for out in folds:
         # Sums of biases have the group n_poses, which is never held out.
-        is_out = np.append(out, False)[system.group].any(axis=1)
-        factor = triangular_of_band(rows[~is_out])[n_nuisances:, n_nuisances:]
+        left_out = np.append(out, False)
+        is_out = left_out[system.group] | left_out[system.end_group]
+        factor = triangular_of_band(rows[~is_out])[system.n_nuisances :, system.n_nuisances :]
         kept = np.concatenate([factor, prior])
         found.append(after_one_step(hand.values, kept[:, :-1], kept[:, -1], free=free))
     return found
@@ -379,5 +379,5 @@ class _Turns(PlainEquations):
         rows = GravityRows(model, hand.poses, used).linearise(state)
         of_turns = rows.component == COMPONENTS.index('turn')
         free = fitted & ~bias
-        design = rows.main[of_turns][:, free]
+        design = rows.columns[of_turns][:, free]
         return after_one_step(moved, design, rows.residual[of_turns], free=free)

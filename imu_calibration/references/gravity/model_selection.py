@@ -14,6 +14,7 @@ import numpy as np
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import (
@@ -27,8 +28,8 @@ from imu_calibration.references.gravity.hand_parameters import (
     possible_by_hand,
 )
 from imu_calibration.references.gravity.pose_residual import unexplained_by_hand
-from imu_calibration.references.gravity.pose_rows import build_rows, gravity_turns
-from imu_calibration.references.rows.row_evidence import RowBlock, RowEvidence, RowSpace
+from imu_calibration.references.gravity.pose_rows import SearchParameters, build_rows, gravity_turns
+from imu_calibration.references.rows.row_evidence import RowEvidence
 from imu_calibration.references.rows.row_search import ChoiceWithout, RowProblem, choose_effects
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.questions import (
@@ -184,7 +185,7 @@ def investigate_by_hand(
     # Including fixed parameters and the Earth's rate: their uncertainty is no finding.
     base = tuple(range(baseline.hand_model.size + 1))
     questions = _questions(effects, blocks, space, base, not_testable)
-    problem = RowProblem(blocks, space, questions, baseline=base)
+    problem = RowProblem(blocks, space.prior_sd, questions, baseline=base)
     chosen = choose_effects(problem)
     return HandInvestigation(
         baseline=baseline,
@@ -241,8 +242,8 @@ def _why_not(
 
 def _questions(
     effects: Sequence[Effect],
-    blocks: Sequence[RowBlock],
-    space: RowSpace,
+    blocks: Sequence[Rows],
+    space: SearchParameters,
     base: Sequence[int],
     not_testable: list[dict[str, str]],
 ) -> list[Question]:
@@ -252,7 +253,7 @@ def _questions(
     An effect that is collinear with the baseline in these poses is moved to `not_testable`.
     """
     by_name, asked = {e.name: e for e in effects}, []
-    probe = RowEvidence(blocks, space, {}, baseline=base)
+    probe = RowEvidence(blocks, space.prior_sd, {}, baseline=base)
     for label, part in space.parts.items():
         name = label.split('@')[0]
         parameters = tuple(range(part.start, part.stop))

@@ -8,9 +8,10 @@ the face, of the table or of the sensor is the same in all of them.
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.estimation.rows import NO_COMPONENT, Rows, flat
 from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD
 from imu_calibration.references.rows.group_variances import GroupVariances, estimate_group_variances
-from imu_calibration.references.rows.row_estimate import RowEstimate, RowSet, gain_of_rows
+from imu_calibration.references.rows.row_estimate import RowEstimate, gain_of_rows
 
 PLACED_AGAIN = 0.0125
 """Consecutive rests within this angle are one placement, rad: they have the same error."""
@@ -50,7 +51,7 @@ def excess(covariance: np.ndarray, known: np.ndarray, index: np.ndarray) -> np.n
     return added
 
 
-def covariance_of_placements(rows: RowSet, found: RowEstimate) -> np.ndarray:
+def covariance_of_placements(rows: Rows, found: RowEstimate) -> np.ndarray:
     """
     Return the covariance that common errors of rests add to the one of independent errors.
 
@@ -63,7 +64,7 @@ def covariance_of_placements(rows: RowSet, found: RowEstimate) -> np.ndarray:
 
     Parameters
     ----------
-    rows : RowSet
+    rows : Rows
         `GravityRows` at the estimate.
     found : RowEstimate
 
@@ -73,7 +74,7 @@ def covariance_of_placements(rows: RowSet, found: RowEstimate) -> np.ndarray:
         Zero where each placement has one rest.
 
     """
-    n_params = rows.main.shape[1]
+    n_params = len(found.free)
     added = np.zeros((n_params, n_params))
     first = placements(found.state.up)
     if len(first) == len(found.state.up):
@@ -83,9 +84,10 @@ def covariance_of_placements(rows: RowSet, found: RowEstimate) -> np.ndarray:
     # Weights of the rests in the mean of each placement and axis, shape (n_means, m).
     pose = COMPONENTS.index('pose')
     of_poses = np.flatnonzero(rows.component == pose)
-    mean = 3 * placement[rows.group[of_poses, 0]] + np.arange(len(of_poses)) % 3
+    mean = 3 * placement[rows.group[of_poses]] + np.arange(len(of_poses)) % 3
     weights = np.zeros((3 * len(first), len(rows.residual)))
-    weights[mean, of_poses] = 1 / rows.variance(found.scatter)[of_poses]
+    variances = rows.with_scatter(found.scatter.variance).variance.ravel()
+    weights[mean, of_poses] = 1 / variances[of_poses]
     weights /= weights.sum(axis=1, keepdims=True)
 
     # Excess of the variance of the means over that of independent rests.
@@ -96,16 +98,16 @@ def covariance_of_placements(rows: RowSet, found: RowEstimate) -> np.ndarray:
     return added
 
 
-def _variance_of_means(rows: RowSet, found: RowEstimate, weights: np.ndarray) -> GroupVariances:
+def _variance_of_means(rows: Rows, found: RowEstimate, weights: np.ndarray) -> GroupVariances:
     """
     Return the variance of the means of placements beyond the noise of their samples.
 
     By restricted likelihood on the means and on the differences within placements: the rows of
     each placement are transformed to their mean and to the directions across it.
     """
-    total = rows.variance(found.scatter)
-    columns = np.column_stack([rows.design(found.free), rows.residual])
-    white = columns / np.sqrt(total)[:, None]
+    free = rows.of_parameters(found.free)
+    columns = flat(free.equations)
+    white = flat(free.with_scatter(found.scatter.variance).white())
 
     transformed = [white[rows.component != COMPONENTS.index('pose')], weights @ columns]
     for row in weights:
@@ -115,17 +117,16 @@ def _variance_of_means(rows: RowSet, found: RowEstimate, weights: np.ndarray) ->
     n_before, n_means = len(transformed[0]), len(weights)
     stacked = np.concatenate(transformed)
     noise = np.ones(len(stacked))
-    group = np.full(len(stacked), -1)
-    noise[n_before : n_before + n_means] = weights**2 @ rows.noise
-    group[n_before : n_before + n_means] = 0
+    component = np.full(len(stacked), NO_COMPONENT)
+    noise[n_before : n_before + n_means] = weights**2 @ rows.variance.ravel()
+    component[n_before : n_before + n_means] = 0
+    rows = Rows(equations=stacked[:, None], variance=noise[:, None], component=component)
 
     fallback = np.array([SCATTER_SD[0] ** 2])
     variances = GroupVariances(fallback, np.zeros(1), fallback)
     for _ in range(VARIANCE_STEPS):
         before = variances.variance
-        variances = estimate_group_variances(
-            stacked[:, :-1], stacked[:, -1], noise, group=group, start=before, fallback=fallback
-        )
+        variances = estimate_group_variances(rows, start=before, fallback=fallback)
         if np.allclose(variances.variance, before, rtol=0.01):
             break
     return variances

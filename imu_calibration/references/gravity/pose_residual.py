@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 
 from imu_calibration.effects.base import AXES
+from imu_calibration.estimation.rows import Rows, flat
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
-from imu_calibration.references.rows.row_evidence import RowBlock, RowEvidence
+from imu_calibration.references.rows.row_evidence import RowEvidence
 from imu_calibration.selection.regime_variables import Variable, ranged
 from imu_calibration.selection.regimes import (
     REGIME_LEVEL,
@@ -34,7 +35,7 @@ TURN_RESIDUAL_UNIT = 'rad/turn'
 
 def unexplained_by_hand(
     hand: HandCalibration,
-    blocks: Sequence[RowBlock],
+    blocks: Sequence[Rows],
     evidence: RowEvidence,
     *,
     used: Sequence[int],
@@ -49,7 +50,7 @@ def unexplained_by_hand(
     ----------
     hand : HandCalibration
         Of the baseline.
-    blocks : sequence of RowBlock
+    blocks : sequence of Rows
         Rows at rest and of turns.
     evidence : RowEvidence
         Of these rows.
@@ -62,9 +63,7 @@ def unexplained_by_hand(
     for block, residual in zip(blocks, residuals):
         if block.sensor != sensor:
             continue
-        spare = residual.size - np.linalg.matrix_rank(
-            block.rows[:, :, used].reshape(residual.size, -1)
-        )
+        spare = residual.size - np.linalg.matrix_rank(flat(block.equations)[:, used])
         if spare < 3:
             continue
         own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
@@ -117,7 +116,7 @@ def _explanations(hand: HandCalibration) -> Iterator[tuple[str, np.ndarray, np.n
 
 
 def regimes_by_hand(
-    hand: HandCalibration, block: RowBlock, residual: np.ndarray
+    hand: HandCalibration, block: Rows, residual: np.ndarray
 ) -> tuple[RestRegime, ...]:
     """
     Return the clearest regime of each axis.
@@ -128,7 +127,7 @@ def regimes_by_hand(
     ----------
     hand : HandCalibration
         Of the baseline.
-    block : RowBlock
+    block : Rows
         The sensor's rows in poses.
     residual : ndarray, shape (k, n_axes)
         Residual of each pose, by a fit without it.
@@ -154,7 +153,7 @@ def regimes_by_hand(
     return tuple(found)
 
 
-def _variables(hand: HandCalibration, block: RowBlock) -> list[Variable]:
+def _variables(hand: HandCalibration, block: Rows) -> list[Variable]:
     """
     Return the variables of regimes of poses.
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import BASE
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.sensor_noise import NATURAL
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.kinematics.strapdown import integrate_turn
@@ -14,7 +15,24 @@ from imu_calibration.references.gravity.equations import Poses, TurnData, betwee
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.rows.row_evidence import RowBlock, RowSpace
+
+
+@dataclass(frozen=True, eq=False)
+class SearchParameters:
+    """Parameters of the rows: those of the baseline, then one run per column set."""
+
+    parts: dict[str, slice]
+    """
+    Label of each run of columns (effect name, for a warm-up with the number of its time constant)
+    -> its parameters.
+    """
+    prior_sd: np.ndarray
+    """Shape (q,); wide for the baseline, which is linearised at its own solution."""
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self.prior_sd)
 
 
 def build_rows(
@@ -23,7 +41,7 @@ def build_rows(
     effects: Sequence[Effect],
     *,
     constants: np.ndarray,
-) -> tuple[list[RowBlock], RowSpace]:
+) -> tuple[list[Rows], SearchParameters]:
     """
     Return the rows at rest and of turns, and their parameters.
 
@@ -56,7 +74,7 @@ def build_rows(
         parts[run.label] = slice(start, start + run.size)
         widths.append(run.effect.prior_sds()[: run.size])
         start += run.size
-    space = RowSpace(parts, np.concatenate(widths), start)
+    space = SearchParameters(parts, np.concatenate(widths))
 
     # Columns at rest in the poses.
     true = hand.gravity * hand.state.up
@@ -145,8 +163,8 @@ def _natural(poses: Poses, sensor: str) -> np.ndarray:
 
 
 def _norm_block(
-    hand: HandCalibration, space: RowSpace, at_rest: Mapping[str, np.ndarray]
-) -> RowBlock:
+    hand: HandCalibration, space: SearchParameters, at_rest: Mapping[str, np.ndarray]
+) -> Rows:
     """One row per pose: ``|true force| - gravity``."""
     poses = hand.poses
     count = len(poses)
@@ -159,22 +177,21 @@ def _norm_block(
     for label, columns in at_rest.items():
         rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
     known = np.sum((back * poses.force_sem) ** 2, axis=1)
-    floor = known + back**2 @ _natural(poses, 'accelerometer')
-    return RowBlock(
-        'poses',
-        'accelerometer',
-        rows[:, None],
-        known[:, None],
-        floor[:, None],
-        np.arange(count),
-        poses.time,
-        wanders=True,
+    drift = back**2 @ _natural(poses, 'accelerometer')
+    return Rows(
+        name='poses',
+        sensor='accelerometer',
+        equations=rows[:, None],
+        variance=known[:, None],
+        drift=drift[:, None],
+        group=np.arange(count),
+        time=poses.time,
     )
 
 
 def _rest_block(
-    hand: HandCalibration, space: RowSpace, at_rest: Mapping[str, np.ndarray]
-) -> RowBlock:
+    hand: HandCalibration, space: SearchParameters, at_rest: Mapping[str, np.ndarray]
+) -> Rows:
     """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
     poses = hand.poses
     count = len(poses)
@@ -186,20 +203,24 @@ def _rest_block(
     rows[:, :, -1] = residual
     for label, columns in at_rest.items():
         rows[:, :, space.parts[label]] = columns
-    known = poses.rate_sem**2
-    floor = known + _natural(poses, 'gyroscope')
-    return RowBlock(
-        'poses', 'gyroscope', rows, known, floor, np.arange(count), poses.time, wanders=True
+    return Rows(
+        name='poses',
+        sensor='gyroscope',
+        equations=rows,
+        variance=poses.rate_sem**2,
+        drift=np.tile(_natural(poses, 'gyroscope'), (count, 1)),
+        group=np.arange(count),
+        time=poses.time,
     )
 
 
 def _turn_block(
     hand: HandCalibration,
     turns: Sequence[TurnData],
-    space: RowSpace,
+    space: SearchParameters,
     at_rest: Mapping[str, np.ndarray],
     moving: Sequence[Effect],
-) -> RowBlock:
+) -> Rows:
     """
     Two rows per turn.
 
@@ -250,13 +271,12 @@ def _turn_block(
         durations.append(found.duration)
         of_bias = 0.25 * np.mean(hand.poses.rate_sem[[i, j]] ** 2, axis=1).sum()
         known.append(np.full(2, turn.noise_variance / found.duration**2 + of_bias))
-    return RowBlock(
-        'turns',
-        'gyroscope',
-        np.array(rows),
-        np.array(known),
-        np.array(known),
-        np.array([turn.first for turn in turns]),
-        np.array([turn.time.mean() for turn in turns]),
-        np.array(durations),
+    return Rows(
+        name='turns',
+        sensor='gyroscope',
+        equations=np.array(rows),
+        variance=np.array(known),
+        group=np.array([turn.first for turn in turns]),
+        time=np.array([turn.time.mean() for turn in turns]),
+        duration=np.array(durations),
     )

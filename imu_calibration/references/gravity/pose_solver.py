@@ -16,6 +16,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.estimation.gauss_newton import gauss_newton
 from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelError
 from imu_calibration.estimation.outliers import find_outliers
+from imu_calibration.estimation.rows import Rows, flat
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import (
     GRAVITY,
@@ -39,7 +40,6 @@ from imu_calibration.references.gravity.poses import missed_angle
 from imu_calibration.references.rows.row_estimate import (
     MAX_NEWTON_STEPS,
     RowEstimate,
-    RowSet,
     estimate_rows,
 )
 from imu_calibration.references.rows.row_model_error import model_error_of_rows
@@ -97,9 +97,7 @@ def _model_error(reference: GravityRows, found: RowEstimate) -> ModelError:
     spare = of_poses_and_turns - 2 * count - free.sum() + free[model.gyro_bias].sum()
     if min(count, spare) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
-    return model_error_of_rows(
-        rows, found, model.model, block=np.minimum(rows.group[:, 0], count - 1)
-    )
+    return model_error_of_rows(rows, found, model.model, block=np.minimum(rows.group, count - 1))
 
 
 def first_state(model: HandModel, poses: Poses) -> State:
@@ -286,7 +284,7 @@ def without_outlying_poses(
     """
     rows = GravityRows(model, poses, turns, integrated or {}).linearise(found.state)
     rest, basis = _whitened(rows, found)
-    pose = rows.group[:, 0]
+    pose = rows.group
     # The turn that begins in a pose.
     turn_of = {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
 
@@ -311,11 +309,12 @@ def without_outlying_poses(
     return poses, turns, {kind: len(out) for kind, out in left.items()}
 
 
-def _whitened(rows: RowSet, found: RowEstimate) -> tuple[np.ndarray, np.ndarray]:
+def _whitened(rows: Rows, found: RowEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals in sds, and an orthonormal basis of the fitted columns."""
-    root = np.sqrt(rows.variance(found.scatter))
-    design = rows.design(found.free) / root[:, None]
-    rest = rows.residual / root
+    weighted = rows.of_parameters(found.free).with_scatter(found.scatter.variance)
+    white = flat(weighted.white())
+    design = white[:, :-1]
+    rest = white[:, -1]
     # A ridge, as some columns may be dependent.
     ridge = np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)
     factor = triangular_of_band(np.vstack([design, ridge]))

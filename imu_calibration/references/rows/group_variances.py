@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import ndtri, stdtrit
 
-from imu_calibration.estimation.whitening import RestrictedLikelihood
+from imu_calibration.estimation.rows import Rows, flat
+from imu_calibration.estimation.scaled_solve import triangular_of_band
 
 SCORING_STEPS = 2
 """Scoring steps per call; for rows of one variance a single step is exact."""
@@ -37,57 +39,27 @@ class GroupVariances:
     Variance for standard deviations, which allows for the error of `variance`, shape (n_groups,).
     """
 
-    def total(self, noise: np.ndarray, group: np.ndarray, inflated: bool = False) -> np.ndarray:
-        """
-        Return the variance of each row, shape (m,).
-
-        Parameters
-        ----------
-        noise : array, shape (m,)
-            Known variance.
-        group : array, shape (m,)
-            Group of each row, -1 for none.
-        inflated : bool
-            Use `upper`, so that 95 % intervals from few poses are correct.
-
-        """
-        return noise + np.append(self.upper if inflated else self.variance, 0.0)[group]
-
 
 def estimate_group_variances(
-    design: np.ndarray,
-    residual: np.ndarray,
-    noise: np.ndarray,
-    *,
-    group: np.ndarray,
-    start: np.ndarray,
-    fallback: np.ndarray,
+    rows: Rows, *, start: np.ndarray, fallback: np.ndarray
 ) -> GroupVariances:
     """
-    Estimate the additional variance of each group of rows.
+    Estimate the variance of each component of rows.
 
-    The rows are ``residual = design @ x + e`` with independent errors of variance ``noise +
-    variance[group]``. Scoring on the restricted likelihood, which charges for the parameters that
-    were fitted.
+    Scoring on the restricted likelihood, which charges for the parameters that were fitted.
 
     Parameters
     ----------
-    design : array, shape (m, p)
-        Columns; full column rank (add weak priors as rows of group -1 where needed).
-    residual, noise, group : arrays, shape (m,)
-        Left-hand side, known variance (above zero), index of the group or -1.
+    rows : Rows
+        With independent errors of one axis and columns of full rank (add weak priors as rows
+        without component where needed).
     start : array, shape (n_groups,)
         First guess of the variances.
     fallback : array, shape (n_groups,)
         Variance of a group with fewer than two degrees of freedom.
 
     """
-    likelihood = RestrictedLikelihood(
-        np.column_stack([design, residual])[:, None],
-        np.zeros(len(design)),
-        [np.arange(len(design))],
-    )
-    problem = _Groups(likelihood, noise, group, len(start))
+    problem = _Groups(rows, len(start))
     none = np.zeros(len(start), bool)
 
     # Groups with enough degrees of freedom are estimated. At a large variance these depend on the
@@ -113,6 +85,39 @@ def estimate_group_variances(
     return GroupVariances(current, dof, upper)
 
 
+def scoring(rows: Rows, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return score and information of the variances of groups of independent rows (Fisher scoring).
+
+    Parameters
+    ----------
+    rows : Rows
+    members : ndarray, shape (n_groups, m n_axes)
+        Which equations belong to each group, as ones and zeros.
+
+    Returns
+    -------
+    tuple
+        First derivative of the restricted log likelihood by the variances, shape (n_groups,), and
+        minus the expected second one, (n_groups, n_groups).
+
+    """
+    white = flat(rows.white())
+    factor = triangular_of_band(white)
+    # Only the rows of groups: the cost grows with the square of their number.
+    some = members.any(axis=0)
+    white, weighted = white[some], (members / rows.variance.ravel())[:, some]
+    # With A = Q R, `left` is Q of these rows: residuals e = y - Q Q'y, hat matrix H = Q Q'.
+    left = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
+    rest = white[:, -1] - left @ factor[:-1, -1]
+    redundancy = 1 - np.einsum('ij,ij->i', left, left)
+    # Score (e^2 - (1 - h)) / 2 and information (I - H)^2 / 2, summed over the groups.
+    spread = left @ left.T
+    spread[np.diag_indices_from(spread)] -= 1
+    np.square(spread, out=spread)  # in place: the square of the number of rows
+    return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ spread @ weighted.T
+
+
 def student_factor(dof: np.ndarray) -> np.ndarray:
     """
     Return the squared ratio of Student's and normal 97.5 % quantiles.
@@ -135,19 +140,14 @@ class _ScoringStep:
 class _Groups:
     """The likelihood as a function of the additional variances of groups."""
 
-    def __init__(
-        self, likelihood: RestrictedLikelihood, noise: np.ndarray, group: np.ndarray, count: int
-    ):
-        self.likelihood, self.noise, self.group = likelihood, noise, group
-        self.members = np.array([group == number for number in range(count)], float)
-
-    def variance(self, extra: np.ndarray) -> np.ndarray:
-        """Return the variance of each row, shape (m,)."""
-        return self.noise + np.append(extra, 0.0)[self.group]
+    def __init__(self, rows: Rows, count: int):
+        self.rows = rows
+        self.members = np.array([rows.component == number for number in range(count)], float)
 
     def typical(self, extra: np.ndarray) -> np.ndarray:
         """Return the mean variance of each group's rows, shape (n_groups,)."""
-        return (self.members @ self.variance(extra)) / np.maximum(self.members.sum(1), 1)
+        variance = self.rows.with_scatter(extra).variance.ravel()
+        return (self.members @ variance) / np.maximum(self.members.sum(1), 1)
 
     def step(self, extra: np.ndarray, free: np.ndarray) -> _ScoringStep:
         """
@@ -155,7 +155,7 @@ class _Groups:
 
         The variances follow from a scoring step over the free groups that are not pinned at zero.
         """
-        score, information = self.likelihood.scoring(self.variance(extra)[:, None], self.members)
+        score, information = scoring(self.rows.with_scatter(extra), self.members)
         typical = self.typical(extra)
         index = np.flatnonzero(free & ~((extra <= 0) & (score < 0)))
         step = np.zeros(len(extra))

@@ -10,18 +10,17 @@ which are estimated and eliminated.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.estimation.estimate import estimate
 from imu_calibration.estimation.gauss_newton import gauss_newton
 from imu_calibration.estimation.held_parameters import undetermined_parameters
-from imu_calibration.estimation.scaled_solve import (
-    covariance_with_held,
-    triangular_of_band,
-)
-from imu_calibration.estimation.solution import terms_of_fit
+from imu_calibration.estimation.rows import Rows, flat
+from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.references.rows.group_variances import GroupVariances, estimate_group_variances
 
 MAX_NEWTON_STEPS = 15
@@ -39,39 +38,6 @@ SMALL_STEP_LENGTH = 1e-3
 """An iteration ends with a step below this length, in joint standard deviations."""
 
 
-@dataclass(frozen=True, eq=False)
-class RowSet:
-    """
-    Linearised equations ``residual = nuisance @ dn + main @ dp + error``.
-
-    The error has the variance `noise` plus that of `component`.
-    """
-
-    residual: np.ndarray
-    """Measured minus predicted, shape (m,)."""
-    nuisance: np.ndarray
-    """Columns of the nuisances, shape (m, d)."""
-    main: np.ndarray
-    """Columns of the parameters, shape (m, n)."""
-    noise: np.ndarray
-    """Known variance of each row, shape (m,)."""
-    component: np.ndarray
-    """Variance component that adds to it, or -1, shape (m,)."""
-    group: np.ndarray
-    """
-    Poses or blocks that the row belongs to, shape (m, 2): a turn belongs to the poses at both its
-    ends.
-    """
-
-    def variance(self, scatter: GroupVariances, *, inflated: bool = False) -> np.ndarray:
-        """Return the variance of each row (`GroupVariances.total`), shape (m,)."""
-        return scatter.total(self.noise, self.component, inflated)
-
-    def design(self, free: np.ndarray) -> np.ndarray:
-        """Return the columns of nuisances and free parameters, shape (m, d + n_free)."""
-        return np.hstack([self.nuisance, self.main[:, free]])
-
-
 class RowReference(Protocol):
     """What an estimate needs of a reference."""
 
@@ -82,8 +48,8 @@ class RowReference(Protocol):
     fixed: np.ndarray
     """True where a convention fixes a parameter, shape (n,)."""
 
-    def linearise(self, state: Any) -> RowSet:
-        """Return the rows at a state."""
+    def linearise(self, state: Any) -> Rows:
+        """Return the rows of one axis at a state, with their components."""
 
     def moved(self, state: Any, step: np.ndarray) -> Any:
         """Return the state after a step (nuisances, then parameters)."""
@@ -133,33 +99,14 @@ def estimate_rows(
 
     """
     asked = ~reference.fixed
-    priors = reference.priors
-    held = np.zeros(len(priors), bool)
-    if withheld is not None:
-        held = withheld & asked
-
-    # With the priors: which parameters do the data determine?
-    with_priors = _RowSquares(reference, asked & ~held, priors, fallback)
-    first = _iterate(with_priors, state, fallback)
-    factor = _factor(reference.linearise(first.state), first.scatter)
-    flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * priors))
-    held = undetermined_parameters(np.vstack([factor, flat_prior]), priors, free=asked, held=held)
-    free = asked & ~held
-
-    # From the data alone, with the other parameters at their nominal values.
-    state = replace(first.state, values=np.where(held, reference.nominal, first.state.values))
-    variance = np.maximum(first.scatter.variance, LEAST_START_VARIANCE * fallback)
-    of_data = _RowSquares(reference, free, FLAT_PRIOR_FACTOR * priors, fallback)
-    last = _iterate(of_data, state, variance)
-
-    # The covariance as a sum of named terms: C = C_noise + C_scatter + C_held.
-    rows = reference.linearise(last.state)
-    factor = _factor(rows, last.scatter)
-    own, of_held = covariance_with_held(factor, free, held, prior_sd=priors)
-    of_scatter = _covariance_of_scatter(rows, last.scatter, free)
-    terms = terms_of_fit(own, of_scatter, of_held)
-    n_steps = first.n_steps + last.n_steps
-    return RowEstimate(last.state, terms, held, free, last.scatter, factor, n_steps)
+    held = np.zeros(len(asked), bool) if withheld is None else withheld & asked
+    problem = _RowProblem(reference, fallback, held, asked, reference.priors)
+    found = estimate(problem, _Iterated(state, _known_scatter(fallback)))
+    last = found.state
+    factor = found.rows.design
+    return RowEstimate(
+        last.state, found.terms, found.held, found.free, last.scatter, factor, last.n_steps
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +119,59 @@ class _Iterated:
     """Scatter of the components beyond the noise."""
     n_steps: int = 0
     """Number of steps."""
+
+
+def _known_scatter(variance: np.ndarray) -> GroupVariances:
+    """Return variances of the components that are not estimated."""
+    return GroupVariances(variance, np.full(len(variance), np.inf), variance.copy())
+
+
+@dataclass(frozen=True, eq=False)
+class _RowProblem:
+    """Estimate from the rows of a reference (`EstimateProblem`)."""
+
+    reference: RowReference
+    fallback: np.ndarray
+    """Variances of the components where the data are too few, shape (n_components,)."""
+    withheld: np.ndarray
+    """True where a parameter is held in any case, shape (n,)."""
+    asked: np.ndarray
+    """False where a convention fixes a parameter, shape (n,)."""
+    prior_sd: np.ndarray
+    """Shape (n,)."""
+
+    def fitted(self, state: _Iterated) -> _Iterated:
+        """Return the values with the priors, and the scatter."""
+        return self._solved(state, self.withheld, self.prior_sd)
+
+    def _solved(self, state: _Iterated, held: np.ndarray, prior_sd: np.ndarray) -> _Iterated:
+        """Return values and scatter of least cost, without changes of the held parameters."""
+        squares = _RowSquares(self.reference, self.asked & ~held, prior_sd, self.fallback)
+        return gauss_newton(squares, state, n_steps=MAX_NEWTON_STEPS)
+
+    def undetermined(self, state: _Iterated) -> np.ndarray:
+        """Return the parameters that the data alone do not determine."""
+        flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * self.prior_sd))
+        rows = np.vstack([self.weighted(state).design, flat_prior])
+        return undetermined_parameters(rows, self.prior_sd, free=self.asked, held=self.withheld)
+
+    def holding(self, state: _Iterated, held: np.ndarray) -> _Iterated:
+        """Return the values from the data alone, the held ones nominal, and the scatter."""
+        values = np.where(held, self.reference.nominal, state.state.values)
+        variance = np.maximum(state.scatter.variance, LEAST_START_VARIANCE * self.fallback)
+        start = _Iterated(replace(state.state, values=values), _known_scatter(variance))
+        last = self._solved(start, held, FLAT_PRIOR_FACTOR * self.prior_sd)
+        return replace(last, n_steps=state.n_steps + last.n_steps)
+
+    def weighted(self, state: _Iterated) -> '_ScatteredRows':
+        """Return the rows at a state."""
+        return _ScatteredRows(self.reference.linearise(state.state), state.scatter)
+
+    def not_believed(
+        self, state: _Iterated, free: np.ndarray, sd: np.ndarray
+    ) -> Mapping[int, float]:
+        """Return none: the scatter of few rows contains their misfit."""
+        return {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,31 +204,23 @@ class _RowSquares:
         """Return the step from a state, with the scatter estimated at it."""
         free, fallback = self.free, self.fallback
         # Rows of the reference, of nuisances and free parameters, and rows of the priors.
-        rows = self.reference.linearise(at.state)
-        n_nuisances = rows.nuisance.shape[1]
-        n_free = int(free.sum())
-        columns = rows.design(free)
-        design = np.vstack([columns, np.eye(n_nuisances + n_free)[n_nuisances:]])
-        distance = (self.reference.nominal - at.state.values)[free]
-        residual = np.concatenate([rows.residual, distance])
-        noise = np.concatenate([rows.noise, self.priors[free] ** 2])
-        group = np.concatenate([rows.component, np.full(n_free, -1)])
+        distance = self.reference.nominal - at.state.values
+        rows = self.reference.linearise(at.state).of_parameters(free)
+        rows = rows.with_prior(distance[free], np.diag(1 / self.priors[free]))
 
         # The residuals of the first steps contain errors of linearisation, which are no scatter.
         scatter = at.scatter
         before = scatter.variance
         if at.n_steps >= FIRST_STEPS:
-            scatter = estimate_group_variances(
-                design, residual, noise, group=group, start=before, fallback=fallback
-            )
+            scatter = estimate_group_variances(rows, start=before, fallback=fallback)
 
         # Weighted least squares: R x = q, from the triangular factor of [design | residual]; |q|
         # is the length of the step.
-        sd = np.sqrt(scatter.total(noise, group))
-        factor = triangular_of_band(np.column_stack([design, residual]) / sd[:, None])[:-1]
+        white = flat(rows.with_scatter(scatter.variance).white())
+        factor = triangular_of_band(white)[:-1]
         right = factor[:, -1]
-        change = np.zeros(n_nuisances + len(free))
-        moving = np.append(np.ones(n_nuisances, bool), free)
+        change = np.zeros(rows.n_nuisances + len(free))
+        moving = np.append(np.ones(rows.n_nuisances, bool), free)
         change[moving] = scipy.linalg.solve_triangular(factor[:, :-1], right)
         settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
         return _RowStep(change, float(np.linalg.norm(right)), scatter, settled)
@@ -244,55 +236,50 @@ class _RowSquares:
         return at.n_steps > FIRST_STEPS + 1 and is_small
 
 
-def _iterate(squares: _RowSquares, state: Any, variance: np.ndarray) -> _Iterated:
-    """Return the state and the scatter of least cost; `variance`: scatter in the first steps."""
-    start = np.array(variance, float)
-    scatter = GroupVariances(start, np.full(len(start), np.inf), start.copy())
-    return gauss_newton(squares, _Iterated(state, scatter), n_steps=MAX_NEWTON_STEPS)
+@dataclass(frozen=True, eq=False)
+class _ScatteredRows:
+    """Rows with the scatter of their components (`WeightedRows`)."""
+
+    rows: Rows
+    scatter: GroupVariances
+
+    @cached_property
+    def design(self) -> np.ndarray:
+        """
+        Triangular factor of the parameters with the nuisances eliminated.
+
+        The factor is at inflated variances.
+        """
+        n_nuisances = self.rows.n_nuisances
+        factor = triangular_of_band(flat(self.rows.with_scatter(self.scatter.upper).white()))
+        return factor[n_nuisances:-1, n_nuisances:-1]
+
+    def scatter_term(self, own: np.ndarray) -> np.ndarray:
+        """
+        Return the part of the covariance that is due to the scatter of the components.
+
+        With the changes G of the parameters by errors of the rows, the variance V of the rows and
+        their noise N::
+
+            covariance = G (V - N) G'
+
+        """
+        free = np.diag(own) > 0
+        added = self.rows.with_scatter(self.scatter.upper).variance - self.rows.variance
+        gain = gain_of_rows(self.rows, self.scatter, free) * np.sqrt(added.ravel())
+        found = np.zeros_like(own)
+        found[np.ix_(free, free)] = gain @ gain.T
+        return found
 
 
-def _factor(rows: RowSet, scatter: GroupVariances) -> np.ndarray:
-    """
-    Return the triangular factor of the parameters with the nuisances eliminated.
-
-    The factor is at inflated variances.
-    """
-    sd = np.sqrt(rows.variance(scatter, inflated=True))
-    n_nuisances = rows.nuisance.shape[1]
-    factor = triangular_of_band(np.hstack([rows.nuisance, rows.main]) / sd[:, None])
-    return factor[n_nuisances:, n_nuisances:]
-
-
-def _covariance_of_scatter(rows: RowSet, scatter: GroupVariances, free: np.ndarray) -> np.ndarray:
-    """
-    Return the part of the covariance that is due to the scatter of the components beyond the noise.
-
-    With the changes G of the parameters by errors of the rows, the variance V of the rows and
-    their noise N::
-
-        covariance = G (V - N) G'
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-        Zero for parameters that are not free.
-
-    """
-    variance = rows.variance(scatter, inflated=True)
-    gain = gain_of_rows(rows, scatter, free) * np.sqrt(variance - rows.noise)
-    found = np.zeros((len(free),) * 2)
-    found[np.ix_(free, free)] = gain @ gain.T
-    return found
-
-
-def gain_of_rows(rows: RowSet, scatter: GroupVariances, free: np.ndarray) -> np.ndarray:
+def gain_of_rows(rows: Rows, scatter: GroupVariances, free: np.ndarray) -> np.ndarray:
     """
     Return the changes of the free parameters by errors of the rows, shape (n_free, m).
 
     ``(A' V^-1 A)^-1 A' V^-1`` without the rows of the nuisances, A being the columns of nuisances
     and free parameters, V the inflated variances.
     """
-    root = np.sqrt(rows.variance(scatter, inflated=True))
-    design = rows.design(free) / root[:, None]
+    weighted = rows.of_parameters(free).with_scatter(scatter.upper)
+    design = flat(weighted.white())[:, :-1]
     solved = scipy.linalg.cho_solve((triangular_of_band(design), False), design.T)
-    return solved[rows.nuisance.shape[1] :] / root
+    return solved[rows.n_nuisances :] / np.sqrt(weighted.variance.ravel())

@@ -1,70 +1,24 @@
 """
 Evidence from few rows of any reference: poses and turns by hand, blocks of a pose topic.
 
-Rows are few, so that variances are estimated too and every group of rows is held out in turn.
+Rows are few, so that this evidence differs from that of windows. The variances of the rows are
+estimated from the same rows: a loss is ``n log(mean square)``, and a test an F test. The rows
+without a fold are whitened anew, since they are correlated with it by the bias. And for halves the
+noise is estimated again.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
-from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
+from imu_calibration.estimation.rows import Rows, flat, normal_of_rows
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.estimation.sensor_noise import BiasProcess
-from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.selection.evidence import Evidence, ParameterFit
-
-
-@dataclass(frozen=True, eq=False)
-class RowBlock(AlignedArrays):
-    """
-    Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor.
-    """
-
-    name: str
-    """'poses', 'turns' or another kind."""
-    sensor: str
-    """'accelerometer' or 'gyroscope'."""
-    rows: np.ndarray
-    """
-    ``[columns | residual]`` at the baseline, shape (m, n_axes, q + 1); different axes have
-    independent errors.
-    """
-    known: np.ndarray
-    """Variance by the noise of the samples, shape (m, n_axes)."""
-    floor: np.ndarray
-    """The same plus the usual bias drift, shape (m, n_axes)."""
-    group: np.ndarray
-    """
-    Group of each row, shape (m,): rows of a group are held out together. By hand the pose, of a
-    turn the pose before it.
-    """
-    time: np.ndarray
-    """Seconds since the first sample, shape (m,)."""
-    duration: np.ndarray | None = None
-    """Of each turn, s, shape (m,): residuals of turns times it are angles; None for poses."""
-    wanders: bool = False
-    """Whether a bias that moves in time is a part of its scatter."""
-
-
-@dataclass(frozen=True, eq=False)
-class RowSpace:
-    """Parameters of a search: those of the baseline, then one run per column set."""
-
-    parts: dict
-    """
-    Label of each run of columns (effect name, for a warm-up with the number of its time constant)
-    -> slice.
-    """
-    prior_sd: np.ndarray
-    """Shape (q,); wide for the baseline, which is linearised at its own solution."""
-    size: int
-    """Number of parameters."""
-
 
 GROUP_FOLDS = 12
 """Number of folds of the groups; with up to `ONE_BY_ONE` groups each group is a fold."""
@@ -96,8 +50,10 @@ class RowEvidence(Evidence):
 
     Parameters
     ----------
-    blocks : sequence of RowBlock
-    space : RowSpace
+    blocks : sequence of Rows
+        With all parameters, by their known variances.
+    prior_sd : array, shape (q,)
+        Of the parameters; wide for the baseline, which is linearised at its own solution.
     smooth : dict
         Sensor -> parameters of each effect that is smooth in time, included when the noise is
         estimated.
@@ -108,32 +64,37 @@ class RowEvidence(Evidence):
 
     def __init__(
         self,
-        blocks: Sequence[RowBlock],
-        space: RowSpace,
+        blocks: Sequence[Rows],
+        prior_sd: np.ndarray,
         smooth: Mapping[str, Sequence[tuple[int, ...]]],
         *,
         baseline: Sequence[int],
     ):
-        self.blocks = blocks
-        self.space = space
         # Smooth effects are included: the noise is not estimated from what they explain.
-        self._noise = []
+        self._weighted = []
         for block in blocks:
             acting = chain.from_iterable(smooth.get(block.sensor, ()))
-            self._noise.append(_noise(block, [*baseline, *acting]))
+            self._weighted.append(_with_noise(block, [*baseline, *acting]))
         self.groups = np.unique(np.concatenate([block.group for block in blocks]))
         """Numbers of the groups of rows, shape (n_groups,)."""
         n_folds = len(self.groups) if len(self.groups) <= ONE_BY_ONE else GROUP_FOLDS
-        self.folds = [np.searchsorted(self.groups, block.group) % n_folds for block in blocks]
-        self._white = self._whitened()
+        folds = [np.searchsorted(self.groups, block.group) % n_folds for block in blocks]
+        self._white = [flat(block.white()) for block in self._weighted]
         self._acting = [np.any(white != 0, axis=0) for white in self._white]
         """Of each block, the columns that are not zero."""
         self._sums: dict[tuple[int, tuple[int, ...]], float] = {}
         self._bases: dict[tuple[int, ...], np.ndarray] = {}
-        total = self._products(self._white)
-        without = [self._products(self._whitened(number)) for number in range(n_folds)]
+        without = []
+        for number in range(n_folds):
+            kept = [block.select(fold != number) for block, fold in zip(self._weighted, folds)]
+            without.append(normal_of_rows(kept, len(prior_sd)))
         super().__init__(
-            total, np.array(without), prior_sd=space.prior_sd, prior_mean=np.zeros(space.size)
+            blocks,
+            folds,
+            total=normal_of_rows(self._weighted, len(prior_sd)),
+            without=np.array(without),
+            prior_sd=prior_sd,
+            prior_mean=np.zeros(len(prior_sd)),
         )
 
     def fits_of_halves(
@@ -146,47 +107,8 @@ class RowEvidence(Evidence):
         for out in (second, first, none):
             # The effects are no noise: their parameters are part of the baseline.
             blocks = without_groups(self.blocks, out)
-            fits.append(RowEvidence(blocks, self.space, {}, baseline=used).fit(used))
+            fits.append(RowEvidence(blocks, self.prior_sd, {}, baseline=used).fit(used))
         return fits[0], fits[1], fits[2]
-
-    @staticmethod
-    def _products(white: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the normal matrix of white rows, shape (q + 1, q + 1)."""
-        return np.sum([rows.T @ rows for rows in white], axis=0)
-
-    def _whitened(self, number: int | None = None) -> list[np.ndarray]:
-        """
-        Return the rows of each block, without fold `number`.
-
-        As independent rows of unit variance, a list of (m, q + 1).
-        """
-        white = []
-        for block, (variance, processes), fold in zip(self.blocks, self._noise, self.folds):
-            kept = fold != number
-            whitening = Whitening(
-                variance[kept], block.time[kept], [np.arange(kept.sum())], processes=processes
-            )
-            white.append(whitening(block.rows[kept]).reshape(-1, self.space.size + 1))
-        return white
-
-    def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
-        """Return the residual rows of each block under the fit to all rows, shape (m, n_axes)."""
-        values = self.fit(used)[0]
-        return [
-            block.rows[:, :, -1] - block.rows[:, :, list(used)] @ values for block in self.blocks
-        ]
-
-    def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
-        """
-        Return the residual of every row under the fit without its fold.
-
-        Shape (m, n_axes) per block.
-        """
-        left = self.left_by_others(used)
-        return [
-            np.einsum('mac,mc->ma', block.rows, left[fold])
-            for block, fold in zip(self.blocks, self.folds)
-        ]
 
     def against_noise(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
@@ -204,14 +126,14 @@ class RowEvidence(Evidence):
         """Sensor -> number of the squares of each block."""
         found: dict[str, list[int]] = {}
         for block in self.blocks:
-            found.setdefault(block.sensor, []).append(block.known.size)
+            found.setdefault(block.sensor, []).append(block.variance.size)
         return {sensor: np.array(sizes) for sensor, sizes in found.items()}
 
     def _heldout(self, used: Sequence[int]) -> float:
         loss = 0.0
-        for residual, noise in zip(self.heldout_residuals(used), self._noise):
-            variance, processes = noise
-            squares = residual**2 / (variance + sum(process.sd**2 for process in processes))
+        for residual, block in zip(self.heldout_residuals(used), self._weighted):
+            of_processes = sum(process.sd**2 for process in block.processes)
+            squares = residual**2 / (block.variance + of_processes)
             loss += squares.size * np.log(squares.mean())
         return float(loss)
 
@@ -273,24 +195,25 @@ class RowEvidence(Evidence):
         return self._bases[used]
 
 
-def without_groups(blocks: Sequence[RowBlock], groups: np.ndarray) -> list[RowBlock]:
+def without_groups(blocks: Sequence[Rows], groups: np.ndarray) -> list[Rows]:
     """Return the blocks without some groups of rows; a block of few rows is omitted."""
     kept = [block.select(~np.isin(block.group, groups)) for block in blocks]
-    return [block for block in kept if block.known.size > FEWEST_SPARE_ROWS]
+    return [block for block in kept if block.variance.size > FEWEST_SPARE_ROWS]
 
 
-def _noise(block: RowBlock, used: Sequence[int]) -> tuple[np.ndarray, tuple[BiasProcess, ...]]:
+def _with_noise(block: Rows, used: Sequence[int]) -> Rows:
     """
-    Return (independent variance of each row (m, n_axes), bias processes).
+    Return the rows with their estimated noise.
 
-    Scatter between rows, and a bias process where the block wanders.
+    Scatter between rows, and a bias process where the bias drifts.
     """
-    count, axes, width = block.rows.shape
-    basis = orthonormal_basis(block.rows.reshape(-1, width)[:, used], DEPENDENT)
-    rows = np.concatenate([basis.reshape(count, axes, -1), block.rows[:, :, -1:]], axis=2)
-    likelihood = NoiseLikelihood(rows, block.known, block.time, sessions=[np.arange(count)])
+    count, axes, width = block.equations.shape
+    basis = orthonormal_basis(flat(block.equations)[:, used], DEPENDENT)
+    columns = basis.reshape(count, axes, -1)
+    of_choice = np.concatenate([columns, block.equations[:, :, -1:]], axis=2)
+    likelihood = NoiseLikelihood(replace(block, equations=of_choice))
     biases = [(0.0, BIAS_TIMES[0])]
-    if block.wanders:
+    if block.drift is not None:
         for share in BIASES[1:]:
             biases += [(share, time) for time in BIAS_TIMES]
     shapes = []
@@ -298,4 +221,5 @@ def _noise(block: RowBlock, used: Sequence[int]) -> tuple[np.ndarray, tuple[Bias
         shapes += [(offset, share * max(offset, 1.0), time) for share, time in biases]
     offset, bias, time = min(shapes, key=likelihood.loss)
     unit = likelihood.typical
-    return block.known + (offset * unit) ** 2, (BiasProcess(bias * unit, time),) if bias else ()
+    processes = (BiasProcess(bias * unit, time),) if bias else ()
+    return replace(block, variance=block.variance + (offset * unit) ** 2, processes=processes)

@@ -5,11 +5,12 @@ import scipy.linalg
 
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.model_error import ModelError, errors_of_waves, waves_of_blocks
-from imu_calibration.references.rows.row_estimate import RowEstimate, RowSet
+from imu_calibration.estimation.rows import Rows, flat
+from imu_calibration.references.rows.row_estimate import RowEstimate
 
 
 def model_error_of_rows(
-    rows: RowSet, found: RowEstimate, model: SensorModel, *, block: np.ndarray
+    rows: Rows, found: RowEstimate, model: SensorModel, *, block: np.ndarray
 ) -> ModelError:
     """
     Return the model error from the scatter of parameters between blocks of rows.
@@ -21,7 +22,7 @@ def model_error_of_rows(
 
     Parameters
     ----------
-    rows : RowSet
+    rows : Rows
         At the estimate.
     found : RowEstimate
     model : SensorModel
@@ -31,17 +32,16 @@ def model_error_of_rows(
 
     """
     # Rows of unit variance, the design without its part along the nuisances (F F' A).
-    root = np.sqrt(rows.variance(found.scatter))[:, None]
-    rest = rows.residual / root[:, 0]
-    fitted = scipy.linalg.qr(rows.nuisance / root, mode='economic')[0]
-    main = rows.main / root
-    main -= fitted @ (fitted.T @ main)
+    white = flat(rows.with_scatter(found.scatter.variance).white())
+    nuisances, main, rest = np.split(white, [rows.n_nuisances, white.shape[1] - 1], axis=1)
+    fitted = scipy.linalg.qr(nuisances, mode='economic')[0]
+    main = main - fitted @ (fitted.T @ main)
 
     information, gradient, shared = [], [], []
     for number in range(block.max() + 1):
         own = block == number
         information.append(main[own].T @ main[own])
-        gradient.append(main[own].T @ rest[own])
+        gradient.append(main[own].T @ rest[own, 0])
         shared.append(fitted[own].T @ main[own])
     waves = waves_of_blocks(
         np.array(information),

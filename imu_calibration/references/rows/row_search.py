@@ -6,19 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.core.progress import reported
-from imu_calibration.references.rows.row_evidence import (
-    RowBlock,
-    RowEvidence,
-    RowSpace,
-    without_groups,
-)
+from imu_calibration.estimation.rows import Rows
+from imu_calibration.references.rows.row_evidence import RowEvidence, without_groups
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
-from imu_calibration.selection.order_of_tests import (
-    Findings,
-    select_findings,
-    without_weakest,
-)
+from imu_calibration.selection.order_of_tests import EffectTests, Findings, select_findings
 from imu_calibration.selection.questions import Question, smooth_parameters
 from imu_calibration.selection.search import Search
 
@@ -31,16 +23,16 @@ class RowProblem:
 
     def __init__(
         self,
-        blocks: Sequence[RowBlock],
-        space: RowSpace,
+        blocks: Sequence[Rows],
+        prior_sd: np.ndarray,
         questions: Sequence[Question],
         *,
         baseline: Sequence[int],
     ):
         untimed = [question for question in questions if not question.effect.time_constant]
         smooth = smooth_parameters(untimed)
-        self.blocks, self.space, self.questions = blocks, space, questions
-        self.evidence = RowEvidence(blocks, space, smooth, baseline=baseline)
+        self.blocks, self.questions = blocks, questions
+        self.evidence = RowEvidence(blocks, prior_sd, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)
         self.explained = Explained(
             self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf
@@ -49,7 +41,8 @@ class RowProblem:
     def without(self, groups: np.ndarray) -> 'RowProblem':
         """Return the same problem without some groups of rows."""
         blocks = without_groups(self.blocks, groups)
-        return RowProblem(blocks, self.space, self.questions, baseline=self.search.baseline)
+        prior_sd = self.evidence.prior_sd
+        return RowProblem(blocks, prior_sd, self.questions, baseline=self.search.baseline)
 
     def gain(
         self,
@@ -63,17 +56,15 @@ class RowProblem:
         Return the Gain of one choice over another on rows held out from both fit and choice.
         """
         block = self.clearest(before, after, sensor)
-        pair = [np.full(block.known.shape, np.nan) for _ in range(2)]
+        pair = [np.full(block.variance.shape, np.nan) for _ in range(2)]
         for part in held_out:
             rows = np.isin(block.group, part.groups)
             for residual, choice in zip(pair, (before, after)):
                 values = part.problem.search.values(part.named_in(choice))
-                residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
+                residual[rows] = block.select(rows).residuals_at(np.append(-values, 1.0))
         return gain_of_groups(block, pair)
 
-    def clearest(
-        self, before: Sequence[Question], after: Sequence[Question], sensor: str
-    ) -> RowBlock:
+    def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Rows:
         """
         Return the rows of a sensor in which one choice improves most over another.
 
@@ -96,7 +87,7 @@ class ChoiceWithout:
 
     groups: np.ndarray
     """Groups that are held out, shape (n,)."""
-    named: list[Question]
+    named: Sequence[Question]
     """Findings without them."""
     problem: RowProblem
     """The problem without them."""
@@ -124,56 +115,48 @@ def choose_effects(problem: RowProblem) -> RowChoice:
     problem : RowProblem
 
     """
-    tests = RowTests(problem)
+    tests = RowTests(problem, problem.explained)
     found = select_findings(tests, problem.search.run())
     return RowChoice(found.named, found.unstable, tests.held_out)
 
 
 @dataclass(eq=False)
-class RowTests:
-    """The tests of a choice on few rows (`EffectTests`)."""
+class RowTests(EffectTests):
+    """The tests of a choice on few rows."""
 
     problem: RowProblem
+    explained: Explained
     held_out: list[ChoiceWithout] = field(default_factory=list)
     """The search without each part of the groups; empty before it is needed."""
 
-    def explaining(self, chosen: Sequence[Question]) -> list[Question]:
+    def preferred(self, named: Sequence[Question]) -> Sequence[Question]:
         """
-        Return the effects of which each explains most of the excess variance.
+        Return the effects, or others of any size where an excess remains that these reduce.
 
         Sizes beyond the range of known instruments are tested only for the remaining excess.
         """
-        explained = self.problem.explained
-        named = list(pruned(chosen, explained.share))
+        explained = self.explained
         if not explained.rest(named):
             return named
         wide = self.problem.search.asking_any_size()
-        others = list(pruned(wide.run(), explained.share))
+        others = pruned(wide.run(), explained.share)
         if not explained.rest(others) < explained.rest(named):
             return named
         self.problem.search = wide
         return others
 
-    def predicting(self, named: Sequence[Question]) -> list[Question]:
-        """Return the findings that improve the prediction of rows held out from their choice."""
-        if named and not self.held_out:
+    def least_predicting(self, kept: list[Question]) -> int | None:
+        """Return the last finding that does not improve the prediction of held-out rows."""
+        if not self.held_out:
             self.held_out = _held_out(self.problem)
-
-        def last_poor(kept: list[Question]) -> int | None:
-            poor = None
-            for place, question in enumerate(kept):
-                gain = self.problem.gain(
-                    self.held_out, kept[:place], kept[: place + 1], sensor=question.sensor
-                )
-                if not gain.ci95[0] > 0:
-                    poor = place
-            return poor
-
-        return without_weakest(named, last_poor)
-
-    def significant(self, named: Sequence[Question]) -> Sequence[Question]:
-        """Return all: each predicts rows that were held out from the choice."""
-        return named
+        poor = None
+        for place, question in enumerate(kept):
+            gain = self.problem.gain(
+                self.held_out, kept[:place], kept[: place + 1], sensor=question.sensor
+            )
+            if not gain.ci95[0] > 0:
+                poor = place
+        return poor
 
 
 def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
@@ -184,19 +167,19 @@ def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
     for number in reported('repeating the search', range(times), times):
         out = groups[number::times]
         smaller = problem.without(out)
-        named = RowTests(smaller).explaining(smaller.search.run())
+        named = RowTests(smaller, smaller.explained).explaining(smaller.search.run())
         found.append(ChoiceWithout(out, named, smaller))
     return found
 
 
-def gain_of_groups(block: RowBlock, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
+def gain_of_groups(block: Rows, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
     """
     Return the Gain from residuals of each row of a block before and after.
 
     Shape (m, n), resampled by group.
     """
     place = np.unique(block.group, return_inverse=True)[1]
-    numbers = np.bincount(place) * block.known.shape[1]
+    numbers = np.bincount(place) * block.variance.shape[1]
     return gain_of(
         block.sensor,
         block.name,

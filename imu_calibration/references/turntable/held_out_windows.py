@@ -36,7 +36,7 @@ from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.accumulator import stack
-from imu_calibration.references.turntable.estimation.accumulated_rows import one_attitude
+from imu_calibration.references.turntable.estimation.one_attitude import one_attitude
 from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldOut
 from imu_calibration.references.turntable.window_statistics import (
     N_AXES,

@@ -13,7 +13,6 @@ import numpy as np
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.estimation.sensor_noise import BiasProcess, SensorNoise, means_beside_middles
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.whitening import Whitening
 
 SAME_VARIANCE = 0.05
 """Relative change of variance up to which two noise models weigh rows alike."""
@@ -249,46 +248,3 @@ class NoiseModel(SensorNoise):
 def noise_of_windows(solution: Solution) -> dict[str, NoiseModel]:
     """Return the noise of a solution on a table: sensor -> NoiseModel."""
     return cast(dict[str, NoiseModel], solution.noise)
-
-
-def sessions_of(rows: Sequence) -> list[np.ndarray]:
-    """Return the index arrays of the rows of each recording, in order of time."""
-    numbers = np.array([row.session for row in rows])
-    times = np.array([row.time for row in rows])
-    return [
-        np.flatnonzero(numbers == number)[np.argsort(times[numbers == number], kind='stable')]
-        for number in np.unique(numbers)
-    ]
-
-
-def predict_session_offsets(
-    misfit: np.ndarray,
-    variance: np.ndarray,
-    times: np.ndarray,
-    *,
-    sessions: list[np.ndarray],
-    noise: NoiseModel,
-) -> np.ndarray:
-    """
-    Return the offset of each session, shape (n_sessions, 3).
-
-    The weighted mean of its residuals, drawn towards zero by its noise.
-
-    Parameters
-    ----------
-    misfit, variance : ndarray, shape (n, 3)
-        Residuals of the window means and the independent part of their variance.
-    noise : NoiseModel
-
-    """
-    rows = Whitening(variance, times, sessions, processes=noise.bias_processes)(
-        np.stack([np.ones_like(misfit), misfit], axis=2)
-    )
-    ones, rest = np.moveaxis(rows, 2, 0)
-    parts = ((ones[index], rest[index]) for index in sessions)
-    return np.array(
-        [
-            (one * left).sum(axis=0) / ((one**2).sum(axis=0) + 1 / noise.session_variance)
-            for one, left in parts
-        ]
-    )

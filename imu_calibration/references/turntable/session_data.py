@@ -14,7 +14,8 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.gauss_newton import after_one_step
-from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
+from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.estimation.rows import flat
 from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.joint_motion import JointMotion
@@ -317,20 +318,19 @@ class HeldOut:
         model, prior, values = solution.model, make_prior(solution.model), solution.values
         free = ~fixed_parameters(model) & ~solution.held
         parts = [
-            _linearised(self.blocks[fold::TABLE_FOLDS], solution, prior)
-            for fold in range(TABLE_FOLDS)
+            _linearised(self.blocks[fold::TABLE_FOLDS], solution) for fold in range(TABLE_FOLDS)
         ]
-        known = np.column_stack([prior.root, prior.root @ (values - prior.mean)])
+        known = np.column_stack([prior.root, prior.root @ (prior.mean - values)])
         found = []
         for fold in range(TABLE_FOLDS):
             rows = np.concatenate([known, *(part for k, part in enumerate(parts) if k != fold)])
-            found.append(after_one_step(values, rows[:, :-1][:, free], -rows[:, -1], free=free))
+            found.append(after_one_step(values, rows[:, :-1][:, free], rows[:, -1], free=free))
         return found
 
 
-def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution, prior: Prior) -> np.ndarray:
+def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution) -> np.ndarray:
     """
-    Return the triangular factor of ``[derivative of the residuals | residuals]``.
+    Return the triangular factor of ``[columns | residual]``.
 
     It covers all windows of some blocks, weighed by noise.
     """
@@ -342,8 +342,7 @@ def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution, prior: Prior
                 sensor: system.factors(sensor, noise)
                 for sensor, noise in noise_of_windows(solution).items()
             }
-            residuals = system.residuals(solution.values, factors)[: -len(prior.root)]
-            rows.append(np.column_stack([system.jacobian(solution.values, factors), residuals]))
+            rows.append(flat(system.linearise(solution.values, factors).equations))
     return triangular(np.concatenate(rows)) if rows else np.zeros((0, n_params + 1))
 
 

@@ -15,7 +15,7 @@ from imu_calibration.effects.base import INPUT_OF, Effect, Role
 from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.forward_equations import coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.references.turntable.estimation.accumulated_rows import AccumulatedRows
+from imu_calibration.references.turntable.accumulator import Accumulator
 
 LEAST_INPUT = {'accelerometer': 1.0, 'gyroscope': 0.1}
 """
@@ -27,7 +27,7 @@ place of an effect that compensation cannot undo: 0.1 g, and 6 deg/s.
 def uncorrected_on_table(
     model: SensorModel,
     values: np.ndarray,
-    accumulator: AccumulatedRows,
+    accumulator: Accumulator,
     *,
     gathered: SensorModel,
     latest: SensorModel | None = None,
@@ -40,7 +40,7 @@ def uncorrected_on_table(
     model : SensorModel
         At the point of its `values`.
     values : array, shape (n_params,)
-    accumulator : AccumulatedRows
+    accumulator : Accumulator
         Windows with the columns of `gathered`.
     gathered : SensorModel
     latest : SensorModel, optional
@@ -94,7 +94,7 @@ class _Samples:
     """Columns of the true input."""
 
     @classmethod
-    def of(cls, accumulator: AccumulatedRows, sensor: str, true_input: slice) -> '_Samples':
+    def of(cls, accumulator: Accumulator, sensor: str, true_input: slice) -> '_Samples':
         """Return the columns of a sensor in the windows of an accumulator."""
         counts = np.array([row.count for row in accumulator.rows], float)
         means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
@@ -163,6 +163,6 @@ def _moved(effect: Effect, part: ColumnCentre, change: np.ndarray) -> ColumnCent
     )
 
 
-def end_of(accumulator: AccumulatedRows) -> float:
+def end_of(accumulator: Accumulator) -> float:
     """Return the end of the longest recording, s since its start."""
     return max(row.time + row.duration / 2 for row in accumulator.rows)

@@ -35,9 +35,9 @@ from imu_calibration.effects.forward_equations import (
 )
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import GRAVITY, Solution, common_scale, with_term
-from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
@@ -47,7 +47,7 @@ from imu_calibration.references.turntable import latitude_check, mount_check
 from imu_calibration.references.turntable.document_parts import gauge_of, statistics
 from imu_calibration.references.turntable.held_out_windows import HeldOutWindows, nominal_values
 from imu_calibration.references.turntable.needs import motions_needed, weak_on_table
-from imu_calibration.references.turntable.noise_model import noise_of_windows, sessions_of
+from imu_calibration.references.turntable.noise_model import noise_of_windows
 from imu_calibration.references.turntable.observability import tolerance_scaled_singular_values
 from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
 from imu_calibration.references.turntable.residuals.residual_blocks import residuals
@@ -195,6 +195,7 @@ def parameter_shifts(
     kinds = [source.kind for source in sources]
     counts = np.array([source.samples for source in sources])
     times = np.array([source.time for source in sources])
+    sessions = np.array([source.session for source in sources])
 
     # Normal equations of the solver: A' V^-1 A, and A' V^-1 dA c of each window and change.
     prior = make_prior(solution.model)
@@ -207,7 +208,14 @@ def parameter_shifts(
         # The means of all windows, correlated through the bias.
         means = np.array([design.mean(axis=0) for design in designs])
         variance = noise.mean_variance(kinds, counts) + noise.offset_sd**2
-        whitening = Whitening(variance, times, sessions_of(sources), processes=noise.bias_processes)
+        rows = Rows(
+            equations=means,
+            variance=variance,
+            processes=noise.bias_processes,
+            time=times,
+            session=sessions,
+        )
+        whitening = rows.whitening()
         weighted = whitening.adjoint(whitening(means))
         normal = normal + np.tensordot(weighted, means, ([0, 1], [0, 1]))
 

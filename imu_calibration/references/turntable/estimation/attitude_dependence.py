@@ -5,11 +5,11 @@ import numpy as np
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.estimation.rows import flat
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.estimation.solution import AttitudeDependence
-from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
-from imu_calibration.references.turntable.noise_model import NoiseModel, sessions_of
+from imu_calibration.references.turntable.noise_model import NoiseModel
 
 MIN_SPARE = 6
 """Fewest degrees of freedom that must remain after the fit of the attitude."""
@@ -44,32 +44,25 @@ def attitude_dependence(
         Of the sensor.
 
     """
-    still = np.flatnonzero(np.array(system.kinds) == 'static')
+    still = np.flatnonzero(~system.moving)
     model = system.model
     # The rows of the accelerometer contain the attitude.
     if len(still) == 0 or 'accelerometer' not in system.sensors:
         return None
 
-    # Rows of the rests, of each axis: [design | f and its products | residual].
-    means = system.means[sensor][still]
+    # Rows of the means, of each axis: [design | f and its products | residual].
+    means = system.means[sensor]
     design = np.einsum('kp,paq->kaq', means[:, :-3], coefficient_jacobian(model, sensor, values))
     misfit = system.misfit(sensor, means, values)
     of_force = model.columns_of('accelerometer', Role.LINEAR)
-    force = system.means['accelerometer'][still][:, of_force]
+    force = system.means['accelerometer'][:, of_force]
     first, second = PRODUCT_AXES
     shapes = np.concatenate([force, force[:, first] * force[:, second]], axis=1)
-    candidates = np.einsum('ks,ab->kabs', shapes, np.eye(3)).reshape(len(still), 3, -1)
-    rows = np.concatenate([design, candidates, misfit[:, :, None]], axis=2)
+    candidates = np.einsum('ks,ab->kabs', shapes, np.eye(3)).reshape(len(means), 3, -1)
+    equations = np.concatenate([design, candidates, misfit[:, :, None]], axis=2)
 
     # Independent rows of unit variance.
-    whitening = Whitening(
-        system.mean_variance(noise)[still] + noise.offset_sd**2,
-        system.times[still],
-        sessions_of([system.accumulator.rows[int(index)] for index in still]),
-        processes=noise.bias_processes,
-        session_variance=noise.session_variance,
-    )
-    white = whitening(rows).reshape(3 * len(still), -1)
+    white = flat(system.mean_rows(equations, noise).select(still).white())
     n_design = design.shape[2]
 
     # S0: without the part along the design. S1: also without the attitude.

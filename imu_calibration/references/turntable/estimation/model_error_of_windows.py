@@ -77,9 +77,7 @@ def _block_scores(
     blocks = system.accumulator.blocks
     information = np.zeros((len(blocks), len(values), len(values)))
     gradient = np.zeros((len(blocks), len(values)))
-    block = system.accumulator.block_of(
-        np.array([row.session for row in system.accumulator.rows]), system.times
-    )
+    block = system.accumulator.block_of(system.session, system.time)
     for sensor in system.sensors:
         own = coefficients(system.model, sensor, values)
         slope = coefficient_jacobian(system.model, sensor, values)

@@ -15,7 +15,8 @@ from imu_calibration.estimation.noise_likelihood import (
     NoiseLikelihood,
     NoiseShape,
 )
-from imu_calibration.estimation.sensor_noise import BiasProcess, dof_factor
+from imu_calibration.estimation.rows import Rows
+from imu_calibration.estimation.sensor_noise import dof_factor
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
 """
@@ -49,16 +50,7 @@ and of the root of two.
 """
 
 
-def estimate_offsets(
-    rows: np.ndarray,
-    white: np.ndarray,
-    times: np.ndarray,
-    *,
-    sessions: list[np.ndarray],
-    information: np.ndarray,
-    known: tuple[BiasProcess, ...] = (),
-    durations: np.ndarray | float = 0.0,
-) -> dict[str, Any]:
+def estimate_offsets(rows: Rows) -> dict[str, Any]:
     """
     Return the fields of `NoiseModel` that concern offsets.
 
@@ -72,25 +64,18 @@ def estimate_offsets(
 
     Parameters
     ----------
-    rows, white, times, sessions, information, known, durations
-        As in `NoiseLikelihood`.
+    rows : Rows
+        Of means, as in `NoiseLikelihood`.
 
     """
-    likelihood = NoiseLikelihood(
-        rows,
-        white,
-        times,
-        sessions=sessions,
-        information=information,
-        known=known,
-        durations=durations,
-    )
+    likelihood = NoiseLikelihood(rows)
+    n_sessions = len(rows.sessions)
     search = _Search(likelihood)
     trials, costs = search.grid(0.0)
 
     # A bias for each recording, if the likelihood gains enough over the best fit without.
     session = 0.0
-    if len(sessions) > 1:
+    if n_sessions > 1:
         likeliest = search.best_session(trials[np.argmin(costs)])
         if likeliest > 0:
             with_biases = search.grid(likeliest)
@@ -100,7 +85,7 @@ def estimate_offsets(
     shape = search.conclusion(trials, costs, session)
     typical = likelihood.typical
     # The few recordings widen the variance that enters standard deviations.
-    dof = 3 * (len(sessions) - 1)
+    dof = 3 * (n_sessions - 1)
     factor = float(dof_factor(dof)) if dof else 1.0
     return {
         'offset_sd': shape.offset * typical,

@@ -8,7 +8,6 @@ import numpy as np
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.prior import fixed_parameters
 from imu_calibration.estimation.sensor_noise import BiasProcess
-from imu_calibration.references.turntable.estimation.accumulated_rows import MeanRows
 from imu_calibration.references.turntable.estimation.noise_search import estimate_offsets
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
 from imu_calibration.references.turntable.noise_model import (
@@ -16,6 +15,7 @@ from imu_calibration.references.turntable.noise_model import (
     NoiseModel,
     ReferenceNoise,
 )
+from imu_calibration.references.turntable.window_statistics import WindowStatistics
 
 MIN_VARIANCE_RATIO = 2.0
 """
@@ -217,7 +217,9 @@ LEAST_MOVING_VARIANCE = 1e-30
 """Least variance of the noise from moving windows, above zero."""
 
 
-def white_noise(rows: Sequence[MeanRows], sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
+def white_noise(
+    rows: Sequence[WindowStatistics], sensor: str
+) -> tuple[np.ndarray, np.ndarray] | None:
     """
     Return (white_variance, inflation) pooled over static windows, each shape (3,).
 
@@ -229,7 +231,7 @@ def white_noise(rows: Sequence[MeanRows], sensor: str) -> tuple[np.ndarray, np.n
 
     Parameters
     ----------
-    rows : sequence of MeanRows
+    rows : sequence of WindowStatistics
 
     """
     static = _rests(rows, sensor)
@@ -264,7 +266,7 @@ def white_noise(rows: Sequence[MeanRows], sensor: str) -> tuple[np.ndarray, np.n
     return np.maximum(pooled, LEAST_NOISE[sensor] ** 2), factors
 
 
-def _rests(rows: Sequence[MeanRows], sensor: str) -> list[MeanRows]:
+def _rests(rows: Sequence[WindowStatistics], sensor: str) -> list[WindowStatistics]:
     """Return the static windows of which the variance of a sensor is known."""
     found = []
     for row in rows:
@@ -290,7 +292,9 @@ def _usual(variances: np.ndarray, inflations: np.ndarray) -> tuple[float, bool]:
     return median, False
 
 
-def shaken_means(rows: Sequence[MeanRows], sensor: str) -> dict[tuple[int, float], np.ndarray]:
+def shaken_means(
+    rows: Sequence[WindowStatistics], sensor: str
+) -> dict[tuple[int, float], np.ndarray]:
     """
     Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level.
     """
@@ -329,8 +333,7 @@ def first_noise(
 def _at_rest(system: WeightedSystem, sensor: str, values: np.ndarray) -> NoiseModel:
     """Return the noise from static windows; without one, from the residuals of moving windows."""
     rows = system.accumulator.rows
-    largest_step = max(row.encoder_step for row in rows)
-    reference = ReferenceNoise.of_steps(largest_step, sensor)
+    reference = ReferenceNoise.of_steps(system.encoder_step, sensor)
     white = white_noise(rows, sensor)
     if white is not None:
         return NoiseModel(*white, reference=reference, shaken=shaken_means(rows, sensor))
@@ -371,18 +374,8 @@ def updated_noise(
     noise = replace(noise, moving=moving)
 
     # Means: offsets of windows and bias processes.
-    rows, information = system.linearised(sensor, values, noise)
-    white = system.mean_variance(noise, beside_bias=False)
-    offsets = estimate_offsets(
-        rows,
-        white,
-        system.times,
-        sessions=system.sessions,
-        information=information,
-        known=noise.known,
-        durations=system.durations,
-    )
-    return replace(noise, **offsets)
+    rows = system.without_offsets(system.linearised(sensor, values, noise), noise)
+    return replace(noise, **estimate_offsets(rows))
 
 
 def _judged(system: WeightedSystem, sensor: str, kind: str, values: np.ndarray) -> BandMisfit:

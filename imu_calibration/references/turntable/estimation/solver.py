@@ -1,39 +1,41 @@
 """Weighted least squares over all windows: noise, outliers, held parameters, covariance."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.estimate import estimate
 from imu_calibration.estimation.gauss_newton import gauss_newton, halved
 from imu_calibration.estimation.held_parameters import Factors, undetermined_parameters, weak_alone
 from imu_calibration.estimation.prior import fixed_parameters
-from imu_calibration.estimation.scaled_solve import covariance_with_held, scaled_lstsq
+from imu_calibration.estimation.rows import Rows
+from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.solution import (
     AttitudeDependence,
     Solution,
-    terms_of_fit,
+    total,
 )
-from imu_calibration.references.turntable.estimation.accumulated_rows import (
-    AccumulatedRows,
-    not_separable,
-)
+from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.estimation.attitude_dependence import attitude_dependence
 from imu_calibration.references.turntable.estimation.implausible_parameters import (
     implausible_parameters,
 )
 from imu_calibration.references.turntable.estimation.model_error_of_windows import model_error
+from imu_calibration.references.turntable.estimation.one_attitude import not_separable
 from imu_calibration.references.turntable.estimation.session_noise import (
     first_noise,
     moving_misfit,
     updated_noise,
 )
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
+from imu_calibration.references.turntable.estimation.window_means import predict_session_offsets
 from imu_calibration.references.turntable.estimation.window_outliers import outlier_windows
-from imu_calibration.references.turntable.noise_model import NoiseModel, predict_session_offsets
+from imu_calibration.references.turntable.noise_model import NoiseModel
 
 NOISE_ROUNDS = 6
 """Largest number of alternating estimates of noise and parameters."""
@@ -56,7 +58,7 @@ Noises = dict[str, NoiseModel]
 
 
 def solve(
-    accumulator: AccumulatedRows,
+    accumulator: Accumulator,
     model: SensorModel,
     *,
     allow_holding: bool = True,
@@ -72,7 +74,7 @@ def solve(
 
     Parameters
     ----------
-    accumulator : AccumulatedRows
+    accumulator : Accumulator
         Rows of windows, reduced with the columns of `model`.
     model : SensorModel
     allow_holding : bool
@@ -100,106 +102,162 @@ def solve(
             code='no_windows',
         )
     system = WeightedSystem(accumulator, model)
-    prior = system.prior
-    free = ~fixed_parameters(model)
-
-    # Noise, first values, and windows that deviate.
+    problem = _WindowProblem(system, allow_holding, noises_are_known=noise is not None)
     values = start(system)
     noises = noise or first_noise(system, values, bias_processes or {})
-    if noise is None:
-        values, noises = _with_estimated_noise(system, values, noises, free)
+    found = estimate(problem, _Fit(values, noises))
+    values = found.state.values
+    noises = found.state.noises
 
-    # Parameters that the data do not determine are fixed at their prior.
-    factors = _factors(system, noises)
-    values = _minimised(system, values, factors, free)
-    data = system.jacobian(values, factors)
-    held = undetermined_parameters(
-        np.concatenate([data, prior.root]),
-        prior.sd,
-        free=free,
-        held=free & weak_alone(data, prior.sd),
-        tie=EQUALLY_WEAK,
-    )
-    held |= not_separable(accumulator, model)
-    _refuse_held(held, free, model, allow_holding)
-
-    # Values that only misfit gives are fixed too: solve without them, until all are plausible.
-    not_believed: dict[str, float] = {}
-    while True:
-        estimated = free & ~held
-        if held.any():
-            values = _minimised(system, np.where(held, prior.mean, values), factors, estimated)
-        data = system.jacobian(values, factors)
-        rows = np.concatenate([data, prior.root])
-        own, of_held = covariance_with_held(rows, estimated, held, prior_sd=prior.sd)
-        sd = np.sqrt(np.diag(own + of_held))
-        implausible = implausible_parameters(system, values, sd=sd, noises=noises, free=estimated)
-        nothing_remains = (held | implausible | ~free).all()
-        if not allow_holding or not implausible.any() or nothing_remains:
-            break
-        for name, value, flag in zip(model.param_names, values, implausible):
-            if flag:
-                not_believed[name] = float(value)
-        held |= implausible
-
-    # The covariance as a sum of named terms: C = C_noise + C_bias + C_held + C_model.
-    of_bias = own @ system.bias_information(values, noises) @ own
-    of_model = model_error(system, values, noises, free=free & ~held)
-    terms = {**terms_of_fit(own, of_bias, of_held), **of_model.terms(own + of_held)}
+    data = system.linearise(values, found.state.factors).columns
+    of_model = model_error(system, values, noises, free=found.free)
     quality = _fit_quality(system, values, noises)
     return Solution(
         model,
         values,
-        terms,
-        held,
+        {**found.terms, **of_model.terms(total(found.terms))},
+        found.held,
         noises,
         quality.chi2,
         data.T @ data,
         quality.rms,
         _session_biases(system, values, noises),
-        not_believed,
+        {model.param_names[number]: value for number, value in found.not_believed.items()},
         slow_over_fast=quality.slow_over_fast,
         attitude=quality.attitude,
     )
 
 
-def _with_estimated_noise(
-    system: WeightedSystem, values: np.ndarray, noises: Noises, free: np.ndarray
-) -> tuple[np.ndarray, Noises]:
-    """Return (values, noise) without the windows that deviate; one outlier may hide another."""
-    values, noises = _alternately(system, values, noises, free)
-    for _ in range(LEAVING_ROUNDS):
-        more = outlier_windows(system, values, noises)
-        if not any(more.values()):
-            break
-        without = {}
-        for sensor in system.sensors:
-            left_out = noises[sensor].left_out | more[sensor]
-            without[sensor] = replace(noises[sensor], left_out=left_out)
-        values, noises = _alternately(system, values, without, free)
-    return values, noises
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Values of the parameters, and the noise with which the rows are weighted."""
+
+    values: np.ndarray
+    """Shape (n_params,)."""
+    noises: Noises
+    factors: Factors = field(default_factory=dict)
+    """Triangular factors of the weighted rows; none before the noise is known."""
 
 
-def _alternately(
-    system: WeightedSystem, values: np.ndarray, noises: Noises, free: np.ndarray
-) -> tuple[np.ndarray, Noises]:
-    """
-    Return (values, noise), estimated alternately.
+@dataclass(frozen=True, eq=False)
+class _WindowProblem:
+    """Estimate from accumulated windows (`EstimateProblem`)."""
 
-    One round usually suffices: the likelihood of the offsets is restricted, so it does not depend
-    on the values of the parameters. With separate weights of slow and fast parts, weights and
-    parameters depend on each other.
-    """
-    for _ in range(NOISE_ROUNDS):
-        factors = _factors(system, noises)
-        values = _minimised(system, values, factors, free, enough=SMALL_STEP_OF_NOISE)
-        before = noises
-        noises = {}
-        for sensor in system.sensors:
-            noises[sensor] = updated_noise(system, sensor, values, noise=before[sensor])
-        if all(noises[sensor].weighs_alike(before[sensor]) for sensor in system.sensors):
-            break
-    return values, noises
+    system: WeightedSystem
+    allow_holding: bool
+    """Whether parameters may be fixed at their prior."""
+    noises_are_known: bool
+    """Whether the noise is not estimated."""
+
+    @property
+    def prior_sd(self) -> np.ndarray:
+        return self.system.prior.sd
+
+    @property
+    def asked(self) -> np.ndarray:
+        return ~fixed_parameters(self.system.model)
+
+    def fitted(self, fit: _Fit) -> _Fit:
+        """Return the values with the noise, without the windows that deviate."""
+        if not self.noises_are_known:
+            fit = self._alternately(fit)
+            # One outlier may hide another.
+            for _ in range(LEAVING_ROUNDS):
+                more = outlier_windows(self.system, fit.values, fit.noises)
+                if not any(more.values()):
+                    break
+                without = {}
+                for sensor, noise in fit.noises.items():
+                    without[sensor] = replace(noise, left_out=noise.left_out | more[sensor])
+                fit = self._alternately(_Fit(fit.values, without))
+        return self._minimised(fit.values, self._weighed(fit), self.asked)
+
+    def _alternately(self, fit: _Fit) -> _Fit:
+        """
+        Return values and noise, estimated alternately.
+
+        One round usually suffices: the likelihood of the offsets is restricted, so it does not
+        depend on the values of the parameters. With separate weights of slow and fast parts,
+        weights and parameters depend on each other.
+        """
+        for _ in range(NOISE_ROUNDS):
+            before = self._weighed(fit)
+            values = self._minimised(fit.values, before, self.asked, SMALL_STEP_OF_NOISE).values
+            noises = {}
+            for sensor, noise in before.noises.items():
+                noises[sensor] = updated_noise(self.system, sensor, values, noise=noise)
+            fit = _Fit(values, noises)
+            if all(noises[sensor].weighs_alike(before.noises[sensor]) for sensor in noises):
+                break
+        return fit
+
+    def _weighed(self, fit: _Fit) -> _Fit:
+        """Return the same with the triangular factors of rows weighted by the noise."""
+        factors = {}
+        for sensor in self.system.sensors:
+            factors[sensor] = self.system.factors(sensor, fit.noises[sensor])
+        return replace(fit, factors=factors)
+
+    def _minimised(
+        self, values: np.ndarray, fit: _Fit, free: np.ndarray, enough: float = SMALL_STEP
+    ) -> _Fit:
+        """Return the values of least cost; steps below `enough` sds are the last."""
+        squares = _WindowSquares(self.system, fit.factors, free, enough)
+        last = gauss_newton(squares, squares.at(values), n_steps=MAX_SOLVE_STEPS)
+        return replace(fit, values=last.values)
+
+    def undetermined(self, fit: _Fit) -> np.ndarray:
+        """Return the parameters that the windows do not determine or separate."""
+        rows = self.weighted(fit)
+        held = undetermined_parameters(
+            rows.design,
+            self.prior_sd,
+            free=self.asked,
+            held=self.asked & weak_alone(rows.data, self.prior_sd),
+            tie=EQUALLY_WEAK,
+        )
+        held |= not_separable(self.system.accumulator, self.system.model)
+        _refuse_held(held, self.asked, self.system.model, self.allow_holding)
+        return held
+
+    def holding(self, fit: _Fit, held: np.ndarray) -> _Fit:
+        """Return the values with the held ones at their prior; the noise depends little on them."""
+        if not held.any():
+            return fit
+        values = np.where(held, self.system.prior.mean, fit.values)
+        return self._minimised(values, fit, self.asked & ~held)
+
+    def weighted(self, fit: _Fit) -> '_WeightedWindows':
+        """Return the rows at a fit."""
+        data = self.system.linearise(fit.values, fit.factors).columns
+        return _WeightedWindows(self.system, fit, data)
+
+    def not_believed(self, fit: _Fit, free: np.ndarray, sd: np.ndarray) -> Mapping[int, float]:
+        """Return the values that misfit gives, unless no parameter would remain."""
+        implausible = implausible_parameters(
+            self.system, fit.values, sd=sd, noises=fit.noises, free=free
+        )
+        if not self.allow_holding or not (free & ~implausible).any():
+            return {}
+        return {int(number): float(fit.values[number]) for number in np.flatnonzero(implausible)}
+
+
+@dataclass(frozen=True, eq=False)
+class _WeightedWindows:
+    """Rows of all windows (`WeightedRows`)."""
+
+    system: WeightedSystem
+    fit: _Fit
+    data: np.ndarray
+    """Columns without the prior, shape (m, n_params)."""
+
+    @property
+    def design(self) -> np.ndarray:
+        return np.concatenate([self.data, self.system.prior.root])
+
+    def scatter_term(self, own: np.ndarray) -> np.ndarray:
+        """Return the part of the covariance that is due to offsets and bias processes."""
+        return own @ self.system.bias_information(self.fit.values, self.fit.noises) @ own
 
 
 def _refuse_held(
@@ -229,7 +287,7 @@ def start(system: WeightedSystem) -> np.ndarray:
     model = system.model
     values = model.start()
     values = np.where(np.isfinite(values), values, 0.0)
-    weight = np.sqrt(system.counts / system.counts.max())[:, None]
+    weight = np.sqrt(system.count / system.count.max())[:, None]
     nominal = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     penalty = START_PENALTY * np.eye(4)
     for sensor in system.sensors:
@@ -245,24 +303,19 @@ def start(system: WeightedSystem) -> np.ndarray:
     return values
 
 
-def _factors(system: WeightedSystem, noises: Noises) -> Factors:
-    """Return the triangular factors of the whitened rows of both sensors."""
-    return {sensor: system.factors(sensor, noises[sensor]) for sensor in system.sensors}
-
-
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """Values of the parameters with their residuals."""
+    """Values of the parameters with their rows."""
 
     values: np.ndarray
     """Shape (n_params,)."""
-    residual: np.ndarray
-    """Whitened residuals, those of the prior last, shape (m,)."""
+    rows: Rows
+    """Weighted, those of the prior last."""
 
     @property
     def cost(self) -> float:
         """Sum of squares."""
-        return float(self.residual @ self.residual)
+        return float(self.rows.residual @ self.rows.residual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,15 +341,17 @@ class _WindowSquares:
     """Length of the last step."""
 
     def at(self, values: np.ndarray) -> _Point:
-        """Return values with their residuals."""
-        return _Point(values, self.system.residuals(values, self.factors))
+        """Return values with their rows."""
+        prior = self.system.prior
+        rows = self.system.linearise(values, self.factors)
+        return _Point(values, rows.with_prior(prior.mean - values, prior.root))
 
     def step(self, point: _Point) -> _Step:
         """Return the step from a point."""
         prior = self.system.prior
-        data = self.system.jacobian(point.values, self.factors)[:, self.free]
-        rows = np.concatenate([data, prior.root[:, self.free]])
-        change = scaled_lstsq(rows, -point.residual)
+        columns = point.rows.columns[:, self.free]
+        change = scaled_lstsq(columns, point.rows.residual)
+        data = columns[: -len(prior.root)]
         information = (data**2).sum(axis=0) + 1 / prior.sd[self.free] ** 2
         return _Step(change, float(np.max(np.abs(change) * np.sqrt(information), initial=0.0)))
 
@@ -313,18 +368,6 @@ class _WindowSquares:
     def is_last(self, point: _Point, step: _Step) -> bool:
         """Return whether a step is small; a large misfit limits the accuracy."""
         return step.length < self.enough * max(1.0, 1e-7 * np.sqrt(point.cost))
-
-
-def _minimised(
-    system: WeightedSystem,
-    values: np.ndarray,
-    factors: Factors,
-    free: np.ndarray,
-    enough: float = SMALL_STEP,
-) -> np.ndarray:
-    """Return the values of least cost; steps below `enough` standard deviations are the last."""
-    squares = _WindowSquares(system, factors, free, enough)
-    return gauss_newton(squares, squares.at(values), n_steps=MAX_SOLVE_STEPS).values
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,7 +396,7 @@ def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> 
         if dependence is not None:
             attitude[sensor] = dependence
         misfit = system.misfit(sensor, system.means[sensor], values)
-        white = system.whitened(misfit[:, :, None], noise)
+        white = system.mean_rows(misfit[:, :, None], noise).white()
         freedom = max(white.size - _parameters_of_means(system, sensor), 1)
         chi2[sensor] = {'means': float((white**2).sum() / freedom)}
         slow_over_fast[sensor] = {}
@@ -386,10 +429,7 @@ def _session_biases(
         if noise.session_variance <= 0:
             continue
         misfit = system.misfit(sensor, system.means[sensor], values)
-        variance = system.mean_variance(noise) + noise.offset_sd**2
-        offsets = predict_session_offsets(
-            misfit, variance, system.times, sessions=system.sessions, noise=noise
-        )
+        offsets = predict_session_offsets(system.mean_rows(misfit[:, :, None], noise))
         found[sensor] = values[system.model.part(sensor, Role.OFFSET)] + offsets
     return found
 

@@ -9,23 +9,18 @@ from collections.abc import Iterator
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.held_parameters import Factors
 from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.scaled_solve import triangular
-from imu_calibration.estimation.whitening import Whitening
-from imu_calibration.references.turntable.estimation.accumulated_rows import (
-    AccumulatedRows,
-    CentredRows,
-)
-from imu_calibration.references.turntable.noise_model import NoiseModel, sessions_of
-
-EXCLUDED_MEAN_SD_FACTOR = 1e3
-"""Sd factor of an excluded mean over the largest sd of all means."""
+from imu_calibration.references.turntable.accumulator import Accumulator, WindowBlock
+from imu_calibration.references.turntable.estimation.window_means import WindowMeans
+from imu_calibration.references.turntable.noise_model import NoiseModel
 
 
-class WeightedSystem:
+class WeightedSystem(WindowMeans):
     """
     Accumulated windows as rows ``[columns | output]``.
 
@@ -33,38 +28,22 @@ class WeightedSystem:
 
     Parameters
     ----------
-    accumulator : AccumulatedRows
+    accumulator : Accumulator
     model : SensorModel
 
     """
 
-    def __init__(self, accumulator: AccumulatedRows, model: SensorModel):
+    def __init__(self, accumulator: Accumulator, model: SensorModel):
         self.model = model
         self.prior = make_prior(model)
         self.accumulator = accumulator
-        rows = accumulator.rows
-
-        self.kinds = [row.kind for row in rows]
-        """Kind of each window."""
-        self.keys = [(row.session, row.time) for row in rows]
-        """(Recording, middle in s) of each window."""
-        self.times = np.array([row.time for row in rows], float)
-        """Middle of each window, s."""
-        self.counts = np.array([row.count for row in rows], float)
-        """Number of samples of each window."""
-        self.durations = np.array([row.duration for row in rows], float)
-        """Length of each window, s."""
-        self.sessions = sessions_of(rows)
-        """Indices of each recording's windows in order of time."""
-
-        self.sensors = tuple(rows[0].sensors) if rows else SENSORS
-        """Sensors with rows: those with readings."""
+        self.windows = accumulator.rows
         self.means = {}
         """Sensor -> mean rows, shape (n_windows, p + 3)."""
         self.within: dict[str, dict[str, np.ndarray]] = {}
         """Sensor -> kind -> factor of the centred rows."""
         for sensor in self.sensors:
-            self.means[sensor] = np.array([row.sensors[sensor].mean for row in rows])
+            self.means[sensor] = np.array([window.sensors[sensor].mean for window in self.windows])
             self.within[sensor] = {}
         # In a fixed order, so that sums over kinds do not depend on the order of the windows.
         for (sensor, kind), factor in sorted(accumulator.within.items()):
@@ -81,38 +60,6 @@ class WeightedSystem:
         """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""
         return rows[:, -3:] - rows[:, :-3] @ coefficients(self.model, sensor, values)
 
-    def mean_variance(self, noise: NoiseModel, beside_bias: bool = True) -> np.ndarray:
-        """
-        Return the variance of the window means, very large for excluded windows.
-
-        Shape (n_windows, 3).
-
-        Relative to the bias in the middle of each window, or of the noise within windows and of the
-        reference only.
-        """
-        of_windows = noise.variance_beside_bias if beside_bias else noise.mean_variance
-        variance = of_windows(self.kinds, self.counts, self.durations, keys=self.keys)
-        if noise.left_out:
-            left_out = np.array([key in noise.left_out for key in self.keys])
-            largest = variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance
-            variance[left_out] = EXCLUDED_MEAN_SD_FACTOR**2 * largest
-        return variance
-
-    def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:
-        """Return mean rows, shape (n_windows, 3, q), as independent rows of unit variance."""
-        return self._whitening(noise)(rows)
-
-    def _whitening(self, noise: NoiseModel) -> Whitening:
-        """Return the whitening of the mean rows, offsets of windows included."""
-        variance = self.mean_variance(noise) + noise.offset_sd**2
-        return Whitening(
-            variance,
-            self.times,
-            self.sessions,
-            processes=noise.bias_processes,
-            session_variance=noise.session_variance,
-        )
-
     def bias_information(self, values: np.ndarray, noises: dict[str, NoiseModel]) -> np.ndarray:
         """
         Return ``A' V^-1 B V^-1 A``, shape (n_params, n_params), over the window means.
@@ -126,7 +73,7 @@ class WeightedSystem:
             # W A with W' W = V^-1, so that A' V^-1 A is its product with itself.
             slope = coefficient_jacobian(self.model, sensor, values)
             design = np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope)
-            whitening = self._whitening(noises[sensor])
+            whitening = self.mean_rows(design, noises[sensor]).whitening()
             white = whitening(design)
             information = np.einsum('kap,kaq->pq', white, white)
 
@@ -145,7 +92,7 @@ class WeightedSystem:
         """
         means = self.means[sensor]
         of_axes = [means[:, self.columns_and(sensor, axis)] for axis in range(3)]
-        return self.whitened(np.stack(of_axes, axis=1), noise)
+        return self.mean_rows(np.stack(of_axes, axis=1), noise).white()
 
     def columns_and(self, sensor: str, axis: int) -> list[int]:
         """Return the places of all columns and of the output of one axis in rows of a sensor."""
@@ -167,7 +114,7 @@ class WeightedSystem:
         return found
 
     def weighed_rows(
-        self, sensor: str, noise: NoiseModel, part: CentredRows | None = None
+        self, sensor: str, noise: NoiseModel, part: WindowBlock | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
         Yield (centred rows, weight of each axis (3,)).
@@ -176,49 +123,33 @@ class WeightedSystem:
 
         From all windows, or from one block.
         """
-        part = part or self.accumulator
+        source: Accumulator | WindowBlock = part or self.accumulator
         for kind in self.within[sensor]:
-            if (sensor, kind) in part.within:
-                yield part.within[sensor, kind], 1 / np.sqrt(noise.row_variance(kind))
+            if (sensor, kind) in source.within:
+                yield source.within[sensor, kind], 1 / np.sqrt(noise.row_variance(kind))
             extra = noise.slow_weight(kind)
-            if extra.any() and (sensor, kind) in part.slow:
-                yield part.slow[sensor, kind], extra
+            if extra.any() and (sensor, kind) in source.slow:
+                yield source.slow[sensor, kind], extra
 
-    def residuals(self, values: np.ndarray, factors: dict) -> np.ndarray:
-        """Return the residual rows of both sensors and all axes, the prior's rows last."""
+    def linearise(self, values: np.ndarray, factors: Factors) -> Rows:
+        """Return the rows of all sensors and axes at values, from the factors of their weights."""
         parts = []
         for sensor in self.sensors:
             of_axes = coefficients(self.model, sensor, values)
-            for axis, factor in enumerate(factors[sensor]):
-                parts.append(factor[:, :-1] @ of_axes[:, axis] - factor[:, -1])
-        parts.append(self.prior.root @ (values - self.prior.mean))
-        return np.concatenate(parts)
-
-    def jacobian(self, values: np.ndarray, factors: dict) -> np.ndarray:
-        """Return the derivative of the residual rows without the prior's."""
-        parts = []
-        for sensor in self.sensors:
             slope = coefficient_jacobian(self.model, sensor, values)
             for axis, factor in enumerate(factors[sensor]):
-                parts.append(factor[:, :-1] @ slope[:, axis])
-        return np.concatenate(parts)
+                residual = factor[:, -1] - factor[:, :-1] @ of_axes[:, axis]
+                parts.append(np.column_stack([factor[:, :-1] @ slope[:, axis], residual]))
+        equations = np.concatenate(parts)[:, None]
+        return Rows(equations=equations, variance=np.ones(equations.shape[:2]))
 
-    def linearised(
-        self, sensor: str, values: np.ndarray, noise: NoiseModel
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def linearised(self, sensor: str, values: np.ndarray, noise: NoiseModel) -> Rows:
         """
-        Return mean rows of one sensor, and the normal matrix of centred rows and prior.
+        Return the mean rows of one sensor, with the products of centred rows and prior.
 
-        The mean rows are in coordinates of the parameters of the sensor.
+        They are in coordinates of the parameters of the sensor.
 
-        Directions fixed by the gauge are excluded: their weight would dominate the normal matrix.
-
-        Returns
-        -------
-        tuple
-            ``[design | residual]``, shape (n_windows, 3, q + 1), and the normal matrix of centred
-            rows and prior, shape (q + 1, q + 1).
-
+        Directions fixed by the gauge are excluded: their weight would dominate the products.
         """
         # Coordinates: the parameters of the sensor, without the directions that the gauge fixes.
         slope = coefficient_jacobian(self.model, sensor, values)
@@ -246,4 +177,4 @@ class WeightedSystem:
                 centred = np.concatenate([columns, misfit[:, axis : axis + 1]], axis=1)
                 parts.append(centred * weight[axis])
         stacked = np.concatenate(parts)
-        return rows, stacked.T @ stacked
+        return self.mean_rows(rows, noise, stacked.T @ stacked)

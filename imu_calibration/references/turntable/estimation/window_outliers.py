@@ -1,6 +1,5 @@
 """Windows whose means deviate from the other windows of their kind."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.estimation.outliers import Outliers, find_outliers
 from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
 from imu_calibration.references.turntable.noise_model import NoiseModel
 
@@ -48,14 +48,13 @@ def outlier_windows(
         Sensor -> NoiseModel of the estimate.
 
     """
-    kinds = np.array(system.kinds)
     found = {}
     for sensor in system.sensors:
         fit = _MeanFit.of(system, sensor, values, noises[sensor])
         excluded = np.array([key in noises[sensor].left_out for key in system.keys])
         of_kinds = []
-        for kind in sorted(set(system.kinds)):
-            of_kinds.append(_outliers_of_kind(kinds == kind, excluded, fit))
+        for kind in np.unique(system.kind):
+            of_kinds.append(_outliers_of_kind(system.kind == kind, excluded, fit))
         # The kind with the least probable outlier.
         most = min(of_kinds, key=lambda outliers: outliers.least_p_value)
         found[sensor] = frozenset(system.keys[window] for window in most.numbers)
@@ -87,24 +86,18 @@ class _MeanFit:
     """Whitened columns, shape (n_windows, 3, q)."""
     covariance: np.ndarray
     """Of the parameters, from the means, the centred rows and the prior, shape (q, q)."""
-    whiten: Callable[[np.ndarray], np.ndarray]
-    """Function that whitens columns, shape (n_windows, 3, k)."""
+    whitening: Whitening
 
     @classmethod
     def of(
         cls, system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel
     ) -> '_MeanFit':
-        rows, normal = system.linearised(sensor, values, noise)
-        white = system.whitened(rows, noise)
+        rows = system.linearised(sensor, values, noise)
+        whitening = rows.whitening()
+        white = whitening(rows.equations)
         design = white[:, :, :-1]
-        q = design.shape[2]
-        normal = normal[:q, :q] + np.einsum('kap,kaq->pq', design, design)
-        return cls(
-            white[:, :, -1],
-            design,
-            inverse_normal(normal),
-            lambda columns: system.whitened(columns, noise),
-        )
+        normal = rows.products[:-1, :-1] + np.einsum('kap,kaq->pq', design, design)
+        return cls(white[:, :, -1], design, inverse_normal(normal), whitening)
 
     def p_value(self, window: int, of_kind: np.ndarray) -> float:
         """
@@ -121,7 +114,7 @@ class _MeanFit:
         """
         column = np.zeros(self.residual.shape + (1,))
         column[window] = 1.0
-        column = self.whiten(column)[:, :, 0]
+        column = self.whitening(column)[:, :, 0]
         along = np.einsum('kap,ka->ap', self.design, column)
         squares = (column**2).sum(axis=0)
         visible = squares - np.einsum('ap,pq,aq->a', along, self.covariance, along)

@@ -132,7 +132,7 @@ class ResidualAnalysis(Investigation):
         Empty without a temperature, or with the times of several recordings.
         """
         blocks = self.blocks[sensor]
-        if blocks.ref.temperature_c is None or len(self.problem.recording.sessions) > 1:
+        if blocks.ref.temperature_c is None or np.ptp(self.problem.recording.session) > 0:
             return {}
         fits = self.fits(sensor, chosen)
         found = {}

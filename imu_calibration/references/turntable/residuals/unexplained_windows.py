@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.effects.base import AXES
+from imu_calibration.estimation.rows import weights_of
 from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.reduced_recording import ReducedRecording
@@ -43,7 +44,7 @@ def unexplained(
 ) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained for a choice of effects."""
     excess, used = explained.excess(chosen), problem.search.indices(chosen)
-    values = problem.space.reduced(used, problem.evidence.fit(used)[0])
+    values = weights_of(used, problem.evidence.fit(used)[0], problem.space.size)
     return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in excess}
 
 
@@ -106,9 +107,7 @@ def _rest(
         [space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1
     )
     floor = explained.floor.noise[sensor]
-    white = floor.variance_beside_bias(
-        recording.kind, recording.count, recording.duration, keys=recording.keys
-    )
+    white = recording.mean_variance(floor)
     noise_sd = np.sqrt(white + floor.bias_variance)
     sigma_means, sigma_within = explained.sigma(sensor, excess)
     # Quiet axes dilute the excess of one.

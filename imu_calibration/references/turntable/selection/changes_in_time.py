@@ -5,11 +5,12 @@ from functools import cached_property
 
 import numpy as np
 
+from imu_calibration.estimation.rows import Rows, flat, weights_of
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.selection.parameter_space import (
     ParameterSpace,
-    mean_whitening,
+    mean_rows,
 )
 from imu_calibration.selection.explained_share import SIGNIFICANT_REST
 
@@ -57,19 +58,25 @@ class _RowsOfAxis:
 
     part: int
     """Number of the part that the means belong to; the rows within windows are the next one."""
-    places: np.ndarray
-    """Places of the columns in the normal matrix, that of the residual last, shape (p + 1,)."""
-    whitening: Whitening
-    """Makes the means of the windows independent and of unit variance."""
-    mean: np.ndarray
-    """Means of the windows, shape (n, p + 1)."""
+    means: Rows
+    """Means of the windows, of p columns."""
     within: np.ndarray
     """Products of the white rows within each window, shape (n, p + 1, p + 1)."""
+
+    @property
+    def places(self) -> np.ndarray:
+        """Places of the columns in the normal matrix, that of the residual last, shape (p + 1,)."""
+        return self.means.places
+
+    @cached_property
+    def whitening(self) -> Whitening:
+        """Makes the means of the windows independent and of unit variance."""
+        return self.means.whitening()
 
     @cached_property
     def white(self) -> np.ndarray:
         """Independent means of unit variance, shape (n, p + 1)."""
-        return self.whitening(self.mean[:, None])[:, 0]
+        return flat(self.whitening(self.means.equations))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,28 +105,27 @@ class WindowRows:
         kind = space.recording.kind
         axes = []
         for number, sensor in enumerate(space.sensors):
-            whitenings = mean_whitening(space, noise, sensor)
-            for axis, (whitening, mean) in enumerate(zip(whitenings, space.mean[sensor])):
-                within = np.zeros((len(kind), mean.shape[1], mean.shape[1]))
+            for axis, means in enumerate(mean_rows(space, noise, sensor)):
+                width = means.equations.shape[2]
+                within = np.zeros((len(kind), width, width))
                 if moving.any():
                     variances = [noise[sensor].row_variance(name)[axis] for name in kind[moving]]
                     variance = np.array(variances)
                     products = np.concatenate(list(space.within_each(sensor, axis, moving)))
                     within[moving] = products / variance[:, None, None]
-                places = space.places(sensor, axis)
-                axes.append(_RowsOfAxis(2 * number, places, whitening, mean, within))
+                axes.append(_RowsOfAxis(2 * number, means, within))
         return cls(space, noise, np.ones(len(kind), bool), tuple(axes))
 
     def selected(self, clear: np.ndarray) -> 'WindowRows':
         """Return the rows with other windows that count (mask, shape (n,))."""
         scatter = np.where(clear, 1.0, NO_WEIGHT)[:, None] * np.ones(3)
-        whitenings = []
+        means = []
         for sensor in self.space.sensors:
-            whitenings += mean_whitening(self.space, self.noise, sensor, scatter=scatter)
+            means += mean_rows(self.space, self.noise, sensor, scatter=scatter)
         axes = []
-        for rows, whitening in zip(self.axes, whitenings):
+        for rows, own in zip(self.axes, means):
             within = np.where(clear[:, None, None], rows.within, 0.0)
-            axes.append(replace(rows, whitening=whitening, within=within))
+            axes.append(replace(rows, means=own, within=within))
         return replace(self, clear=clear, axes=tuple(axes))
 
     @property
@@ -141,7 +147,7 @@ class WindowRows:
         size = self.space.size + 1
         normals = np.zeros((len(self.expected), size, size))
         for rows in self.axes:
-            at = np.ix_(rows.places, rows.places)
+            at = rows.means.at
             normals[rows.part][at] += rows.white.T @ rows.white
             normals[rows.part + 1][at] += rows.within.sum(axis=0)
         return normals
@@ -167,7 +173,7 @@ class WindowRows:
             if not len(columns):
                 continue
             order = np.searchsorted(at, rows.places[columns])
-            mean = rows.mean[:, None, columns]
+            mean = rows.means.equations[:, :, columns]
             within = rows.within[:, :, columns]
             axes.append(_ChangingOfAxis(rows, order, mean, within, within[:, columns]))
         return ChangingColumns(len(self.expected), self.space.size + 1, len(at), tuple(axes))
@@ -223,7 +229,7 @@ class WindowRows:
             squares = v'N v - 2 v'C c + c'S c,   expected = n, variance 2 n
 
         """
-        weights = self.space.reduced(own.tolist(), fit.values)
+        weights = weights_of(own.tolist(), fit.values, self.space.size)
         squares = np.einsum('i,kij,j->k', weights, self.part_normals, weights)
         if changes is not None:
             squares -= 2 * weights @ changes.cross @ fit.change

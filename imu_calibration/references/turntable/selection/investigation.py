@@ -43,7 +43,7 @@ from imu_calibration.references.turntable.selection.window_gain import gain_in_t
 from imu_calibration.selection.explained_share import pruned
 from imu_calibration.selection.gain import LEAST_REDUCTION
 from imu_calibration.selection.onset import Onset
-from imu_calibration.selection.order_of_tests import select_findings, without_weakest
+from imu_calibration.selection.order_of_tests import EffectTests, select_findings
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import SelectedEffects
 
@@ -442,47 +442,46 @@ def too_few_windows(count: int) -> NotObservableError:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class WindowTests:
-    """The tests of a choice on the windows of a table (`EffectTests`)."""
+@dataclass(eq=False)
+class WindowTests(EffectTests):
+    """The tests of a choice on the windows of a table."""
 
     problem: LinearisedProblem
     explained: ExplainedWindows
 
-    def explaining(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return the effects that explain most of the excess, without a simpler alternative."""
-        return simpler(self.problem, self.explained, pruned(chosen, self.explained.share))
+    def preferred(self, named: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects, or a simpler alternative."""
+        return simpler(self.problem, self.explained, named)
 
-    def predicting(self, named: Sequence[Question]) -> list[Question]:
+    def admissible(self, named: Sequence[Question]) -> Sequence[Question]:
+        """Return the effects of a possible size on which the windows agree."""
+        problem = self.problem
+        return [
+            question
+            for question in named
+            if problem.search.allowed(named, question) and problem.windows_agree(named, question)
+        ]
+
+    def least_predicting(self, kept: list[Question]) -> int | None:
         """
-        Return the admissible findings that improve cross-validated prediction.
+        Return the finding that improves cross-validated prediction least, of those that do not.
 
         Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a
         misfit that repeats with the motion is evidence for any effect that correlates with it. So
         the unweighted residual must decrease too. The locked windows are not used: their later gain
         would be biased.
         """
-        problem = self.problem
-        admissible = [
-            question
-            for question in named
-            if problem.search.allowed(named, question) and problem.windows_agree(named, question)
-        ]
-
-        def least_helpful(kept: list[Question]) -> int | None:
-            place = None
-            least = np.inf
-            for k, question in enumerate(kept):
-                reduction = _sure_reduction(problem, kept, question)
-                if not reduction > _needed_reduction(problem, self.explained, kept, question):
-                    # NaN is not sure.
-                    rank = -np.inf if np.isnan(reduction) else reduction
-                    if place is None or rank < least:
-                        place = k
-                        least = rank
-            return place
-
-        return without_weakest(admissible, least_helpful)
+        place = None
+        least = np.inf
+        for k, question in enumerate(kept):
+            reduction = _sure_reduction(self.problem, kept, question)
+            if not reduction > _needed_reduction(self.problem, self.explained, kept, question):
+                # NaN is not sure.
+                rank = -np.inf if np.isnan(reduction) else reduction
+                if place is None or rank < least:
+                    place = k
+                    least = rank
+        return place
 
     def significant(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects that are significant without those that were removed."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.sensor_noise import NATURAL, BiasProcess
 from imu_calibration.references.turntable.estimation.noise_search import (
@@ -261,30 +262,26 @@ def _with_bias_process(
     structural = np.setdiff1d(np.concatenate(space.index[sensor]), superfluous)
     own = np.append(structural, superfluous).astype(int)
     place = {parameter: k for k, parameter in enumerate(own)}
-    rows = np.zeros((len(recording.windows), 3, len(own) + 1))
+    equations = np.zeros((len(recording.windows), 3, len(own) + 1))
     for axis in range(3):
-        rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = (
-            space.mean[sensor][axis]
-        )
-    white = noise[sensor].mean_variance(
-        recording.kind, recording.count, recording.duration, keys=recording.keys
-    )
+        columns = [*(place[parameter] for parameter in space.index[sensor][axis]), -1]
+        equations[:, axis, columns] = space.mean[sensor][axis]
+    products = _known_otherwise(space, sensor, noise, own)
+    rows = recording.mean_rows(equations, noise[sensor], products)
+    rows = recording.without_offsets(rows, noise[sensor])
     natural = float(
         np.sqrt(
             sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))
         )
     )
-    smooth_columns = rows[:, :, len(structural) : -1]
+    smooth_columns = equations[:, :, len(structural) : -1]
     options = []  # columns of each smooth effect
     for parameters in smooth:
         options.append([place[k] - len(structural) for k in parameters])
     wander = _WanderProblem(
         recording=recording,
-        noise=noise[sensor],
         rows=rows,
         n_structural=len(structural),
-        white=white,
-        information=_known_otherwise(space, sensor, noise, own),
         options=options,
         prior_sd=drift_prior(
             smooth_columns, space.prior_sd[superfluous], max(natural, STABLE[sensor])
@@ -317,16 +314,13 @@ class _WanderProblem:
     """Rows of one sensor, of which a bias process or a course in time explains the wander."""
 
     recording: ReducedRecording
-    noise: NoiseModel
-    """Noise of the sensor without a bias process."""
-    rows: np.ndarray
-    """Mean rows ``[structural | smooth | residual]``, shape (n, 3, q + 1)."""
+    rows: Rows
+    """
+    Means ``[structural | smooth | residual]`` without a bias process but the known ones, with the
+    products of what is known of the parameters otherwise.
+    """
     n_structural: int
     """Columns that every model has."""
-    white: np.ndarray
-    """Variance of the means without a bias process, shape (n, 3)."""
-    information: np.ndarray
-    """Normal matrix of what is known of the parameters otherwise, shape (q + 1, q + 1)."""
     options: Sequence[Sequence[int]]
     """Numbers of the parameters of each smooth effect."""
     prior_sd: np.ndarray
@@ -348,20 +342,15 @@ class _WanderProblem:
         for first in range(n_smooth, n_smooth + len(sd), len(AXES)):
             options.append([first, first + 1, first + 2])
 
-        likelihood = NoiseLikelihood(
-            np.concatenate([self.rows[:, :, :-1], added, self.rows[:, :, -1:]], axis=2),
-            self.white,
-            self.recording.time,
-            sessions=self.recording.sessions,
-            information=_with_priors(self.information, sd),
-            known=self.noise.known,
-            durations=self.recording.duration,
-            common=self.n_structural,
-            choices=options,
+        equations = self.rows.equations
+        rows = replace(
+            self.rows,
+            equations=np.concatenate([equations[:, :, :-1], added, equations[:, :, -1:]], axis=2),
+            products=_with_priors(self.rows.products, sd),
         )
-        search = BiasProcessSearch(
-            likelihood, 0.0 if self.noise.known else self.natural, self.stable
-        )
+        likelihood = NoiseLikelihood(rows, common=self.n_structural, choices=options)
+        least = 0.0 if rows.processes else self.natural
+        search = BiasProcessSearch(likelihood, least, self.stable)
         first_step = len(options) - len(steps)
         # Each of the moments is as likely as the other ones.
         prices = np.zeros(len(options))
@@ -374,7 +363,7 @@ class _WanderProblem:
 def _best_course(wander: _WanderProblem) -> _Choice:
     """Return the best model beside a bias process: a step is sought coarsely, then closely."""
     recording = wander.recording
-    if len(recording.sessions) > 1:  # between two recordings each bias may change
+    if np.ptp(recording.session) > 0:  # between two recordings each bias may change
         return wander.choice([])
     count = len(wander.rows)
     temperature = recording.describe['temperature']

@@ -10,7 +10,7 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.estimation.rows import Rows, normal_of_rows, weights_of
 from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.selection.reduced_recording import ReducedRecording
 from imu_calibration.selection.questions import Question
@@ -72,16 +72,6 @@ class ParameterSpace:
         Shape (q_a + 1,).
         """
         return np.append(self.index[sensor][axis], self.size)
-
-    def reduced(self, used: Sequence[int], values: np.ndarray) -> np.ndarray:
-        """
-        Return the vector that maps rows of all parameters to residuals, shape (q + 1,).
-
-        The residuals are taken at `values` of the parameters `used`.
-        """
-        found = np.zeros(self.size + 1)
-        found[list(used)], found[-1] = -values, 1.0
-        return found
 
     def restricted(self, kept: np.ndarray) -> 'ParameterSpace':
         """Return the space of some of the parameters, in this order."""
@@ -357,14 +347,10 @@ def normal_matrix(
 
     Shape (q + 1, q + 1).
     """
-    of_means = np.zeros((space.size + 1, space.size + 1))
+    means = []
     for sensor in space.sensors:
-        for axis, rows in enumerate(white_means(space, noise, sensor)):
-            if select is not None:
-                rows = rows[select]
-            at = space.places(sensor, axis)
-            of_means[np.ix_(at, at)] += rows.T @ rows
-    return within_matrix(space, noise, select) + of_means
+        means += mean_rows(space, noise, sensor)
+    return within_matrix(space, noise, select) + normal_of_rows(means, space.size, select)
 
 
 def within_matrix(
@@ -414,7 +400,7 @@ def scatter_of_each(
     Shape (k, 3).
     """
     recording = space.recording
-    reduced = space.reduced(range(space.size), values)
+    reduced = weights_of(range(space.size), values, space.size)
     found = {}
     for sensor in space.sensors:
         # Squares that the noise of the kind gives, and those of the window.
@@ -428,49 +414,31 @@ def scatter_of_each(
     return found
 
 
-def white_means(
+def mean_rows(
     space: ParameterSpace,
     noise: dict[str, NoiseModel],
     sensor: str,
     *,
     scatter: np.ndarray | None = None,
-) -> list[np.ndarray]:
+) -> list[Rows]:
     """
-    Return for each axis the mean rows, turned into independent rows of unit variance.
-
-    Shape (k, q_a + 1).
+    Return the means of the windows for each axis, with their errors.
 
     `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
     """
-    whitenings = mean_whitening(space, noise, sensor, scatter=scatter)
-    return [
-        whitening(rows[:, None])[:, 0]
-        for whitening, rows in zip(whitenings, space.mean[sensor], strict=True)
-    ]
-
-
-def mean_whitening(
-    space: ParameterSpace,
-    noise: dict[str, NoiseModel],
-    sensor: str,
-    *,
-    scatter: np.ndarray | None = None,
-) -> list[Whitening]:
-    """Return for each axis the Whitening of `white_means`, with its arguments."""
     recording = space.recording
     own = noise[sensor]
-    variance = own.variance_beside_bias(
-        recording.kind, recording.count, recording.duration, keys=recording.keys
-    )
-    variance = variance + own.offset_sd**2
+    means = recording.mean_rows(np.zeros((len(recording.kind), 3, 0)), own)
+    variance = means.variance
     if scatter is not None:
         variance = variance + (scatter - 1) * own.mean_variance(recording.kind, recording.count)
-    return [
-        Whitening(
-            variance[:, axis : axis + 1],
-            recording.time,
-            recording.sessions,
-            processes=own.bias_processes,
+    found = []
+    for axis, equations in enumerate(space.mean[sensor]):
+        of_axis = replace(
+            means,
+            equations=equations[:, None],
+            variance=variance[:, axis : axis + 1],
+            places=space.places(sensor, axis),
         )
-        for axis in range(3)
-    ]
+        found.append(of_axis)
+    return found

@@ -27,7 +27,7 @@ from imu_calibration.references.turntable.accumulator import (
     restricted_window,
     selected_columns,
 )
-from imu_calibration.references.turntable.noise_model import sessions_of
+from imu_calibration.references.turntable.estimation.window_means import WindowMeans
 from imu_calibration.references.turntable.packed_factors import packed, unpacked
 from imu_calibration.references.turntable.window_statistics import WindowStatistics, reduce_windows
 from imu_calibration.selection.evidence import Recent
@@ -140,7 +140,7 @@ MOST_SUMS = 32
 
 
 @dataclass(frozen=True, eq=False)
-class ReducedRecording:
+class ReducedRecording(WindowMeans):
     """
     Windows of one recording as statistics, and residuals at a point.
 
@@ -167,50 +167,10 @@ class ReducedRecording:
     """
 
     @cached_property
-    def kind(self) -> np.ndarray:
-        """Kind of each window, shape (k,)."""
-        return np.array([window.kind for window in self.windows])
-
-    @cached_property
-    def moving(self) -> np.ndarray:
-        """Whether each window has centred rows, shape (k,)."""
-        return self.kind != 'static'
-
-    @cached_property
-    def time(self) -> np.ndarray:
-        """Middle of each window, s, shape (k,)."""
-        return np.array([window.time for window in self.windows])
-
-    @cached_property
-    def count(self) -> np.ndarray:
-        """Samples of each window, shape (k,)."""
-        return np.array([window.count for window in self.windows], float)
-
-    @cached_property
-    def duration(self) -> np.ndarray:
-        """Length of each window, s, shape (k,)."""
-        return np.array([window.duration for window in self.windows])
-
-    @cached_property
-    def keys(self) -> list[tuple[int, float]]:
-        """(Recording, middle in s) of each window."""
-        return [(window.session, window.time) for window in self.windows]
-
-    @property
-    def encoder_step(self) -> float:
-        """Largest step of the encoders that shows in the readings, rad; 0 where none does."""
-        return max((window.encoder_step for window in self.windows), default=0.0)
-
-    @cached_property
     def slow_rows(self) -> np.ndarray:
         """Short pieces of each window, shape (k,)."""
         (sensor, *_) = self.sensors
         return np.array([window.sensors[sensor].slow_rows for window in self.windows])
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Sensors with rows: those with readings."""
-        return tuple(self.windows[0].sensors)
 
     @property
     def period(self) -> float:
@@ -283,11 +243,6 @@ class ReducedRecording:
     @cached_property
     def _sums(self) -> Recent:
         return Recent(MOST_SUMS)
-
-    @cached_property
-    def sessions(self) -> list[np.ndarray]:
-        """Indices of each session's windows in order of time."""
-        return sessions_of(self.windows)
 
     @cached_property
     def _coefficients(self) -> dict[str, np.ndarray]:

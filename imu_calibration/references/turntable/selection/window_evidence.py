@@ -7,13 +7,14 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
-from imu_calibration.estimation.scaled_solve import inverse_normal, solve_normal, solve_scaled
+from imu_calibration.estimation.rows import flat, weights_of
+from imu_calibration.estimation.scaled_solve import inverse_normal, solve_scaled
 from imu_calibration.estimation.solution import CONVENTION_SHARE
 from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.selection.parameter_space import (
     ParameterSpace,
+    mean_rows,
     normal_matrix,
-    white_means,
     within_of_axis,
 )
 from imu_calibration.selection.evidence import Evidence, ParameterFit, _squares
@@ -85,21 +86,31 @@ class WindowEvidence(Evidence):
         self.space = space
         self.noise = noise
         self.fold = fold
-        self._white = {}
-        """Sensor -> white mean rows of each axis."""
+        self._white: dict[str, list[np.ndarray]] = {}
+        """Sensor -> independent means of unit variance of each axis."""
         self._of_axis: dict[str, list[np.ndarray]] = {}
         """Sensor -> of each axis the products of means and within windows, (2, n_folds, n, n)."""
+        blocks = []
         for sensor in space.sensors:
             own_scatter = None if scatter is None else scatter.get(sensor)
-            self._white[sensor] = white_means(space, noise, sensor, scatter=own_scatter)
+            means = mean_rows(space, noise, sensor, scatter=own_scatter)
+            self._white[sensor] = [flat(rows.white()) for rows in means]
             self._of_axis[sensor] = []
-            for axis, rows in enumerate(self._white[sensor]):
-                of_means = [rows[own].T @ rows[own] for own in self._folds]
+            for axis, white in enumerate(self._white[sensor]):
+                of_means = [white[own].T @ white[own] for own in self._folds]
                 within = self._within(space, sensor, axis)
                 self._of_axis[sensor].append(np.array([of_means, within]))
+            blocks += means
         parts = np.sum([self._of_sensor(sensor) for sensor in space.sensors], axis=0)
         total = np.sum(parts, axis=0)
-        super().__init__(total, total - parts, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
+        super().__init__(
+            blocks,
+            [fold] * len(blocks),
+            total=total,
+            without=total - parts,
+            prior_sd=space.prior_sd,
+            prior_mean=space.prior_mean,
+        )
 
     @property
     def _folds(self) -> list[np.ndarray]:
@@ -125,11 +136,8 @@ class WindowEvidence(Evidence):
         self, used: Sequence[int]
     ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
         """Return the fits of parameters to both halves of the windows, and to all of them."""
-        first, second = (
-            solve_normal(normal, np.array(used), self._prior_sd, prior_mean=self._prior_mean)
-            for normal in self._halves
-        )
-        return first, second, self.fit(used)
+        first, second = self._halves
+        return self._fitted(first, used), self._fitted(second, used), self.fit(used)
 
     @cached_property
     def _halves(self) -> list[np.ndarray]:
@@ -141,7 +149,7 @@ class WindowEvidence(Evidence):
         """Return the covariance of the parameters `used` from one sensor and the prior."""
         at = np.ix_(used, used)
         information = self._of_sensor(sensor).sum(axis=0)[at]
-        return inverse_normal(information + np.diag(1 / self._prior_sd[list(used)] ** 2))
+        return inverse_normal(information + np.diag(1 / self.prior_sd[list(used)] ** 2))
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
@@ -173,7 +181,7 @@ class WindowEvidence(Evidence):
         left = self.left_by_others(used)
         found = self.heldout_parts(used)
         # Information N of the other folds, with the prior.
-        others = self.without[:, own[:, None], own] + np.diag(1 / self._prior_sd[own] ** 2)
+        others = self.without[:, own[:, None], own] + np.diag(1 / self.prior_sd[own] ** 2)
         for sensor, axes in self._of_axis.items():
             for axis, (means, _) in enumerate(axes):
                 places = self.space.places(sensor, axis)
@@ -216,7 +224,7 @@ class WindowEvidence(Evidence):
         """
         # Slopes g_k of the windows, shape (n_windows, q + 1).
         values, covariance = self.fit(used)
-        reduced = self.space.reduced(used, values)
+        reduced = weights_of(used, values, self.space.size)
         kind = self.space.recording.kind
         slopes = np.zeros((len(self.fold), self.space.size + 1))
         for sensor in self.space.sensors:

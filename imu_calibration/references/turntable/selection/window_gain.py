@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from imu_calibration.estimation.rows import weights_of
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.parameter_space import ParameterSpace
 from imu_calibration.selection.gain import MEASURES, REST_MEASURE, Gain, gain_of
@@ -38,7 +39,7 @@ def heldout_gain(
     for choice in (before, after):
         used = problem.search.indices(choice)
         values, _ = problem.evidence.fit(used)
-        weights = problem.space.reduced(used, values)[None]
+        weights = weights_of(used, values, problem.space.size)[None]
         squares = _squares(problem.locked_samples, weights, chosen.sensor)
         pair.append(squares[chosen.measure])
     return gain_of(chosen.sensor, chosen.measure, pair)
@@ -65,12 +66,7 @@ def gain_in_turn(
         # Each window is predicted by a fit to the other folds.
         squares_of_choices = []
         for choice in (before, after):
-            used = problem.search.indices(choice)
-            weights_of_folds = []
-            for number in range(fold.max() + 1):
-                values, _ = problem.evidence.fit(used, number)
-                weights_of_folds.append(problem.space.reduced(used, values))
-            weights = np.array(weights_of_folds)[fold]
+            weights = problem.evidence.left_by_others(problem.search.indices(choice))[fold]
             squares_of_choices.append(_squares(problem.all_samples, weights, sensor))
         for measure in MEASURES:
             pair = [squares[measure] for squares in squares_of_choices]
@@ -93,7 +89,7 @@ def _squares(
     """
     Return measure -> (sums of squares, their numbers) per window, each (k,).
 
-    They are taken at vectors of `ParameterSpace.reduced`, one or many.
+    They are taken at weights (`weights_of`), one or of each window.
     """
     # Squares of the mean residual and of the residual about it, sums over the axes.
     recording = space.recording

@@ -1,0 +1,115 @@
+"""
+Estimate from the rows of any reference, in four steps.
+
+What differs is how a reference finds its values. On a table all rows are one triangular factor,
+and the noise is estimated between the solutions. For few rows it is estimated in each step,
+beside nuisances that belong to single rows.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Generic, Protocol
+
+import numpy as np
+
+from imu_calibration.estimation.gauss_newton import StateT
+from imu_calibration.estimation.scaled_solve import covariance_with_held
+from imu_calibration.estimation.solution import terms_of_fit
+
+
+class WeightedRows(Protocol):
+    """Rows at an estimate, weighted by their noise."""
+
+    @property
+    def design(self) -> np.ndarray:
+        """
+        Columns of the parameters, shape (m, n).
+
+        Without nuisances, and with rows of the prior where it counts.
+        """
+
+    def scatter_term(self, own: np.ndarray) -> np.ndarray:
+        """
+        Return the part of the covariance of free parameters that is no noise of samples.
+
+        Both have the shape (n, n), and are zero for the other parameters.
+        """
+
+
+class EstimateProblem(Protocol[StateT]):
+    """What an estimate needs of a reference; a state has parameters, noise and nuisances."""
+
+    @property
+    def prior_sd(self) -> np.ndarray:
+        """Standard deviations of the parameters before any data, shape (n,)."""
+
+    @property
+    def asked(self) -> np.ndarray:
+        """False where a convention fixes a parameter, shape (n,)."""
+
+    def fitted(self, state: StateT) -> StateT:
+        """Return the values of least cost with the priors, and the noise, estimated alternately."""
+
+    def undetermined(self, state: StateT) -> np.ndarray:
+        """Return a mask of the asked parameters that the data do not determine."""
+
+    def holding(self, state: StateT, held: np.ndarray) -> StateT:
+        """Return the values of least cost with the held parameters (mask) at their prior."""
+
+    def weighted(self, state: StateT) -> WeightedRows:
+        """Return the rows at a state."""
+
+    def not_believed(self, state: StateT, free: np.ndarray, sd: np.ndarray) -> Mapping[int, float]:
+        """Return the values of the free parameters that are no more than misfit, by number."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointEstimate(Generic[StateT]):
+    """Joint estimate of parameters."""
+
+    state: StateT
+    """Parameters, noise and nuisances."""
+    rows: WeightedRows
+    """The rows there."""
+    terms: dict[str, np.ndarray]
+    """Covariance of the parameters as named terms, each of shape (n, n)."""
+    held: np.ndarray
+    """True where a parameter is fixed at its prior, shape (n,)."""
+    free: np.ndarray
+    """True where a parameter was estimated, shape (n,)."""
+    not_believed: dict[int, float]
+    """Values of parameters that were held because only misfit gives them, by number."""
+
+
+def estimate(problem: EstimateProblem[StateT], state: StateT) -> JointEstimate[StateT]:
+    """
+    Return the estimate of all parameters that the data determine.
+
+    Parameters
+    ----------
+    problem : EstimateProblem
+    state
+        Where the first step begins.
+
+    """
+    # 1. Values and noise, alternately; 2. which parameters do the data determine?
+    state = problem.fitted(state)
+    held = problem.undetermined(state)
+
+    # 3. Values with the other parameters at their prior, until all are more than misfit.
+    not_believed: dict[int, float] = {}
+    while True:
+        free = problem.asked & ~held
+        state = problem.holding(state, held)
+        rows = problem.weighted(state)
+        own, of_held = covariance_with_held(rows.design, free, held, prior_sd=problem.prior_sd)
+        misfit = problem.not_believed(state, free, np.sqrt(np.diag(own + of_held)))
+        if not misfit:
+            break
+        not_believed.update(misfit)
+        held = held.copy()
+        held[list(misfit)] = True
+
+    # 4. The covariance as a sum of named terms.
+    terms = terms_of_fit(own, rows.scatter_term(own), of_held)
+    return JointEstimate(state, rows, terms, held, free, not_believed)
