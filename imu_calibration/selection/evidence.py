@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.distributions import chi2_sf
-from imu_calibration.estimation.rows import Rows, weights_of
+from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.scaled_solve import (
     quadratic,
     solve_normal,
@@ -156,11 +156,6 @@ class Evidence:
     ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
         """Return the fits of parameters to the first and second half of the rows, and to both."""
         raise NotImplementedError
-
-    def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
-        """Return the residuals of each block under the fit to all rows, shape (m, n_axes)."""
-        weights = weights_of(used, self.fit(used)[0], len(self.prior_sd))
-        return [block.residuals_at(weights) for block in self.blocks]
 
     def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
         """

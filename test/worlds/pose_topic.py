@@ -37,6 +37,7 @@ from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 from imu_calibration.references.rows.row_estimate import estimate_rows
 from imu_calibration.references.rows.row_search import RowProblem, choose_effects
+from imu_calibration.references.rows.scalar_rows import scalar_rows
 from imu_calibration.selection.questions import Question
 
 BLOCK = 1.0
@@ -189,7 +190,7 @@ class PoseRows:
         noise = np.full((count, 3), READING_SD**2)
         if self.left_out is not None:
             noise[self.left_out] = 1e6
-        return Rows.of_columns(
+        return scalar_rows(
             np.concatenate(late_columns),
             np.concatenate(main),
             np.concatenate(residual),

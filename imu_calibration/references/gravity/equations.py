@@ -17,6 +17,7 @@ from imu_calibration.estimation.sensor_noise import SensorNoise
 from imu_calibration.kinematics.rotations import cross, skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.rows.scalar_rows import scalar_rows
 
 COMPONENTS = ('pose', 'drift', 'turn')
 """
@@ -288,7 +289,7 @@ class _Equations:
         own, size = np.arange(len(residual)), residual.size
         nuisance = np.zeros((*residual.shape, len(residual), 5))
         nuisance[own, :, own, place] = blocks
-        return Rows.of_columns(
+        return scalar_rows(
             nuisance.reshape(size, -1),
             main.reshape(size, -1),
             residual.ravel(),
@@ -307,7 +308,7 @@ class _Equations:
         model = self.model
         sums = zero_sum_rows(model.model)
         count, n_poses = len(sums), len(self.state.up)
-        return Rows.of_columns(
+        return scalar_rows(
             np.zeros((count, 5 * n_poses)),
             sums,
             -sums @ self.state.values,
@@ -345,7 +346,7 @@ class _Equations:
         nuisance[:, i, OF_DIRECTION] = across_j.T @ mat_ji @ across_i
         nuisance[:, j, OF_DIRECTION] = -(carried @ state.up[j]) * np.eye(2)
         nuisance[:, [i, j], OF_DRIFT] = 0.5 * main[:, None, model.gyro_bias]
-        return Rows.of_columns(
+        return scalar_rows(
             nuisance.reshape(2, -1),
             main,
             -across_j.T @ carried,
@@ -405,7 +406,7 @@ class _Equations:
 
         variance = known_cov + data.noise_variance * np.eye(3)
         white = np.linalg.inv(np.linalg.cholesky(variance))
-        return Rows.of_columns(
+        return scalar_rows(
             np.zeros((3, 5 * count)),
             white @ main,
             white @ (known - rotation),

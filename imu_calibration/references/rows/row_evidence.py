@@ -15,7 +15,7 @@ import numpy as np
 
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
-from imu_calibration.estimation.rows import Rows, flat, normal_of_rows
+from imu_calibration.estimation.rows import Rows, flat, normal_of_rows, weights_of
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.selection.evidence import Evidence, ParameterFit
@@ -109,6 +109,11 @@ class RowEvidence(Evidence):
             blocks = without_groups(self.blocks, out)
             fits.append(RowEvidence(blocks, self.prior_sd, {}, baseline=used).fit(used))
         return fits[0], fits[1], fits[2]
+
+    def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
+        """Return the residuals of each block under the fit to all rows, shape (m, n_axes)."""
+        weights = weights_of(used, self.fit(used)[0], len(self.prior_sd))
+        return [block.residuals_at(weights) for block in self.blocks]
 
     def against_noise(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
