@@ -102,19 +102,21 @@ def group_states(result: CalibrationResult) -> list[GroupState]:
 
 def waiting_groups(model: SensorModel) -> list[GroupState]:
     """Return the GroupState of every effect of a model without data."""
-    return [
-        GroupState(
-            e.sensor,
-            e.name,
-            Progress.WAITING,
-            e.param_names()[0],
-            float('nan'),
-            e.tolerance,
-            e.unit_of(0),
-            ALL_MOTIONS[e.motion[0]],
+    found = []
+    for e in model.effects:
+        found.append(
+            GroupState(
+                e.sensor,
+                e.name,
+                Progress.WAITING,
+                e.param_names()[0],
+                float('nan'),
+                e.tolerance,
+                e.unit_of(0),
+                ALL_MOTIONS[e.motion[0]],
+            )
         )
-        for e in model.effects
-    ]
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +218,8 @@ def arrows_of(
 
     Up direction now, direction or axis of the next motion, arms that are not zero.
     """
-    step, centre = coverage.next, np.zeros(3)
+    step = coverage.next
+    centre = np.zeros(3)
     if coverage.up is not None:
         yield 'up now', centre, 0.85 * RADIUS * coverage.up, NOW
     if step.up is not None:
@@ -244,5 +247,6 @@ def label_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], str]:
             if np.isnan(coverage.seconds) or not coverage.seconds
             else f', about {coverage.seconds:.0f} s left'
         )
-        colour, line = TEXT_COLOUR, (coverage.next.text or 'go on') + left
+        colour = TEXT_COLOUR
+        line = (coverage.next.text or 'go on') + left
     return np.array([0.0, 0.0, 1.6 * RADIUS]), colour, line

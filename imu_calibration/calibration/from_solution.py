@@ -69,13 +69,13 @@ class ModelChanges:
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        return {
-            {'unstable': 'denied'}.get(name, name): (
-                list(value) if isinstance(value, tuple) else value
-            )
-            for name, value in vars(self).items()
-            if value
-        }
+        found = {}
+        for name, value in vars(self).items():
+            if value:
+                found[{'unstable': 'denied'}.get(name, name)] = (
+                    list(value) if isinstance(value, tuple) else value
+                )
+        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,7 +101,9 @@ def _compared(
 
     """
     held = counts > 0
-    before, after, counts = before[held], after[held], counts[held]
+    before = before[held]
+    after = after[held]
+    counts = counts[held]
     draw = np.random.default_rng(1).integers(0, len(counts), (BLOCK_RESAMPLES, len(counts)))
     with np.errstate(divide='ignore', invalid='ignore'):
         ratio = np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))

@@ -70,8 +70,10 @@ def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelErr
         Its parameters; a group are those of one effect.
 
     """
-    size, misfits = len(model.param_names), set()
-    factor, more = np.ones(size), np.zeros(size)
+    size = len(model.param_names)
+    misfits = set()
+    factor = np.ones(size)
+    more = np.zeros(size)
     for sensor in {effect.sensor for effect in model.effects}:
         # Groups are the parameters of one effect that the recording informs about.
         groups = []
@@ -112,7 +114,8 @@ def waves_of_blocks(
 
     `shared`: products of their fitted nuisances with the design, shape (k, n_nuisances, n_params).
     """
-    information, gradient = information[:, free][:, :, free], gradient[:, free]
+    information = information[:, free][:, :, free]
+    gradient = gradient[:, free]
     covariance = inverse_normal(
         information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free]
     )
@@ -152,7 +155,9 @@ class CosineScores:
     def __init__(
         self, places: np.ndarray, moved: np.ndarray, expected: np.ndarray, *, covariance: np.ndarray
     ):
-        self.places, self.moved, self.expected = places, moved, expected
+        self.places = places
+        self.moved = moved
+        self.expected = expected
         self.walk = 1 / (np.pi * np.arange(1, len(moved) + 1)) ** 2
         """
         Variance of each cosine of a random walk that has unit variance after the whole recording.
@@ -195,10 +200,13 @@ class CosineScores:
         makes the slow cosines smaller than expected: where the faster ones scatter less than
         expected, they are the reference of the test (F instead of chi-square).
         """
-        inverse, walk, moved = self._inverse(group), self.walk[:SLOW_WAVES], self.moved[:, group]
+        inverse = self._inverse(group)
+        walk = self.walk[:SLOW_WAVES]
+        moved = self.moved[:, group]
         fast = np.einsum('ki,kij,kj->k', moved, inverse, moved)[SLOW_WAVES:]
         fast_dof = fast.size * len(group)
-        inverse, moved = inverse[:SLOW_WAVES], moved[:SLOW_WAVES]
+        inverse = inverse[:SLOW_WAVES]
+        moved = moved[:SLOW_WAVES]
         score = walk @ (np.einsum('kij,kj->ki', inverse, moved) ** 2).sum(axis=1)
         mean = walk @ np.einsum('kii->k', inverse)
         spread = walk**2 @ np.einsum('kij,kij->k', inverse, inverse)

@@ -122,7 +122,8 @@ class NoiseLikelihood:
         In units of the axis' own typical noise.
         """
         # The other axes are the information on the parameters, with which this axis begins.
-        offset, bias = shape.offset * self.typical, shape.bias * self.typical
+        offset = shape.offset * self.typical
+        bias = shape.bias * self.typical
         processes = self.processes(bias, shape.time)
         others = self._rows.of_axes(np.arange(self._rows.variance.shape[1]) != axis)
         _, normal = whitened(self._with_errors(others, offset, processes))
@@ -192,7 +193,8 @@ def profile_each(normal: np.ndarray) -> np.ndarray:
 
     Of few parameters each, the calls for one after the other would take most of the time.
     """
-    information, right = normal[:, :-1, :-1], normal[:, :-1, -1]
+    information = normal[:, :-1, :-1]
+    right = normal[:, :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum('kii->ki', information), 1e-300))
     scaled = information / (scale[:, :, None] * scale[:, None, :])
     np.einsum('kii->ki', scaled)[:] += JITTER

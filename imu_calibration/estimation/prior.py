@@ -37,7 +37,8 @@ def make_prior(model: SensorModel) -> Prior:
     """
     mean, sd = model.prior()
     mean = np.where(np.isfinite(mean), mean, 0.0)
-    rows, gauge = [np.diag(1 / sd)], np.zeros((0, len(mean)))
+    rows = [np.diag(1 / sd)]
+    gauge = np.zeros((0, len(mean)))
     if {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}:
         arms = np.arange(len(mean))[model.part('accelerometer', Role.ARMS)].reshape(3, 3)
         gauge = np.zeros((3, len(mean)))

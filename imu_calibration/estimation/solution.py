@@ -208,8 +208,11 @@ def replace_weak(
         the prior value.
 
     """
-    moved, posterior, limits = values.copy(), of_fit(terms), np.broadcast_to(limit, values.shape)
-    replaced, smallest = np.zeros(len(values), bool), 1e-12 * np.diag(posterior)
+    moved = values.copy()
+    posterior = of_fit(terms)
+    limits = np.broadcast_to(limit, values.shape)
+    replaced = np.zeros(len(values), bool)
+    smallest = 1e-12 * np.diag(posterior)
     candidates = [k for k in weak if np.isfinite(prior[k])]
     while candidates := [k for k in candidates if posterior[k, k] > smallest[k]]:
         ratio = [(moved[k] - prior[k]) ** 2 / posterior[k, k] / limits[k] for k in candidates]
@@ -218,10 +221,8 @@ def replace_weak(
             break
         k = candidates.pop(least)
         slope = posterior[:, k] / posterior[k, k]
-        moved, posterior = (
-            moved + slope * (prior[k] - moved[k]),
-            posterior - np.outer(slope, posterior[k]),
-        )
+        moved = moved + slope * (prior[k] - moved[k])
+        posterior = posterior - np.outer(slope, posterior[k])
         replaced[k] = True
     moved[replaced] = prior[replaced]
     if not replaced.any():
@@ -291,17 +292,15 @@ def reasons_held(
 
     `replaced` by its prior, for those `tested` by likelihood ratio, or too weak data.
     """
-    return {
-        name: (
-            WEAK_DATA
-            if name not in replaced
-            else LIKELIHOOD_RATIO
-            if name in tested
-            else REPLACEMENT
-        )
-        for name, flag in zip(names, held, strict=True)
-        if flag
-    }
+    found = {}
+    for name, flag in zip(names, held, strict=True):
+        if not flag:
+            continue
+        if name not in replaced:
+            found[name] = WEAK_DATA
+        else:
+            found[name] = LIKELIHOOD_RATIO if name in tested else REPLACEMENT
+    return found
 
 
 def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarray:

@@ -198,7 +198,8 @@ def _gains(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (variances of the innovations, shape (n,), gains, shape (n, m)) of m processes."""
     spread = np.zeros((decay.shape[1],) * 2)
-    total, gain = np.empty(len(variance)), np.empty(decay.shape)
+    total = np.empty(len(variance))
+    gain = np.empty(decay.shape)
     for k, own in enumerate(variance):
         spread = decay[k][:, None] * spread * decay[k] + np.diag(fresh[k])
         reach = spread.sum(axis=1)

@@ -61,7 +61,8 @@ class Variable:
         """
         Ranges of neighbouring bins, 1 in each bin of a range, the shortest first, shape (r, k).
         """
-        count, places = int(self.bins.max()) + 1, np.arange(int(self.bins.max()) + 1)
+        count = int(self.bins.max()) + 1
+        places = np.arange(int(self.bins.max()) + 1)
         parts = []
         for length in range(1, count):
             starts = count if self.cyclic else count - length + 1
@@ -80,7 +81,8 @@ class Variable:
         if self.cyclic:
             turns = np.arange(1, SMOOTH_ORDER + 1) * (self.values * DEG)[:, None]
             return block_means(np.concatenate([np.cos(turns), np.sin(turns)], axis=1), self.starts)
-        low, high = self.values.min(), self.values.max()
+        low = self.values.min()
+        high = self.values.max()
         return block_means(
             np.polynomial.legendre.legvander(
                 2 * (self.values - low) / (high - low) - 1, SMOOTH_ORDER

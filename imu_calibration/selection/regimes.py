@@ -166,10 +166,8 @@ class AxisResidual:
 
         Each one of some columns is in the model in turn.
         """
-        size, product = (
-            np.maximum((marks * self.free(marks)).sum(axis=0), TINY),
-            marks.T @ self.values,
-        )
+        size = np.maximum((marks * self.free(marks)).sum(axis=0), TINY)
+        product = marks.T @ self.values
         return product / size, self.values @ self.values - product**2 / size
 
     def energy(self, columns: np.ndarray) -> float:

@@ -113,8 +113,12 @@ class Search:
         any_size: bool = False,
         resolved: AbstractSet[str] = frozenset(),
     ):
-        self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
-        self.encoder_step, self.any_size, self.resolved = encoder_step, any_size, resolved
+        self.evidence = evidence
+        self.baseline = tuple(baseline)
+        self.questions = questions
+        self.encoder_step = encoder_step
+        self.any_size = any_size
+        self.resolved = resolved
 
     def asking_any_size(self) -> 'Search':
         """Return a search that allows sizes that are known of no instrument too."""

@@ -127,15 +127,20 @@ def correlate(
     for name, columns, rows in explanations:
         if rows.sum() < 3 * columns.shape[1] + 6:
             continue
-        total, total_dof, rest, rest_dof = 0.0, 0, 0.0, 0
+        total = 0.0
+        total_dof = 0
+        rest = 0.0
+        rest_dof = 0
         for axis, own in enumerate(fitted):
             weight = 1 / noise_sd[rows, axis, None]
             design = weight * np.column_stack([bias, own, columns])[rows]
             values = weight[:, 0] * residual[rows, axis]
             misfit, dof = _misfit(design[:, : 1 + own.shape[1]], values)
-            total, total_dof = total + misfit, total_dof + dof
+            total = total + misfit
+            total_dof = total_dof + dof
             misfit, dof = _misfit(design, values)
-            rest, rest_dof = rest + misfit, rest_dof + dof
+            rest = rest + misfit
+            rest_dof = rest_dof + dof
         gained = total_dof - rest_dof
         if min(gained, rest_dof) <= 0:
             continue

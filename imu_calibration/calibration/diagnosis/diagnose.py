@@ -144,11 +144,10 @@ def helpful_formulas(
         if after.after > CLEARLY_BETTER * before.after:
             continue
         known = before.regimes
-        grown = [
-            name
-            for name, errors in after.regimes.items()
-            if name in known and errors.after > HARM * known[name].after
-        ]
+        grown = []
+        for name, errors in after.regimes.items():
+            if name in known and errors.after > HARM * known[name].after:
+                grown.append(name)
         if not grown:
             helpful.append(effect)
     return helpful

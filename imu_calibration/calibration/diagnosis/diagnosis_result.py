@@ -132,12 +132,12 @@ def parameters_of(
     declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
     part = solution.model.slices[sensor, effect]
     sd = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
-    return {
-        name: (float(value), float(spread), declared.unit_of(k))
-        for k, (name, value, spread) in enumerate(
-            zip(declared.param_names(), solution.values[part], sd)
-        )
-    }
+    found = {}
+    for k, (name, value, spread) in enumerate(
+        zip(declared.param_names(), solution.values[part], sd)
+    ):
+        found[name] = (float(value), float(spread), declared.unit_of(k))
+    return found
 
 
 DIAGNOSIS_FORMAT = 'imu_calibration/diagnosis/1'

@@ -307,11 +307,10 @@ def strongest_refused(diagnosis: Diagnosis) -> Candidate | None:
 
     None where no refused effect is significant.
     """
-    refused = [
-        row
-        for row in diagnosis.candidates
-        if row.verdict in WHY_NOT and _gain_of(row) > MIN_GAIN_NATS
-    ]
+    refused = []
+    for row in diagnosis.candidates:
+        if row.verdict in WHY_NOT and _gain_of(row) > MIN_GAIN_NATS:
+            refused.append(row)
     return max(refused, key=_gain_of, default=None)
 
 

@@ -117,7 +117,9 @@ def candidates_of(
     """
     superseded = {question.name for question in replaced}
     refused_later = {question.name for question in withdrawn}
-    found, mates, rows = {question.name for question in named}, {}, {}
+    found = {question.name for question in named}
+    mates = {}
+    rows = {}
     for question in named:
         for mate, _ in search.confounded(named, question):
             mates.setdefault(mate.name, question.name)
@@ -227,7 +229,8 @@ def finding(
         return fitted(search, with_exchanged(named, place, mate), mate)
 
     score = search.score([q for q in named if q is not question], question)
-    gain, explained = gain_of(place), share(named, question)
+    gain = gain_of(place)
+    explained = share(named, question)
     if question.effect.key in solution.model.slices:
         parameters = parameters_of(solution, question.sensor, question.name)
     else:

@@ -189,7 +189,8 @@ class DistanceSums:
     def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
         """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
         n, rest, *squares = np.array(self._rows[sensor]).T
-        models, still = (squares[:2], squares[2:]), rest > 0
+        models = (squares[:2], squares[2:])
+        still = rest > 0
         pairs = (
             [(within + n * mean, 3 * n) for within, mean in models],
             [(mean, 0 * n + 3) for _, mean in models],

@@ -518,7 +518,9 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
 
     Its information, reduced by the growth of its standard deviations beyond noise.
     """
-    model, statistics, poses = hand.hand_model, hand.statistics, hand.poses
+    model = hand.hand_model
+    statistics = hand.statistics
+    poses = hand.poses
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
     known = expected < UNKNOWN_SHARE * model.priors
     wider = max(1.0, float(np.max(np.where(known, hand.judged_sd / expected, 0.0))))

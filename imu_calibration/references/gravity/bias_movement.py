@@ -76,7 +76,8 @@ def _of_norms(time: np.ndarray, residual: np.ndarray, base: np.ndarray) -> BiasM
     both = np.hstack([base, *(power[:, None] * base[:, 0:3] for power in powers.T)])
 
     # F test of the drift, on the columns that are independent.
-    known, new = orthonormal_basis(base), orthonormal_basis(both)
+    known = orthonormal_basis(base)
+    new = orthonormal_basis(both)
     spare = len(time) - new.shape[1]
     square_before = np.sum((residual - known @ (known.T @ residual)) ** 2)
     square_after = np.sum((residual - new @ (new.T @ residual)) ** 2)

@@ -220,7 +220,10 @@ class _Equations:
     def __init__(
         self, model: HandModel, poses: Poses, state: State, memory: dict[int, _RememberedTurn]
     ):
-        self.model, self.poses, self.state, self.memory = model, poses, state, memory
+        self.model = model
+        self.poses = poses
+        self.state = state
+        self.memory = memory
         self.across = tangent(state.up)
         self.true_force = model.gravity * state.up
         linear = model.linear(state.values)
@@ -233,7 +236,9 @@ class _Equations:
 
         Three rows per pose, two of them used for its direction.
         """
-        model, poses, true = self.model, self.poses, self.true_force
+        model = self.model
+        poses = self.poses
+        true = self.true_force
         more, slopes = model.further('accelerometer', self.state.values, true, **poses.conditions)
         main = np.zeros((len(true), 3, model.size))
         main[:, :, 0:3] = np.eye(3)
@@ -286,7 +291,8 @@ class _Equations:
         component: int,
     ) -> Rows:
         """Return three rows per pose; `blocks`: their columns of its own nuisances at `place`."""
-        own, size = np.arange(len(residual)), residual.size
+        own = np.arange(len(residual))
+        size = residual.size
         nuisance = np.zeros((*residual.shape, len(residual), 5))
         nuisance[own, :, own, place] = blocks
         return scalar_rows(
@@ -307,7 +313,8 @@ class _Equations:
         """
         model = self.model
         sums = zero_sum_rows(model.model)
-        count, n_poses = len(sums), len(self.state.up)
+        count = len(sums)
+        n_poses = len(self.state.up)
         return scalar_rows(
             np.zeros((count, 5 * n_poses)),
             sums,
@@ -332,7 +339,8 @@ class _Equations:
         mat_ji, turn = self._integrated(data, bias, number)
         mat_ji = between_middles(self.poses, data, mat_ji)
         carried = mat_ji @ state.up[i]
-        across_i, across_j = self.across[i], self.across[j]
+        across_i = self.across[i]
+        across_j = self.across[j]
 
         # By the gyroscope's parameters, through psi.
         by_psi = across_j.T @ skew(carried)
@@ -384,7 +392,8 @@ class _Equations:
 
         It is ``matrix^-1 integral(measured - bias - further effects) = known``, whitened.
         """
-        model, count = self.model, len(self.state.up)
+        model = self.model
+        count = len(self.state.up)
         output, columns = self._further_of_turn(data, self.gyro_bias)
         turn = integrate_turn(
             data.time,

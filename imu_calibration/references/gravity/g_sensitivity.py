@@ -68,7 +68,8 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
     full = np.column_stack([course, poses.force / np.linalg.norm(poses.force, axis=1).mean()])
     if count < full.shape[1] + MIN_PROCESS_FREEDOM:
         return dict(NO_EVIDENCE)
-    up, first = full[:, course.shape[1] :], course.shape[1]
+    up = full[:, course.shape[1] :]
+    first = course.shape[1]
     upwards = np.trace(np.linalg.lstsq(full, poses.rate, rcond=None)[0][first:]) / 3
     rate = poses.rate - np.clip(upwards, -EARTH_RATE, EARTH_RATE) * up
     apart = np.abs(time[:, None] - time)

@@ -406,7 +406,8 @@ def _solved(
         found, integrated = solved(model, poses, turns)
         # The columns below are computed at the estimate.
         integrated = {} if model.model.relinearised else integrated
-        settled, model = _settled(model, found), model.at(found.state.values)
+        settled = _settled(model, found)
+        model = model.at(found.state.values)
         poses, turns, out = without_outlying_poses(
             model, found, poses=poses, turns=turns, integrated=integrated
         )
@@ -436,10 +437,8 @@ def _solved(
         terms[PLACEMENTS] = excess(expected, total(terms), free)
     terms = bounded_by_prior(terms, found.held, model.priors)
     # The result has all poses unchanged, also excluded and drifting ones.
-    used, poses = (
-        poses,
-        data.poses,
-    )
+    used = poses
+    poses = data.poses
     goals = tolerances_of(model.model, options.tolerances)
     statistics = {
         **data.statistics,
@@ -452,7 +451,8 @@ def _solved(
         **_statistics(model, found, poses, turns),
     }
     if options.gravity_sd:
-        sd, goal = options.gravity_sd / options.gravity, float(goals[3])
+        sd = options.gravity_sd / options.gravity
+        goal = float(goals[3])
         statistics['common_scale'] = {
             'sd': sd,
             'tolerance': goal,
@@ -497,11 +497,10 @@ def _hidden_covariance(model: HandModel, poses: Poses) -> np.ndarray:
 
 def _settled(model: HandModel, found: RowEstimate) -> bool:
     """Return whether the columns of warm-ups were computed close enough to the solution."""
-    known = [
-        (model.model.slices[e.key].stop - 1, model.model.point_of(e)[-1])
-        for e in model.extras
-        if e.time_constant
-    ]
+    known = []
+    for e in model.extras:
+        if e.time_constant:
+            known.append((model.model.slices[e.key].stop - 1, model.model.point_of(e)[-1]))
     return all(
         found.held[k] or abs(found.state.values[k] / time - 1) <= MAX_SETTLED_CHANGE
         for k, time in known

@@ -224,10 +224,8 @@ class HandModel:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate for readings of shape (m, 3)."""
         bias_f, matrix_f, bias_w, matrix_w = self.linear(values)
-        true_f, true_w = (
-            np.linalg.solve(matrix_f, (force - bias_f).T).T,
-            np.linalg.solve(matrix_w, (rate - bias_w).T).T,
-        )
+        true_f = np.linalg.solve(matrix_f, (force - bias_f).T).T
+        true_w = np.linalg.solve(matrix_w, (rate - bias_w).T).T
         for _ in range(REPEATS if self.extras else 0):
             more_f, more_w = (
                 self.further(

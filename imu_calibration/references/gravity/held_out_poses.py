@@ -362,7 +362,9 @@ class _Turns(PlainEquations):
 
     def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return the parameters after a step with some of the poses, and the turns between them."""
-        hand, model, fitted = self.hand, self.hand.hand_model, self.plan.fitted
+        hand = self.hand
+        model = self.hand.hand_model
+        fitted = self.plan.fitted
         bias = np.zeros(len(values), bool)
         bias[model.gyro_bias] = True
         moved = values.copy()

@@ -282,7 +282,8 @@ def hand_coverage(
     steps = foretold(knowledge)
     if not steps:
         return no_gain
-    first, worth = steps[0], knowledge.best()[1]
+    first = steps[0]
+    worth = knowledge.best()[1]
     return Coverage(
         worth,
         seen,
@@ -346,17 +347,18 @@ class LiveByHand(LiveSession):
         saved: bytes | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self.options, self.settings, self._clock = by_hand.at_place(options), settings, clock
+        self.options = by_hand.at_place(options)
+        self.settings = settings
+        self._clock = clock
         self._asked = hand_options(self.options)
         _check_model(self.model)
-        self._check, self._store, self._drops = (
-            StreamCheck(one_sensor=True),
-            HandStore(by_hand.hand_samples),
-            Counter(),
-        )
+        self._check = StreamCheck(one_sensor=True)
+        self._store = HandStore(by_hand.hand_samples)
+        self._drops = Counter()
         if saved is not None:
             self._store.load(saved)
-        self._pacer, self._unsearched = SolvePacer(SEARCH_SHARE), 0
+        self._pacer = SolvePacer(SEARCH_SHARE)
+        self._unsearched = 0
         self._reported_ns: int | None = None
         self._shown: tuple[tuple, Coverage] | None = None
         self.found = EMPTY_SCAN
@@ -533,7 +535,8 @@ class LiveByHand(LiveSession):
         """
         if self.result is None or not poses:
             return None
-        mean, hand = ImuSamples.concatenate(poses), self.result.applied
+        mean = ImuSamples.concatenate(poses)
+        hand = self.result.applied
         time = 1e-9 * (mean.stamp_ns - self.result.gathered.first_stamp_ns)
         true, turning = hand.compensate(mean.force_s, mean.rate_s, time)
         gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]

@@ -88,11 +88,9 @@ class HandInvestigation(SelectedEffects):
     @cached_property
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the residual that no finding explains."""
-        blocks, evidence, used = (
-            self.problem.blocks,
-            self.problem.evidence,
-            self.search.indices(self.named),
-        )
+        blocks = self.problem.blocks
+        evidence = self.problem.evidence
+        used = self.search.indices(self.named)
         return {
             sensor: unexplained_by_hand(self.baseline, blocks, evidence, used=used, sensor=sensor)
             for sensor in SENSORS
@@ -104,10 +102,8 @@ class HandInvestigation(SelectedEffects):
 
         From the rows of `problem`.
         """
-        fit, warm = (
-            problem.search.values(chosen),
-            [question for question in chosen if '@' in question.label],
-        )
+        fit = problem.search.values(chosen)
+        warm = [question for question in chosen if '@' in question.label]
         return {
             q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])])
             for q in warm
@@ -123,7 +119,9 @@ class HandInvestigation(SelectedEffects):
 
         `problem` has the rows for the estimate, those of this investigation or fewer.
         """
-        hand, point, fit = self.baseline, self.point(problem, chosen), problem.search.values(chosen)
+        hand = self.baseline
+        point = self.point(problem, chosen)
+        fit = problem.search.values(chosen)
         base = hand.model
         extended = base
         for question in chosen:
@@ -224,7 +222,8 @@ def _why_not(
     if not possible_by_hand(effect):
         return 'gravity in poses and the turns between them do not show it', 'record on a table'
     span = None if poses.temperature_c is None else float(np.ptp(poses.temperature_c))
-    if why := lacking_temperature(effect, span):
+    why = lacking_temperature(effect, span)
+    if why:
         return why
     if effect.role is Role.CROSS and not follows_gravity:  # the same test as in calibration
         return (
@@ -252,7 +251,8 @@ def _questions(
 
     An effect that is collinear with the baseline in these poses is moved to `not_testable`.
     """
-    by_name, asked = {e.name: e for e in effects}, []
+    by_name = {e.name: e for e in effects}
+    asked = []
     probe = RowEvidence(blocks, space.prior_sd, {}, baseline=base)
     for label, part in space.parts.items():
         name = label.split('@')[0]

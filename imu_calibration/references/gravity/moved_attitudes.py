@@ -46,7 +46,9 @@ def require_no_sway(
     at_rest = np.zeros(len(imu), bool)
     for start, stop in rests:
         at_rest[start:stop] = True
-    forces, rates, length = [], [], []
+    forces = []
+    rates = []
+    length = []
     for start, stop in _kept_attitudes(imu):
         if not at_rest[start:stop].any():
             forces.append(imu.force_s[start:stop])
@@ -84,7 +86,8 @@ def _kept_attitudes(imu: ImuSamples) -> list[tuple[int, int]]:
         if piece < count and up[first] @ up[piece] > np.cos(KEPT_ANGLE):
             continue
         # The first and the last piece may hold the end of a turn.
-        start, stop = (first + 1) * width, (piece - 1) * width
+        start = (first + 1) * width
+        stop = (piece - 1) * width
         if (stop - start) * period >= KEPT_SECONDS:
             ranges.append((start, stop))
         first = piece

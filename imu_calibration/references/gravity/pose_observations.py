@@ -191,7 +191,8 @@ class PoseObservations:
         """
         hand, poses = result.applied, result.applied.poses
         force, rate = poses.force, poses.rate
-        true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
+        true = hand.gravity * hand.state.up
+        zero = np.zeros_like(rate)
         corrected_force, corrected_rate = hand.compensate(
             force, rate, poses.time, temperature_c=poses.temperature_c
         )

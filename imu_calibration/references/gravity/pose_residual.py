@@ -59,7 +59,10 @@ def unexplained_by_hand(
     sensor : str
 
     """
-    residuals, sigma, rms, chosen = evidence.residuals(used), -np.inf, 0.0, None
+    residuals = evidence.residuals(used)
+    sigma = -np.inf
+    rms = 0.0
+    chosen = None
     for block, residual in zip(blocks, residuals):
         if block.sensor != sensor:
             continue
@@ -72,10 +75,13 @@ def unexplained_by_hand(
             size = 1.0 if block.duration is None else block.duration[:, None] ** 2
             excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
             if own > sigma:
-                sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
+                sigma = own
+                rms = float(np.sqrt(max(excess, 0.0)))
+                chosen = block
     count = len(hand.poses)
     first = next(k for k, block in enumerate(blocks) if block.sensor == sensor)
-    layers, noise_sd = residuals[first], np.sqrt(blocks[first].floor)
+    layers = residuals[first]
+    noise_sd = np.sqrt(blocks[first].floor)
     significant = bool(sigma > SIGNIFICANT_SDS and count >= MIN_EXPLAINED_WINDOWS)
     unit = None if chosen is None or chosen.duration is None else TURN_RESIDUAL_UNIT
     sigma = float(max(sigma, -99.0))
@@ -136,10 +142,8 @@ def regimes_by_hand(
     names = AXES if residual.shape[1] == len(AXES) else (NORM,)
     poses = np.arange(len(residual))
     exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
-    search, found = (
-        RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange),
-        [],
-    )
+    search = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange)
+    found = []
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
         rest = AxisResidual(

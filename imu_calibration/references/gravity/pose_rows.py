@@ -235,7 +235,9 @@ def _turn_block(
     bias_f, matrix_f = hand.accelerometer
     matrix = hand.gyroscope[1]
     across = tangent(hand.state.up)
-    rows, known, durations = [], [], []
+    rows = []
+    known = []
+    durations = []
     for turn in turns:
         # True inputs during the turn, and the columns of further effects less those at rest.
         i, j = turn.first, turn.last

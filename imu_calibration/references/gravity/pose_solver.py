@@ -89,7 +89,9 @@ def _model_error(reference: GravityRows, found: RowEstimate) -> ModelError:
 
     None where parts are fitted almost exactly: they have no scatter to compare.
     """
-    model, free, count = reference.model, found.free, len(reference.poses)
+    model = reference.model
+    free = found.free
+    count = len(reference.poses)
     rows = reference.linearise(found.state)
     # The rows of poses and turns, without those that directions and parameters need; the bias of
     # the gyroscope is determined at rest.

@@ -132,10 +132,12 @@ def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: SensorNoise)
     ``d force / dt = -rate x force``: the part across gravity. Zero where the slopes of all poses
     together are no more than noise.
     """
-    rates, excess = np.zeros((len(forces), 3)), 0.0
+    rates = np.zeros((len(forces), 3))
+    excess = 0.0
     for pose, (force, seconds) in enumerate(zip(forces, length)):
         since = np.linspace(-0.5, 0.5, len(force)) * seconds
-        slope, up = since @ force / (since @ since), force.mean(axis=0)
+        slope = since @ force / (since @ since)
+        up = force.mean(axis=0)
         rates[pose] = np.cross(slope, up) / (up @ up)
         across = np.cross(up, rates[pose])
         excess += across @ across * (since @ since) / np.mean(noise.low_variance)
@@ -175,7 +177,8 @@ def _pooled_noise(
             ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * length / within**2)
     if not ratios:
         return SensorNoise(within**2, np.ones(3))
-    ratio, margin = np.mean(ratios, axis=0), 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
+    ratio = np.mean(ratios, axis=0)
+    margin = 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
     return SensorNoise(within**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
 
@@ -233,7 +236,9 @@ def collect_turns(
 
     `temperature_c` is that of the samples or None.
     """
-    turns, dropped, rate = [], {}, imu.rate_s
+    turns = []
+    dropped = {}
+    rate = imu.rate_s
     limit = max(MAX_TURN_GAP, 5 * poses.period)
     ended = at_range_end(rate)
     density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
@@ -333,7 +338,8 @@ def _at_end(signed: Callable, axes: np.ndarray, fresh: np.ndarray) -> np.ndarray
 
 def _largest(signed: Callable, axis: np.ndarray, fresh: np.ndarray) -> np.ndarray:
     """Return the largest values of ``signed(axis[fresh])``, block by block."""
-    largest, least = np.zeros(0), -np.inf
+    largest = np.zeros(0)
+    least = -np.inf
     for start in range(0, len(axis), SAMPLES_AT_ONCE):
         stop = start + SAMPLES_AT_ONCE
         values = signed(axis[start:stop])
@@ -383,7 +389,8 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
     stamps, as with a driver that polls the sensor at uneven times.
     """
     stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
-    even, step = stamps.copy(), np.diff(stamps)
+    even = stamps.copy()
+    step = np.diff(stamps)
     period = float(np.median(step))
     edges = np.flatnonzero(step / period > MOST_LOST + MAX_REGULAR_STEP) + 1
     del step  # a long recording is large
@@ -402,7 +409,8 @@ def _clock_times(stamps: np.ndarray, period: float) -> np.ndarray:
     """
     Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed.
     """
-    step, numbers = np.diff(stamps) / period, [np.arange(float(len(stamps)))]
+    step = np.diff(stamps) / period
+    numbers = [np.arange(float(len(stamps)))]
     lost = (step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE)
     if lost.any():  # long steps of a rebuilt clock need not be lost samples
         numbers.insert(0, np.concatenate([[0.0], np.cumsum(np.where(lost, np.rint(step), 1.0))]))

@@ -41,7 +41,8 @@ class HandStore:
     def __init__(self, most: int):
         self.most = most
         self._parts: list[ImuSamples] = []
-        self._stamps, self.forgotten = ContinuedStamps(INSERTED_PAUSE_NS), 0
+        self._stamps = ContinuedStamps(INSERTED_PAUSE_NS)
+        self.forgotten = 0
 
     def __len__(self) -> int:
         return sum(len(part) for part in self._parts)
@@ -133,7 +134,8 @@ class HandStore:
 
     def to_bytes(self) -> bytes:
         """Return the samples as an npz archive."""
-        target, imu = io.BytesIO(), self.samples()
+        target = io.BytesIO()
+        imu = self.samples()
         if imu is None:
             imu = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
         np.savez(

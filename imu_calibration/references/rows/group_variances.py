@@ -70,7 +70,8 @@ def estimate_group_variances(
 
     current = np.where(free, start, fallback)
     for _ in range(SCORING_STEPS):
-        typical, step = problem.typical(current), problem.step(current, free)
+        typical = problem.typical(current)
+        step = problem.step(current, free)
         settled = np.all(np.abs(step.variance - current) <= 1e-3 * typical)
         current = step.variance
         if settled:
@@ -106,7 +107,8 @@ def scoring(rows: Rows, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     factor = triangular_of_band(white)
     # Only the rows of groups: the cost grows with the square of their number.
     some = members.any(axis=0)
-    white, weighted = white[some], (members / rows.variance.ravel())[:, some]
+    white = white[some]
+    weighted = (members / rows.variance.ravel())[:, some]
     # With A = Q R, `left` is Q of these rows: residuals e = y - Q Q'y, hat matrix H = Q Q'.
     left = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
     rest = white[:, -1] - left @ factor[:-1, -1]

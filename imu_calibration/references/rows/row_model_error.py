@@ -37,7 +37,9 @@ def model_error_of_rows(
     fitted = scipy.linalg.qr(nuisances, mode='economic')[0]
     main = main - fitted @ (fitted.T @ main)
 
-    information, gradient, shared = [], [], []
+    information = []
+    gradient = []
+    shared = []
     for number in range(block.max() + 1):
         own = block == number
         information.append(main[own].T @ main[own])

@@ -193,7 +193,9 @@ class Accumulator(_CentredRows):
         Their difference joins the centred rows of their kind. Without such neighbours the oldest
         row is lost.
         """
-        thinned, index, older = [], 0, len(self.rows) // 2
+        thinned = []
+        index = 0
+        older = len(self.rows) // 2
         while index <= min(older, len(self.rows) - 2):
             first, second = self.rows[index : index + 2]
             if (first.kind, first.session) != (second.kind, second.session):
@@ -237,7 +239,8 @@ def _difference(first: WindowStatistics, second: WindowStatistics, sensor: str) 
 def _joined(first: WindowStatistics, second: WindowStatistics) -> WindowStatistics:
     """Return two windows as one, with means by their numbers of samples."""
     total = first.count + second.count
-    share_of_first, share_of_second = first.count / total, second.count / total
+    share_of_first = first.count / total
+    share_of_second = second.count / total
 
     def mean(of_first: np.ndarray, of_second: np.ndarray) -> np.ndarray:
         return share_of_first * of_first + share_of_second * of_second

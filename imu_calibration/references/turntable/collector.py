@@ -306,13 +306,11 @@ class Collector:
         without: np.ndarray = NO_RANGES,
         unusable: Sequence[str] = (),
     ):
-        self.table, self.model, self.session, self.windows, self.spread = (
-            table,
-            model,
-            session,
-            windows,
-            spread,
-        )
+        self.table = table
+        self.model = model
+        self.session = session
+        self.windows = windows
+        self.spread = spread
         self.gatherer = MotionGatherer(
             table,
             settings,

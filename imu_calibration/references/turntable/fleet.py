@@ -186,7 +186,8 @@ def _spread(name: str, unit: str, found: Sequence[tuple[float, float, str]]) -> 
         missing = float('nan')
         return Spread(name, unit, 0, missing, missing, missing, (missing, ''), (missing, ''))
     value, sd = (np.array(column) for column in list(zip(*found, strict=True))[:2])
-    low, high = found[int(np.argmin(value))], found[int(np.argmax(value))]
+    low = found[int(np.argmin(value))]
+    high = found[int(np.argmax(value))]
     spread = float(value.std(ddof=1)) if len(value) > 1 else float('nan')
     return Spread(
         name,

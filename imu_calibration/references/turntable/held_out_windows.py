@@ -288,7 +288,8 @@ def _nuisances(stacked: np.ndarray) -> tuple[np.ndarray, float]:
 
     The delay is the first nuisance. The sum of squares without a delay is returned as well.
     """
-    error, changes = stacked[0].ravel(), stacked[1:].reshape(len(stacked) - 1, -1)
+    error = stacked[0].ravel()
+    changes = stacked[1:].reshape(len(stacked) - 1, -1)
     best = np.linalg.lstsq(changes.T, -error, rcond=1e-9)[0]
     others = changes[1:]
     rest = np.linalg.lstsq(others.T, -error, rcond=1e-9)[0] if len(others) else np.zeros(0)
@@ -319,11 +320,9 @@ class _Correction:
 
         The delay, s, and the arm, m.
         """
-        columns, slope, output = (
-            rows[:, : -2 * N_AXES],
-            rows[:, -2 * N_AXES : -N_AXES],
-            rows[:, -N_AXES:],
-        )
+        columns = rows[:, : -2 * N_AXES]
+        slope = rows[:, -2 * N_AXES : -N_AXES]
+        output = rows[:, -N_AXES:]
         # measured(t) = matrix @ true(t - delay): the error is the delay times the slope.
         parts = [
             output - columns @ self.total,
@@ -380,7 +379,8 @@ def _linearised(
     designs = []
     targets = []
     for group in groups:
-        columns, output = group[:, : len(total)], group[:, -N_AXES:]
+        columns = group[:, : len(total)]
+        output = group[:, -N_AXES:]
         designs.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
         targets.append((output - columns @ total).ravel())
     return designs, targets

@@ -172,7 +172,8 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
     if len(design) < design.shape[1] + LEAST_WINDOWS:
         return ()
     weight = _weights_of_kinds(windows, design)
-    design, measured = design * weight[:, None], windows.measured * weight[:, None]
+    design = design * weight[:, None]
+    measured = windows.measured * weight[:, None]
     left, singular, right = np.linalg.svd(design, full_matrices=False)
     if singular[-1] <= 1e-6 * singular[0]:
         return ()

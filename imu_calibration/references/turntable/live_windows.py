@@ -148,7 +148,9 @@ class LiveCalibration(LiveSession):
         *,
         saved: bytes | None = None,
     ):
-        self.table, self.options, self.settings = table, options, settings
+        self.table = table
+        self.options = options
+        self.settings = settings
         self.earlier, known, extension = (
             (None, None, ModelExtension()) if saved is None else from_bytes(saved)
         )
@@ -205,11 +207,10 @@ class LiveCalibration(LiveSession):
     @property
     def frame_id(self) -> str:
         """Frame of the sensor; '' before the first message."""
-        known = [
-            part.frame_id
-            for part in (self.earlier, self._collector and self._collector.gathered)
-            if part
-        ]
+        known = []
+        for part in (self.earlier, self._collector and self._collector.gathered):
+            if part:
+                known.append(part.frame_id)
         return next(filter(None, known), '')
 
     def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> bool:

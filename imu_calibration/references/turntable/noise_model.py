@@ -178,7 +178,8 @@ class NoiseModel(SensorNoise):
 
         The instants are about the middle of a window, in s, and the result has shape (n, n).
         """
-        away, apart = np.abs(offsets), np.abs(np.subtract.outer(offsets, offsets))
+        away = np.abs(offsets)
+        apart = np.abs(np.subtract.outer(offsets, offsets))
         return sum(
             (
                 process.sd**2
@@ -236,7 +237,8 @@ class NoiseModel(SensorNoise):
                 continue
             if kind not in other.moving:
                 return False
-            its, unit = other.moving[kind], self.low_variance / other.low_variance
+            its = other.moving[kind]
+            unit = self.low_variance / other.low_variance
             if any(
                 np.any(np.abs(unit * a / b - 1) > SAME_VARIANCE)
                 for a, b in ((mine.every, its.every), (mine.slow, its.slow))

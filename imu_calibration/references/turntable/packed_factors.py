@@ -17,7 +17,8 @@ def unpacked(factors: Sequence[np.ndarray], width: int) -> np.ndarray:
 
     Rows of zeros complete the shorter ones.
     """
-    places, longest = _places(width), max(map(len, factors))
+    places = _places(width)
+    longest = max(map(len, factors))
     rows = places[longest - 1] // width + 1 if longest else 0
     found = np.zeros((len(factors), rows * width))
     for row, factor in zip(found, factors):

@@ -38,12 +38,14 @@ def _cautious(solution: Solution) -> np.ndarray:
     regularised with LINEAR_STEPS towards the point. A time constant is positive: its step ends at
     the share `LEAST_TIME_CONSTANT` of the point at the latest.
     """
-    model, values = solution.model, solution.values.copy()
+    model = solution.model
+    values = solution.values.copy()
     for effect in model.relinearised:
         if effect.time_constant:
             last = model.slices[effect.key].stop - 1
             values[last] = max(values[last], LEAST_TIME_CONSTANT * model.point_of(effect)[-1])
-    move, pull = np.zeros(len(values)), np.zeros(len(values))
+    move = np.zeros(len(values))
+    pull = np.zeros(len(values))
     for effect in model.relinearised:
         if effect.warp is not None:
             part = model.slices[effect.key]

@@ -60,7 +60,10 @@ class WindowStore:
     """
 
     def __init__(self, most: int, complete: bool = True):
-        self._most, self._entries, self._n_samples, self._n_static = most, [], 0, 0
+        self._most = most
+        self._entries = []
+        self._n_samples = 0
+        self._n_static = 0
         self.complete = complete and most > 0
 
     def copy(self) -> 'WindowStore':
@@ -315,7 +318,9 @@ class HeldOut:
         Noise and held parameters are those of the solution; a parameter that only the fold
         determines is set to its prior.
         """
-        model, prior, values = solution.model, make_prior(solution.model), solution.values
+        model = solution.model
+        prior = make_prior(solution.model)
+        values = solution.values
         free = ~fixed_parameters(model) & ~solution.held
         parts = [
             _linearised(self.blocks[fold::TABLE_FOLDS], solution) for fold in range(TABLE_FOLDS)
@@ -334,7 +339,8 @@ def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution) -> np.ndarra
 
     It covers all windows of some blocks, weighed by noise.
     """
-    n_params, rows = len(solution.values), []
+    n_params = len(solution.values)
+    rows = []
     for block in blocks:
         if block.accumulator.rows:
             system = WeightedSystem(block.accumulator, solution.model)
@@ -363,7 +369,11 @@ class DecimatedWindows:
     """
 
     def __init__(self, most: int = MAX_KEPT_SAMPLES) -> None:
-        self.most, self.n_samples, self._stride, self._counts, self._kept = most, 0, 1, {}, []
+        self.most = most
+        self.n_samples = 0
+        self._stride = 1
+        self._counts = {}
+        self._kept = []
 
     def add(self, window: Window) -> None:
         """Add a window in order of time, as a copy in separate memory (`owned_window`)."""

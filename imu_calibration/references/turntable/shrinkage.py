@@ -22,7 +22,8 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
         Parameters of each effect.
 
     """
-    values, prior = solution.values.copy(), make_prior(solution.model).mean
+    values = solution.values.copy()
+    prior = make_prior(solution.model).mean
     covariance = of_fit(solution.terms)
     for part in parts:
         at = np.arange(part.start, part.stop)[~solution.held[part]]

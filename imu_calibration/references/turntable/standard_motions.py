@@ -102,7 +102,8 @@ def _turn(
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
     up = np.asarray(up, float) / np.linalg.norm(up)
     up_s = rotation(-angle[:, None] * axis) @ up
-    rate_s, alpha_s = rate[:, None] * axis, alpha[:, None] * axis
+    rate_s = rate[:, None] * axis
+    alpha_s = alpha[:, None] * axis
     # f = g + alpha x r + omega x (omega x r)
     force = gravity * up_s
     arm, shaking = surroundings.arm, surroundings.shaking
@@ -239,7 +240,8 @@ def _two_axis(gravity: float) -> list[Reference]:
     """
     pieces = []
     w = 200 * DEG
-    cos, sin = np.cos(w * MOTION_TIME), np.sin(w * MOTION_TIME)
+    cos = np.cos(w * MOTION_TIME)
+    sin = np.sin(w * MOTION_TIME)
     for inner, outer in ((0, 1), (1, 2), (2, 0)):
         third = 3 - inner - outer
         rate, alpha, up = np.zeros((3, len(MOTION_TIME), 3))

@@ -310,16 +310,18 @@ def _by_default(model: SensorModel, options: CalibrationOptions) -> list[slice]:
     # A model with an error of table or clock that the recordings support is that of a request for
     # it: levelling and the Earth's rate are estimated in both.
     as_described = not any(sensor == 'reference' for sensor, _ in options.added)
-    return [
-        model.slices[effect.key]
-        for effect in model.effects
-        if effect.role is Role.ARMS
-        and arms
-        or effect.sensor == 'reference'
-        and effect.nuisance
-        and options.reference_model is None
-        and as_described
-    ]
+    found = []
+    for effect in model.effects:
+        if (
+            effect.role is Role.ARMS
+            and arms
+            or effect.sensor == 'reference'
+            and effect.nuisance
+            and options.reference_model is None
+            and as_described
+        ):
+            found.append(model.slices[effect.key])
+    return found
 
 
 def _size_effect_unseen(solution: Solution) -> bool:

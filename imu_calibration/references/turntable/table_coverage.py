@@ -76,11 +76,10 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     after = np.array([left(base + added(rest)) for rest in REST_WITH_UP])
     worth = share_gained(left(base), after)
     possible = possible_motions(cast(WindowObservations, result.data).table)
-    motions = [
-        motion
-        for motion in (MOTIONS if possible is None else possible)
-        if motion.seconds < MAX_MOTION_SECONDS
-    ]
+    motions = []
+    for motion in MOTIONS if possible is None else possible:
+        if motion.seconds < MAX_MOTION_SECONDS:
+            motions.append(motion)
     first, seconds = _foretold(base, left, added, motions)
     step = _next_on_table(result) if first is None else _step(first.text)
     errors = result.window_errors()
@@ -108,7 +107,9 @@ def _foretold(
 
     (None, NaN) if these motions do not suffice.
     """
-    first, seconds, missing = None, 0.0, left(information)
+    first = None
+    seconds = 0.0
+    missing = left(information)
     more = [added(motion) for motion in motions] if missing else []
     for _ in range(MAX_MOTIONS_AHEAD):
         if not missing:
@@ -121,8 +122,10 @@ def _foretold(
         )
         if best is None or missing - remaining[best] < MIN_MOTION_GAIN * missing:
             break
-        first, seconds = first or motions[best], seconds + motions[best].seconds
-        information, missing = information + more[best], remaining[best]
+        first = first or motions[best]
+        seconds = seconds + motions[best].seconds
+        information = information + more[best]
+        missing = remaining[best]
     return None, float('nan')
 
 

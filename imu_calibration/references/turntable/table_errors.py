@@ -47,11 +47,10 @@ def calibrate_with_table_errors(
     if options.as_asked or not _unlike_noise(result):
         return TableErrors(result, ())
     # The ones that the table has: the zero of the first joint is part of the attitude of the base.
-    added = [
-        key
-        for key, effect in result.model.catalogue.effects(recordings.table.joint_names).items()
-        if effect.set_up_fault is not None
-    ]
+    added = []
+    for key, effect in result.model.catalogue.effects(recordings.table.joint_names).items():
+        if effect.set_up_fault is not None:
+            added.append(key)
     extended_options = replace(options, added=(*options.added, *added))
     extended = conclude(recordings.solved(extended_options), extended_options)
     findings = _table_error_findings(extended)
@@ -87,7 +86,8 @@ def _table_error_findings(result: TableResult) -> list[CheckFinding]:
         for index, component in enumerate(effect.components, first):
             if not significant[index] or calibration.status[index] is Status.HELD:
                 continue
-            value, sd = float(calibration.values[index]), float(calibration.sd[index])
+            value = float(calibration.values[index])
+            sd = float(calibration.sd[index])
             text = effect.set_up_fault(component, value, sd)
             findings.append(CheckFinding(effect.name, WARNING, text))
     return findings

@@ -247,11 +247,10 @@ class _Source(NamedTuple):
 
 def _sources(gathered: SessionData) -> Iterator[_Source]:
     """Yield the windows at rest, and the moving ones that were kept."""
-    rows = {
-        (row.session, row.time): row.count
-        for row in gathered.accumulator.rows
-        if row.kind == 'static'
-    }
+    rows = {}
+    for row in gathered.accumulator.rows:
+        if row.kind == 'static':
+            rows[(row.session, row.time)] = row.count
     typical = float(np.median(list(rows.values()))) if rows else 1.0
     for time, session, position in gathered.poses:
         motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
@@ -454,7 +453,8 @@ class WindowObservations:
         )
         for sensor, noise in solution.noise.items():
             means = np.array([row.sensors[sensor].mean for row in rows])
-            columns_of_means, output = means[:, :-3], means[:, -3:]
+            columns_of_means = means[:, :-3]
+            output = means[:, -3:]
             nominal = coefficients(model, sensor, nominal_values(model))
             after = np.array([coefficients(model, sensor, values) for values in folds])[fold]
             missed = output - np.einsum('ni,nij->nj', columns_of_means, after)

@@ -132,5 +132,6 @@ def _both(window: Window) -> tuple[Window, Window]:
     present = np.repeat([sensor not in window.absent for sensor in SENSORS], 3)
     known = np.isfinite(corrected[:, present]).all(axis=1)
     if not known.all():
-        window, corrected = window.select(known), corrected[known]
+        window = window.select(known)
+        corrected = corrected[known]
     return window, replace(window, force_s=corrected[:, :3], rate_s=corrected[:, 3:])

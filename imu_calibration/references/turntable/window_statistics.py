@@ -249,7 +249,8 @@ def _reduced(
 
     """
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
-    static, length = window.kind == 'static', _piece_length(window)
+    static = window.kind == 'static'
+    length = _piece_length(window)
     duration = float(window.time[-1] - window.time[0])
     sensors, pieces = {}, {}
     for sensor, design in designs.items():

@@ -79,7 +79,8 @@ def residual_traces(
     parts: list[ResidualBlocks] = []
     for group in chunks(_used(windows, spans)):
         of_models = [residuals(group, table, each.model, values=each.values) for each in models]
-        old, new = of_models[0], of_models[-1]
+        old = of_models[0]
+        new = of_models[-1]
         for window, stop in zip(group, np.cumsum([len(window) for window in group])):
             rows = slice(stop - len(window), stop)
             old_rows = {sensor: residual[rows] for sensor, residual in old.items()}

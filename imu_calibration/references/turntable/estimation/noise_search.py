@@ -157,7 +157,8 @@ class _Search:
         if costs[: len(OFFSET_GRID)].min() - costs[best] > CLEAR_GAIN:
             return self._refined(trials[best], session)
         if self.likelihood.known:
-            trials, costs = trials[: len(OFFSET_GRID)], costs[: len(OFFSET_GRID)]
+            trials = trials[: len(OFFSET_GRID)]
+            costs = costs[: len(OFFSET_GRID)]
         return _posterior_mean(trials, costs - costs.min())
 
     def _refined(self, start: np.ndarray, session: float) -> NoiseShape:
@@ -167,7 +168,8 @@ class _Search:
         unit = self.likelihood.typical
 
         def shape(logs: np.ndarray) -> NoiseShape:
-            offset, bias = np.exp(logs[0]), np.exp(logs[1])
+            offset = np.exp(logs[0])
+            bias = np.exp(logs[1])
             time = np.exp(np.clip(logs[2], *LOG_TIME_RANGE))
             return NoiseShape(float(offset / unit), float(bias / unit), float(time))
 

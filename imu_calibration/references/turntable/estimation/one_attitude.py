@@ -29,7 +29,8 @@ def one_attitude(accumulators: Iterable[Accumulator], model: SensorModel) -> boo
     model : SensorModel
 
     """
-    part, moment = model.columns_of('accelerometer', Role.LINEAR), np.zeros((3, 3))
+    part = model.columns_of('accelerometer', Role.LINEAR)
+    moment = np.zeros((3, 3))
     for accumulator in accumulators:
         for row in accumulator.rows:
             if 'accelerometer' in row.sensors:

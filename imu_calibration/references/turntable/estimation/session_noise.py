@@ -141,7 +141,8 @@ def own_misfit(rows: np.ndarray) -> np.ndarray:
 
     Shape (k, 3).
     """
-    columns, output = rows[:, :-3], rows[:, -3:]
+    columns = rows[:, :-3]
+    output = rows[:, -3:]
     scale = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
     if not len(rows):
@@ -165,7 +166,8 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
         Products of ``[design | residual]``.
 
     """
-    gram, gradient = products[:, :-1, :-1], products[:, :-1, -1]
+    gram = products[:, :-1, :-1]
+    gradient = products[:, :-1, -1]
     scale = _scales(np.einsum('kii->ki', gram))
     eigenvalues, vectors = np.linalg.eigh(gram * scale[:, :, None] * scale[:, None, :])
     along = np.einsum('kij,ki->kj', vectors, gradient * scale)

@@ -79,7 +79,8 @@ def find_onset(
     parameters removes (a polynomial in time of degree `GRADUAL`). The moment is then refined to
     the sample at which the residuals of both states are least.
     """
-    used, space = problem.search.indices(chosen), problem.evidence.space
+    used = problem.search.indices(chosen)
+    space = problem.evidence.space
     groups = _groups(problem.recording.model, problem.recording.sensors)
 
     # The chosen parameters and those that may change, the chosen ones first.
@@ -147,11 +148,10 @@ class _Candidate:
 def _groups(model: SensorModel, sensors: Sequence[str]) -> list[_Group]:
     """Return the groups of parameters that may change suddenly."""
     numbers = np.arange(len(model.param_names))
-    groups = [
-        _Group(effect.name, numbers[model.slices[effect.key]], None)
-        for effect in model.effects
-        if effect.sudden
-    ]
+    groups = []
+    for effect in model.effects:
+        if effect.sudden:
+            groups.append(_Group(effect.name, numbers[model.slices[effect.key]], None))
     # A shock or a new start of a sensor changes its biases, a displaced mount its matrix.
     for prefix, role in (('bias of ', Role.OFFSET), ('', Role.LINEAR)):
         parts = [numbers[model.part(sensor, role)] for sensor in sensors]
@@ -201,9 +201,11 @@ def _candidate(
     apart = rows.selected(clear)
     changing = apart.changing(at)
     change = changing.along(_after(rows, last))
-    alone, step = apart.fit(base), apart.fit(own, change)
+    alone = apart.fit(base)
+    step = apart.fit(own, change)
     gradual = apart.fit(own, changing.along(_curves(rows.space.recording.time)))
-    before, after = apart.excess(base, alone), apart.excess(own, step, change)
+    before = apart.excess(base, alone)
+    after = apart.excess(own, step, change)
     if after.squares >= (1 - MIN_EXPLAINED_SHARE) * before.squares:
         return None
     if gradual.loss - step.loss <= SUDDEN * (alone.loss - step.loss):
@@ -267,7 +269,8 @@ def _follows_temperature(
 
 def _passed_once(warmth: np.ndarray, last: int) -> float | None:
     """Return a temperature on different sides of which the windows up to and after `last` are."""
-    first, second = warmth[: last + 1], warmth[last + 1 :]
+    first = warmth[: last + 1]
+    second = warmth[last + 1 :]
     for lower, upper in ((first, second), (second, first)):
         if lower.max() < upper.min():
             return float(0.5 * (lower.max() + upper.min()))
@@ -281,7 +284,8 @@ def _after(rows: WindowRows, last: int) -> np.ndarray:
 
 def _curves(time: np.ndarray) -> np.ndarray:
     """Return the Legendre polynomials of degree 1 to `GRADUAL` over the times, shape (n, m)."""
-    middle, half = 0.5 * (time[0] + time[-1]), max(0.5 * (time[-1] - time[0]), 1e-9)
+    middle = 0.5 * (time[0] + time[-1])
+    half = max(0.5 * (time[-1] - time[0]), 1e-9)
     return np.polynomial.legendre.legvander((time - middle) / half, GRADUAL)[:, 1:]
 
 

@@ -89,7 +89,8 @@ def _variance(rough: np.ndarray, slope: np.ndarray, freedom: np.ndarray) -> tupl
     The median of chi-square over its degrees of freedom f is ``(1 - 2 / (9 f))^3`` (Wilson and
     Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
     """
-    variance, rough = 0.0, rough / (1.0 - 2.0 / (9.0 * np.maximum(freedom, 1.0)))[:, None] ** 3
+    variance = 0.0
+    rough = rough / (1.0 - 2.0 / (9.0 * np.maximum(freedom, 1.0)))[:, None] ** 3
     for _ in range(JITTER_STEPS):
         noise = _noise(rough, slope, variance)
         ratio = ((rough - noise) / np.maximum(slope, np.finfo(float).tiny)).ravel()

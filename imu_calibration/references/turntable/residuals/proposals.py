@@ -117,16 +117,17 @@ class Proposal:
 
     def to_mapping(self) -> dict:
         """Return the proposal as plain data."""
-        terms = [
-            {
-                'name': effect.name,
-                'definition': effect.definition,
-                'value': value.tolist(),
-                'sd': sd.tolist(),
-                'rms': size,
-            }
-            for effect, value, sd, size in zip(self.effects, self.values, self.sds, self.sizes)
-        ]
+        terms = []
+        for effect, value, sd, size in zip(self.effects, self.values, self.sds, self.sizes):
+            terms.append(
+                {
+                    'name': effect.name,
+                    'definition': effect.definition,
+                    'value': value.tolist(),
+                    'sd': sd.tolist(),
+                    'rms': size,
+                }
+            )
         return {
             'terms': terms,
             'axes': list(self.axes),
@@ -209,7 +210,8 @@ def propose(
         grown = share_removed(plain, fits.fit(_joined([*choices, found])))
         if choices and grown < share + WORTH_A_SECOND:
             break
-        choices, share = [*choices, found], grown
+        choices = [*choices, found]
+        share = grown
     needed = (
         MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
     )

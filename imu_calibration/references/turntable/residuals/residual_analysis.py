@@ -149,10 +149,8 @@ class ResidualAnalysis(Investigation):
         """
         Return the fits of a choice, of the findings where not given, to the blocks of a sensor.
         """
-        space, used = (
-            self.problem.space,
-            tuple(self.search.indices(self.named if chosen is None else chosen)),
-        )
+        space = self.problem.space
+        used = tuple(self.search.indices(self.named if chosen is None else chosen))
         if (sensor, used) not in self._fits:
             self._fits[sensor, used] = BlockFits(
                 self.blocks[sensor], used, prior_sd=space.prior_sd, prior_mean=space.prior_mean
@@ -170,10 +168,8 @@ class ResidualAnalysis(Investigation):
 
         Return the findings where no choice is given (`find_regimes`).
         """
-        fits, offsets = (
-            self.fits(sensor, chosen),
-            chosen is not None or self.rests[sensor].significant or formula is not None,
-        )
+        fits = self.fits(sensor, chosen)
+        offsets = chosen is not None or self.rests[sensor].significant or formula is not None
         return find_regimes(
             self.blocks[sensor],
             self.problem,
@@ -210,14 +206,14 @@ class ResidualAnalysis(Investigation):
         it is deterministic.
         """
         fits = {sensor: self.fits(sensor) for sensor in self.rests}
-        return {
-            sensor: (
+        found = {}
+        for sensor, rest in self.rests.items():
+            found[sensor] = (
                 self.proposed(sensor, fits[sensor])
                 if rest.significant or fits[sensor].sigma > MIN_FORMULA_SDS
                 else None
             )
-            for sensor, rest in self.rests.items()
-        }
+        return found
 
     def columns(self, sensor: str, proposal: Proposal | None) -> np.ndarray | None:
         """

@@ -142,7 +142,8 @@ def _share_in_phase(
     Effects of a motion have the same phase in all of its pieces only.
     """
     starts = np.flatnonzero(np.diff(number, prepend=-1))
-    each, known = np.add.reduceat(sums, starts), np.add.reduceat(weight, starts) > 0
+    each = np.add.reduceat(sums, starts)
+    known = np.add.reduceat(weight, starts) > 0
     in_phase = (each * wave.conj()).real > IN_PHASE * np.abs(each) * np.abs(wave)
     return (in_phase & known[..., None]).sum(axis=0) / known.sum(axis=0)[:, None]
 
@@ -497,11 +498,13 @@ def _powers(
 
     Both powers have shape (n, 3), and the mask marks the frequencies that have enough around them.
     """
-    window, line = np.hanning(len(rest)), np.linspace(-1.0, 1.0, len(rest))[:, None]
+    window = np.hanning(len(rest))
+    line = np.linspace(-1.0, 1.0, len(rest))[:, None]
     level = rest - rest.mean(axis=0)
     level -= line * (line * level).sum(axis=0) / (line**2).sum()
     power = np.abs(np.fft.rfft(level * window[:, None], size, axis=0)) ** 2 / (window**2).sum()
-    around, inside = np.ones_like(power), inside.copy()
+    around = np.ones_like(power)
+    inside = inside.copy()
     octave = np.zeros(len(power), int)
     octave[1:] = np.log2(np.arange(1, len(power))).astype(int)
     for number in range(octave.max() + 1):

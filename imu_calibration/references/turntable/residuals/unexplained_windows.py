@@ -43,7 +43,8 @@ def unexplained(
     problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]
 ) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained for a choice of effects."""
-    excess, used = explained.excess(chosen), problem.search.indices(chosen)
+    excess = explained.excess(chosen)
+    used = problem.search.indices(chosen)
     values = weights_of(used, problem.evidence.fit(used)[0], problem.space.size)
     return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in excess}
 
@@ -54,10 +55,12 @@ def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> 
 
     As significant if loud tones or the scatter in motion of one axis exceed the noise at rest.
     """
-    scatter, noise = _scatter_of_one_axis(problem, sensor), problem.noise[sensor].white_variance
+    scatter = _scatter_of_one_axis(problem, sensor)
+    noise = problem.noise[sensor].white_variance
     squares = np.array(scatter)
     for tone in rest.tones:
-        axis, mean_square = AXES.index(tone.axis), 0.5 * tone.amplitude**2
+        axis = AXES.index(tone.axis)
+        mean_square = 0.5 * tone.amplitude**2
         if mean_square > LOUD * noise[axis]:
             squares[axis] += mean_square
     if not squares.any():
@@ -87,8 +90,10 @@ def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
 
 def scatter_in_motion(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     """Return the excess variance of moving samples over the noise at rest, shape (3,)."""
-    noise, recording = problem.noise[sensor].at_rest_only(), problem.recording
-    kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
+    noise = problem.noise[sensor].at_rest_only()
+    recording = problem.recording
+    kinds = recording.kind[recording.moving]
+    counts = recording.count[recording.moving]
     if not len(kinds):
         return np.zeros(3)
     in_motion = np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts)
@@ -140,14 +145,16 @@ def _rest(
 
 def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield (name, columns (k, m), windows where they are known)."""
-    describe, every = recording.describe, np.ones(len(recording.kind), bool)
+    describe = recording.describe
+    every = np.ones(len(recording.kind), bool)
     yield from slow_explanations(describe['time'], describe['temperature'])
     yield 'rate', np.stack([describe['rate'], describe['rate'] ** 2], axis=1), every
     yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
     for name in describe:
         if name.startswith('angle'):
             number = name[len('angle') :]
-            angle, known = describe[name], describe['span' + number] < 0.7
+            angle = describe[name]
+            known = describe['span' + number] < 0.7
             turns = []
             for multiple in (1, 2, 3):
                 turns += [np.cos(multiple * angle), np.sin(multiple * angle)]

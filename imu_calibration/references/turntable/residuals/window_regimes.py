@@ -48,19 +48,18 @@ def find_regimes(
         problem.recording.kind[blocks.window],
         np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1),
     )
-    search, level = (
-        ScatterSearch(
-            blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange
-        ),
-        REGIME_LEVEL / len(AXES),
+    search = ScatterSearch(
+        blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange
     )
+    level = REGIME_LEVEL / len(AXES)
     white, found = None, []
     for axis, name in enumerate(AXES):
         offsets = []
         if name in axes:
             white = white or BlockWhitener(blocks, np.ones(len(blocks.time), bool))
             at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
-            own, scaled = blocks.index[axis][at], partial(white, axis=axis)
+            own = blocks.index[axis][at]
+            scaled = partial(white, axis=axis)
             prior = 1 / problem.space.prior_sd[own] ** 2, problem.space.prior_mean[own]
             rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), *prior)
             offsets = search.offsets(

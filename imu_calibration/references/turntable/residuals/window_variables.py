@@ -13,7 +13,9 @@ from imu_calibration.selection.regime_variables import FEWEST, N_BINS, Variable,
 
 def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variable]:
     """Return the variables of regimes in this recording; the first is reported among equals."""
-    ref, starts, found = blocks.ref, blocks.starts, []
+    ref = blocks.ref
+    starts = blocks.starts
+    found = []
     each = partial(ranged, starts=starts)
     rates = partial(ranged, unit='deg/s', starts=starts, is_rate=True)
     for k, name in enumerate(joint_names):

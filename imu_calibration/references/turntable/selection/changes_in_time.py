@@ -287,7 +287,8 @@ class ChangingColumns:
         for axis in self.axes:
             rows = axis.rows
             places = (np.arange(n_functions)[:, None] * self.count + axis.order).ravel()
-            at_cross, at_squares = (rows.places[:, None], places), (places[:, None], places)
+            at_cross = (rows.places[:, None], places)
+            at_squares = (places[:, None], places)
 
             # Means: the product with the function first, then independent rows.
             columns = functions[:, :, None] * axis.mean

@@ -299,7 +299,9 @@ def _with_lags(
     another. Only a trial that helps where it begins, or the best of all, is relinearised at its
     choice.
     """
-    most, refused, tried = None, [], []
+    most = None
+    refused = []
+    tried = []
     for number in range(EXPLANATIONS):
         selected = explanations.select(most, refused)
         there, chosen, of_lags = explanations.settled(selected, linearised_at)
@@ -310,7 +312,8 @@ def _with_lags(
         if trial.helps and (trial := trial.finished(linearised_at)).helps:
             return trial.outcome, trial.rivals
         tried.append(trial)
-        most, refused = max(len(selected.lags) - 1, 1), [*refused, selected]
+        most = max(len(selected.lags) - 1, 1)
+        refused = [*refused, selected]
         if not explanations.others(most, refused):
             break
     best = _best_of(tried, linearised_at)
@@ -456,11 +459,11 @@ class WindowTests(EffectTests):
     def admissible(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects of a possible size on which the windows agree."""
         problem = self.problem
-        return [
-            question
-            for question in named
-            if problem.search.allowed(named, question) and problem.windows_agree(named, question)
-        ]
+        found = []
+        for question in named:
+            if problem.search.allowed(named, question) and problem.windows_agree(named, question):
+                found.append(question)
+        return found
 
     def least_predicting(self, kept: list[Question]) -> int | None:
         """

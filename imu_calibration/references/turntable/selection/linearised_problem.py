@@ -94,7 +94,9 @@ class LinearisedProblem:
         any_size: bool = False,
         resolved: AbstractSet[str] = frozenset(),
     ):
-        self.baseline, self.effects, self.locked = baseline, effects, locked
+        self.baseline = baseline
+        self.effects = effects
+        self.locked = locked
         self.duration = max(float(window.time[-1]) for window in windows)
         self.constants = time_constants(self.duration)
         model, values = point or _start(baseline, effects)

@@ -135,7 +135,8 @@ def noise_beside_effects(
         Sensor -> its bias processes, where measured separately.
 
     """
-    noise, every = noise_before_fit(space), np.arange(space.size)
+    noise = noise_before_fit(space)
+    every = np.arange(space.size)
     noise = {
         sensor: replace(own, known=(known or {}).get(sensor, ())) for sensor, own in noise.items()
     }
@@ -224,7 +225,8 @@ def _with_moving_factors(
     for kind in np.unique(space.recording.kind[space.recording.moving]):
         rows = space.recording.kind == kind
         dof = (space.recording.count[rows] - 1).sum()
-        variances, along = np.zeros(3), np.zeros(3)
+        variances = np.zeros(3)
+        along = np.zeros(3)
         for axis in range(3):
             reduced = np.append(-values[space.index[sensor][axis]], 1.0)
             if look_along:
@@ -233,7 +235,8 @@ def _with_moving_factors(
                     products[:, :, -1] = products @ reduced
                     variances[axis] += (reduced @ products[:, :, -1].T).sum() / dof
                     misfit, dimensions = misfit_along(products)
-                    squares, rank = squares + misfit, rank + dimensions
+                    squares = squares + misfit
+                    rank = rank + dimensions
                 along[axis] = squares / max(rank, 1)
             else:
                 variances[axis] = reduced @ space.within_sum(sensor, axis, rows) @ reduced / dof

@@ -261,7 +261,9 @@ class _Joined:
 
 def _matrices(joined: dict[str, list[_Joined]]) -> dict[str, Any]:
     """Return `index`, `join` and `join_within` of a ParameterSpace."""
-    index, join, join_within = {}, {}, {}
+    index = {}
+    join = {}
+    join_within = {}
     for sensor, axes in joined.items():
         index[sensor] = [each.used for each in axes]
         join[sensor] = [each.columns for each in axes]

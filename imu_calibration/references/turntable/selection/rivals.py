@@ -312,7 +312,8 @@ class _Blocks:
         fall = np.einsum('ki,ki->k', values, self.right[places])
         # Share of the signal of each member that its mate cannot imitate.
         cross = systems[:, :n_first, n_first:]
-        first, second = values[:, :n_first], values[:, n_first:]
+        first = values[:, :n_first]
+        second = values[:, n_first:]
         of_first = np.einsum('kij,ki->kj', cross, first)
         of_second = np.einsum('kij,kj->ki', cross, second)
         for k, (one, two) in enumerate(pairs):

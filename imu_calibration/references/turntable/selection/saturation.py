@@ -124,10 +124,8 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
                 for w, o in zip(picked, outputs)
             ]
         )
-        base, slope = (
-            coefficients(model, sensor, values),
-            coefficient_jacobian(model, sensor, values),
-        )
+        base = coefficients(model, sensor, values)
+        slope = coefficient_jacobian(model, sensor, values)
         weight = 1 / sample_sd_at_rest(windows, sensor) ** 2
         for axis in range(3):
             rows = np.column_stack(
@@ -193,7 +191,8 @@ def find_saturation(
     ):
         return None
     far = np.abs(expected) > level
-    before, after = output - expected, output - np.clip(expected, -level, level)
+    before = output - expected
+    after = output - np.clip(expected, -level, level)
     rms = [float(np.sqrt(np.mean(e[far] ** 2))) if far.any() else 0.0 for e in (before, after)]
     return Saturation(
         sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms

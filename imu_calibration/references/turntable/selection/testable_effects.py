@@ -90,7 +90,8 @@ def _why_not(
     shaken: bool,
 ) -> tuple[str, str] | None:
     moving = kinds & {'spin', 'dynamic'}
-    if why := lacking_temperature(effect, span):
+    why = lacking_temperature(effect, span)
+    if why:
         return why
     if 'rotation' in effect.needs and not moving:
         return 'the recording has no rotation', 'spin and swing the table'

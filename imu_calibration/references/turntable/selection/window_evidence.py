@@ -243,7 +243,8 @@ class WindowEvidence(Evidence):
         sizes, directions = np.linalg.eigh(moved.T @ moved)
         # Without unobservable directions: compliances in no pose, arms that cancel.
         observable = sizes > CONVENTION_SHARE * sizes[-1]
-        n_windows, n_own = len(moved), int(observable.sum())
+        n_windows = len(moved)
+        n_own = int(observable.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0
 
