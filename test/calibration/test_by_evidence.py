@@ -6,7 +6,7 @@ it, and nothing else.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
@@ -34,7 +34,7 @@ from imu_calibration.references.turntable.selection import investigation, testab
 from imu_calibration.references.turntable.selection.extended_model import without_saturation
 from imu_calibration.references.turntable.selection.extended_solution import extended_solution
 from imu_calibration.references.turntable.selection.investigation import investigate
-from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.linearised_problem import SearchedWindows
 from imu_calibration.references.turntable.selection.rivals import (
     Rival,
     same_questions,
@@ -254,22 +254,20 @@ def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     used = [window for window in windows if window.kind != 'unused']
     effects = without_saturation(testable_effects.testable_effects(model, table, used)[0])
-    linearised_at = partial(
-        LinearisedProblem, used, table, model, effects=effects, locked=np.zeros(len(used), bool)
-    )
-    first = linearised_at()
+    searched = SearchedWindows(used, table, model, effects, np.zeros(len(used), bool))
+    first = searched.linearised()
     by_name = {question.name: question for question in first.questions}
     for start in ('time_offset', 'gyro_bandwidth'):
-        settled, near = settle_rivals(first, [by_name[start]], linearised_at)
+        settled, near = settle_rivals(first, [by_name[start]], searched)
         assert settled.search.run()[0].name == 'time_offset' and not near
-    lag = linearised_at(point=first.point([by_name['gyro_bandwidth']]))
+    lag = searched.linearised(point=first.point([by_name['gyro_bandwidth']]))
     assert (
         lag.values(same_questions(lag, [by_name['gyro_bandwidth']]))[
             lag.space.names.index('gyroscope.gyro_bandwidth.time_constant')
         ]
         > 0.01
     )
-    assert settle_rivals(first, [by_name['gyro_quadratic']], linearised_at) == (first, [])
+    assert settle_rivals(first, [by_name['gyro_quadratic']], searched) == (first, [])
 
 
 def _disagreement(found, names):

@@ -197,7 +197,12 @@ class LagsAndDelay(forward.Evidence):
 
     def __init__(self, better=0.0):
         super().__init__(
-            np.zeros((4, 4)), np.zeros((0, 4, 4)), prior_sd=np.ones(3), prior_mean=np.zeros(3)
+            [],
+            [],
+            total=np.zeros((4, 4)),
+            without=np.zeros((0, 4, 4)),
+            prior_sd=np.ones(3),
+            prior_mean=np.zeros(3),
         )
         self.better = better
 

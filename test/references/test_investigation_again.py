@@ -34,7 +34,7 @@ def looked_again(monkeypatch):
         )
         monkeypatch.setattr(investigation, 'best_pairs', lambda search: [])
 
-        def settled(linearised_at, problem, chosen):
+        def settled(searched, problem, chosen):
             trials.append(chosen)
             return SimpleNamespace(rest=after)
 
@@ -42,7 +42,8 @@ def looked_again(monkeypatch):
         outcome, tried = first, set()
         for any_size in (False, True):
             if outcome is first:
-                outcome = investigation._looked_again(outcome, None, any_size, tried)
+                of_size = SimpleNamespace(any_size=any_size)
+                outcome = investigation._looked_again(outcome, of_size, tried)
         return outcome.rest, len(trials)
 
     return look

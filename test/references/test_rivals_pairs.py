@@ -106,10 +106,9 @@ def test_pairs_are_tested_for_a_remaining_excess(monkeypatch, rest, remaining, f
     monkeypatch.setattr(
         investigation,
         '_settled',
-        lambda linearised_at, problem, chosen: outcome(search, chosen, remaining),
+        lambda searched, problem, chosen: outcome(search, chosen, remaining),
     )
-    assert (
-        names(investigation._looked_again(outcome(search, [], rest), None, False, set()).named)
-        == found
-    )
+    setup = SimpleNamespace(any_size=False)
+    again = investigation._looked_again(outcome(search, [], rest), setup, set())
+    assert names(again.named) == found
     assert bool(tested) == bool(rest)  # their search takes long

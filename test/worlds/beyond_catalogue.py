@@ -12,7 +12,7 @@ import numpy as np
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.references.turntable.selection.extended_solution import extended_solution
-from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.linearised_problem import SearchedWindows
 from imu_calibration.selection.unexplained import biases_off
 
 from worlds.diagnosing import diagnose
@@ -77,9 +77,8 @@ def _known(found, recording):
     for effect in effects:
         model = model.with_effect(effect.sensor, effect.name)
     windows = [window for window in recording.windows if window.kind != 'unused']
-    problem = LinearisedProblem(
-        windows, recording.table, model, effects=[], locked=np.zeros(len(windows), bool)
-    )
+    unlocked = np.zeros(len(windows), bool)
+    problem = SearchedWindows(windows, recording.table, model, [], unlocked).linearised()
     solution = extended_solution(problem.space, problem.noise, model, chosen=[])
     unsure = ModelExtension(
         moves=tuple((moved, 1.0) for moved in biases_off(model, found.unexplained))

@@ -4,9 +4,9 @@ The search from windows to named effects.
 Remove clipped samples, linearise, choose, prove, relinearise.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import AbstractSet
 
 import numpy as np
@@ -28,7 +28,10 @@ from imu_calibration.references.turntable.selection.lag_explanations import (
     LagExplanations,
     lag_explanations,
 )
-from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.linearised_problem import (
+    LinearisedProblem,
+    SearchedWindows,
+)
 from imu_calibration.references.turntable.selection.rivals import (
     Rival,
     best_pairs,
@@ -148,18 +151,10 @@ def investigate(
     used, locked, limits = without_clipping(used, table, model)
     testable, not_testable = testable_effects(model, table, windows_at(used, ~locked))
     effects = without_saturation(testable)
-    linearised_at = partial(
-        LinearisedProblem,
-        used,
-        table,
-        model,
-        effects=effects,
-        locked=locked,
-        bias_processes=bias_processes,
-    )
+    searched = SearchedWindows(used, table, model, effects, locked, bias_processes)
 
     # Search for constant parameters.
-    outcome, rivals, linearised_again = _explained(linearised_at(), linearised_at)
+    outcome, rivals, searched_again = _explained(searched.linearised(), searched)
 
     # An excess remains: do parameters change at one moment?
     onset = None
@@ -172,17 +167,17 @@ def investigate(
     # onset, and counts if it removes most of the excess.
     step = next((effect for effect in testable if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
-        stepped_at = partial(linearised_at, effects=[*effects, step])
+        stepped = replace(searched, effects=[*effects, step])
         ((name, before),) = onset.before.items()
         size_and_time = (onset.after[name] - before, onset.time)
         values = {name: before, **dict(zip(step.param_names(), size_and_time))}
-        problem = stepped_at(point=point_with(model, [*effects, step], values))
+        problem = stepped.linearised(point_with(model, [*effects, step], values))
         start = [question for question in problem.questions if question.name == step.name]
-        with_step, rivals_with_step, stepped_again = _explained(problem, stepped_at, start)
+        with_step, rivals_with_step, stepped_again = _explained(problem, stepped, start)
         if with_step.rest < LEFT * outcome.rest:
             outcome = with_step
             rivals = rivals_with_step
-            linearised_again = stepped_again
+            searched_again = stepped_again
             onset = None
 
     # Any other change: only the longer part.
@@ -196,8 +191,8 @@ def investigate(
     # Once more where an excess remains: with plausible sizes, then with any size.
     tried = {_labels(outcome.chosen)}
     for any_size in (False, True):
-        at_any_size = partial(linearised_again, any_size=any_size)
-        outcome = _looked_again(outcome, at_any_size, any_size, tried)
+        of_size = replace(searched_again, any_size=any_size)
+        outcome = _looked_again(outcome, of_size, tried)
 
     named = outcome.named
     unstable = outcome.unstable
@@ -220,12 +215,12 @@ def investigate(
 
 
 def _explained(
-    problem: LinearisedProblem, linearised_at: Callable, start: Sequence[Question] = ()
-) -> tuple['_Outcome', Sequence[Rival], Callable]:
+    problem: LinearisedProblem, searched: SearchedWindows, start: Sequence[Question] = ()
+) -> tuple['_Outcome', Sequence[Rival], SearchedWindows]:
     """
-    Return (the '_Outcome' of a search, rivals of its findings, `linearised_at`).
+    Return (the '_Outcome' of a search, rivals of its findings, `searched`).
 
-    In `linearised_at` the lags are resolved if there are any.
+    In `searched` the lags are resolved if there are any.
     """
     chosen = problem.search.run(start)
     chosen = [
@@ -233,16 +228,14 @@ def _explained(
         for question in chosen
         if question.name not in FAMILY or problem.windows_agree(chosen, question)
     ]
-    explanations = lag_explanations(
-        problem, [*chosen, *problem.search.early(chosen)], linearised_at
-    )
+    explanations = lag_explanations(problem, [*chosen, *problem.search.early(chosen)], searched)
     if explanations is not None:
-        linearised_at = partial(linearised_at, resolved=FAMILY)
-        return *_with_lags(explanations, linearised_at), linearised_at
-    settled, rivals = settle_rivals(problem, chosen, linearised_at)
+        searched = replace(searched, resolved=FAMILY)
+        return *_with_lags(explanations, searched), searched
+    settled, rivals = settle_rivals(problem, chosen, searched)
     if settled is not problem:
         chosen = settled.search.run()
-    return _settled(linearised_at, settled, chosen), rivals, linearised_at
+    return _settled(searched, settled, chosen), rivals, searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,15 +275,13 @@ class _Trial:
         """Whether all of its lags are named."""
         return self.rank[0] == len(self.lags)
 
-    def finished(self, linearised_at: Callable) -> '_Trial':
+    def finished(self, searched: SearchedWindows) -> '_Trial':
         """Return the trial relinearised at its choice, without the lags that are not named."""
-        return replace(
-            self, outcome=_settled(linearised_at, self.outcome.problem, self.outcome.chosen)
-        )
+        return replace(self, outcome=_settled(searched, self.outcome.problem, self.outcome.chosen))
 
 
 def _with_lags(
-    explanations: LagExplanations, linearised_at: Callable
+    explanations: LagExplanations, searched: SearchedWindows
 ) -> tuple[_Outcome, Sequence[Rival]]:
     """
     Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
@@ -304,23 +295,23 @@ def _with_lags(
     tried = []
     for number in range(EXPLANATIONS):
         selected = explanations.select(most, refused)
-        there, chosen, of_lags = explanations.settled(selected, linearised_at)
+        there, chosen, of_lags = explanations.settled(selected, searched)
         chosen = there.search.run(chosen)
-        settled, rivals = settle_rivals(there, chosen, linearised_at)
-        outcome = _outcome(settled, chosen if settled is there else _searched(settled, chosen))
+        settled, rivals = settle_rivals(there, chosen, searched)
+        outcome = _outcome(settled, chosen if settled is there else _chosen_again(settled, chosen))
         trial = _Trial(number, selected.lags.keys(), outcome, [*of_lags, *rivals])
-        if trial.helps and (trial := trial.finished(linearised_at)).helps:
+        if trial.helps and (trial := trial.finished(searched)).helps:
             return trial.outcome, trial.rivals
         tried.append(trial)
         most = max(len(selected.lags) - 1, 1)
         refused = [*refused, selected]
         if not explanations.others(most, refused):
             break
-    best = _best_of(tried, linearised_at)
+    best = _best_of(tried, searched)
     return best.outcome, best.rivals
 
 
-def _best_of(trials: Iterable[_Trial], linearised_at: Callable) -> _Trial:
+def _best_of(trials: Iterable[_Trial], searched: SearchedWindows) -> _Trial:
     """
     Return the finished trial with the highest rank.
 
@@ -329,7 +320,7 @@ def _best_of(trials: Iterable[_Trial], linearised_at: Callable) -> _Trial:
     best = None
     for trial in sorted(trials, key=lambda trial: trial.rank, reverse=True):
         if best is None or trial.rank > best.rank:
-            finished = trial.finished(linearised_at)
+            finished = trial.finished(searched)
             best = finished if best is None or finished.rank > best.rank else best
     assert best is not None, 'there is at least one trial'
     return best
@@ -340,7 +331,7 @@ def _labels(chosen: Sequence[Question]) -> frozenset[str]:
 
 
 def _looked_again(
-    outcome: _Outcome, linearised_at: Callable, any_size: bool, tried: set[frozenset[str]]
+    outcome: _Outcome, searched: SearchedWindows, tried: set[frozenset[str]]
 ) -> _Outcome:
     """
     Return the _Outcome of the searches for the cause of a remaining significant excess.
@@ -351,7 +342,7 @@ def _looked_again(
     """
     if not outcome.rest:
         return outcome
-    problem = outcome.problem.asking_any_size() if any_size else outcome.problem
+    problem = outcome.problem.asking_any_size() if searched.any_size else outcome.problem
     search = problem.search
     lags = _resolved(problem, outcome.chosen)
     choices = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
@@ -361,34 +352,34 @@ def _looked_again(
     if outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest:
         return outcome
     # Implausible sizes have a price; without them the better choice has the lower cost.
-    if not any_size and search.cost(best) >= search.cost(outcome.chosen):
+    if not searched.any_size and search.cost(best) >= search.cost(outcome.chosen):
         return outcome
 
     tried.add(_labels(best))
-    other = _settled(linearised_at, problem, best)
+    other = _settled(searched, problem, best)
     return other if other.rest < LEFT * outcome.rest else outcome
 
 
 def _settled(
-    linearised_at: Callable, problem: LinearisedProblem, chosen: Sequence[Question]
+    searched: SearchedWindows, problem: LinearisedProblem, chosen: Sequence[Question]
 ) -> _Outcome:
     """
     Return the _Outcome of a choice.
 
     Relinearise at the effects, then keep the ones with sufficient share and gain.
     """
-    return _without_unnamed(_relinearised(linearised_at, problem, chosen), linearised_at)
+    return _without_unnamed(_relinearised(searched, problem, chosen), searched)
 
 
 def _relinearised(
-    linearised_at: Callable, problem: LinearisedProblem, chosen: Sequence[Question]
+    searched: SearchedWindows, problem: LinearisedProblem, chosen: Sequence[Question]
 ) -> _Outcome:
     """Return the same, linearised at all effects of the choice."""
     for _ in range(LINEARISATIONS - 1):
         if not problem.needs_another(chosen):
             break
-        problem = linearised_at(point=problem.point(chosen))
-        chosen = _searched(problem, chosen)
+        problem = searched.linearised(problem.point(chosen))
+        chosen = _chosen_again(problem, chosen)
     return _outcome(problem, chosen)
 
 
@@ -401,7 +392,7 @@ def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome
     return _Outcome(problem, explained, chosen, found.named, found.unstable)
 
 
-def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
+def _without_unnamed(outcome: _Outcome, searched: SearchedWindows) -> _Outcome:
     """
     Return the _Outcome linearised at its findings alone.
 
@@ -410,7 +401,7 @@ def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
     for _ in range(LINEARISATIONS - 1):
         if not outcome.problem.acts_beside(outcome.named):
             break
-        problem = linearised_at(point=outcome.problem.point(outcome.named))
+        problem = searched.linearised(outcome.problem.point(outcome.named))
         explained = ExplainedWindows(problem.evidence, problem.search)
         named = pruned(same_questions(problem, outcome.named), explained.share)
         outcome = _Outcome(
@@ -423,7 +414,7 @@ def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
     return outcome
 
 
-def _searched(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
+def _chosen_again(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
     """
     Return the choice of a search at another linearisation; it starts from the resolved effects.
     """

@@ -11,7 +11,7 @@ first, then a common clock before separate lags, then a delay before a filter. A
 its rivals.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -20,7 +20,10 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag_name
 from imu_calibration.references.turntable.selection.extended_model import point_with
-from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.linearised_problem import (
+    LinearisedProblem,
+    SearchedWindows,
+)
 from imu_calibration.references.turntable.selection.rivals import (
     MIN_CURVATURE_NATS,
     Rival,
@@ -137,7 +140,7 @@ class LagExplanations:
         return simplest(self.others(most, refused), self.silent)
 
     def settled(
-        self, selected: Explanation, linearised_at: Callable
+        self, selected: Explanation, searched: SearchedWindows
     ) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
         """
         Return (the LinearisedProblem at an explanation, the choice with it, alternatives).
@@ -149,7 +152,9 @@ class LagExplanations:
         values = dict(selected.values)
         for name, lag in selected.lags.items():
             values[parameter[name]] = lag
-        there = linearised_at(point=point_with(self.problem.baseline, self.problem.effects, values))
+        there = searched.linearised(
+            point=point_with(self.problem.baseline, self.problem.effects, values)
+        )
 
         # Its effects, the other chosen effects, and what fits nearly as well.
         asked = _questions_by_name(there)
@@ -167,7 +172,7 @@ def _questions_by_name(problem: LinearisedProblem) -> dict[str, Question]:
 
 
 def lag_explanations(
-    problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable
+    problem: LinearisedProblem, chosen: Sequence[Question], searched: SearchedWindows
 ) -> LagExplanations | None:
     """
     Return the LagExplanations of a choice.
@@ -179,9 +184,8 @@ def lag_explanations(
     problem : LinearisedProblem
         Linearised where no lag acts.
     chosen : sequence of Question
-    linearised_at : callable
-        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, with some of the
-        effects.
+    searched : SearchedWindows
+        For the LinearisedProblem elsewhere, or with some of the effects.
 
     """
     effects = {effect.name: effect for effect in problem.effects}
@@ -197,7 +201,7 @@ def lag_explanations(
         if question.name in CLOCKS:
             for k in question.parameters:
                 clocks[problem.space.names[k]] = float(values[k])
-    described = _described(problem, linearised_at, effects, rest=rest, clocks=clocks or None)
+    described = _described(searched, effects, rest=rest, clocks=clocks or None)
 
     judges = [each.problem for each in described]
     names = [name for name in described[0].values if name.split('.')[1] not in FAMILY]
@@ -240,28 +244,15 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
 
 
 def _described(
-    problem: LinearisedProblem,
-    linearised_at: Callable,
+    searched: SearchedWindows,
     effects: Mapping[str, Effect],
     *,
     rest: Sequence[Question],
     clocks: dict[str, float] | None,
 ) -> list[LagHypothesis]:
     """Return the description of each kind; only the first if no curvature is observable."""
-
-    def at(kind: tuple[str, ...], values: dict[str, float] | None = clocks) -> LagHypothesis:
-        names = [lag_name(sensor, ending) for ending, sensor in product(kind, SENSORS)]
-        asked = [effects[name] for name in names] + [question.effect for question in rest]
-        point = None
-        if values is not None:
-            point = point_with(problem.baseline, asked, values)
-        there = linearised_at(effects=asked, point=point)
-        known = _questions_by_name(there)
-        lags = [known[name] for name in names]
-        return LagHypothesis(kind, there, [*lags, *same_questions(there, rest)])
-
     # Delays only, at zero; without an observable curvature all kinds have the same columns.
-    first = at(DELAY)
+    first = _hypothesis(searched, DELAY, clocks, effects=effects, rest=rest)
     curvatures = []
     for question in first.chosen:
         if question.name in FAMILY:
@@ -270,7 +261,7 @@ def _described(
         return [first]
 
     # Delays at their own estimate, then each other kind from there.
-    first = at(DELAY, first.values)
+    first = _hypothesis(searched, DELAY, first.values, effects=effects, rest=rest)
     found = [first]
     for kind in LAG_KINDS[1:]:
         values = dict(first.values)
@@ -282,12 +273,32 @@ def _described(
                 own = [delay - low_pass, low_pass]
             for ending, value in zip(kind, own, strict=True):
                 values[effects[lag_name(sensor, ending)].param_names()[0]] = value
-        hypothesis = at(kind, values)
-        if len(kind) > 1:
-            for _ in range(DELAY_LINEARISATIONS - 1):
-                hypothesis = at(kind, hypothesis.values)
+        # A delay beside a low-pass is linearised at its own estimate.
+        for _ in range(DELAY_LINEARISATIONS if len(kind) > 1 else 1):
+            hypothesis = _hypothesis(searched, kind, values, effects=effects, rest=rest)
+            values = hypothesis.values
         found.append(hypothesis)
     return found
+
+
+def _hypothesis(
+    searched: SearchedWindows,
+    kind: tuple[str, ...],
+    values: dict[str, float] | None,
+    *,
+    effects: Mapping[str, Effect],
+    rest: Sequence[Question],
+) -> LagHypothesis:
+    """Return the lags of one kind, linearised at values of parameters or at the baseline."""
+    names = [lag_name(sensor, ending) for ending, sensor in product(kind, SENSORS)]
+    asked = [effects[name] for name in names] + [question.effect for question in rest]
+    point = None
+    if values is not None:
+        point = point_with(searched.baseline, asked, values)
+    there = searched.linearised(point, effects=asked)
+    known = _questions_by_name(there)
+    lags = [known[name] for name in names]
+    return LagHypothesis(kind, there, [*lags, *same_questions(there, rest)])
 
 
 def _explanations(

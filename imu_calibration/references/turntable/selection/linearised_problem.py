@@ -6,7 +6,7 @@ It also holds the decision whether to relinearise.
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from typing import AbstractSet
@@ -54,46 +54,65 @@ BILINEAR = 2e-3
 """Relative change of the matrix that an effect left out may have caused."""
 
 
+@dataclass(frozen=True, eq=False)
+class SearchedWindows:
+    """Windows of one recording and the effects under test: the same at each linearisation."""
+
+    windows: Sequence[Window]
+    """Without clipped samples."""
+    table: Table
+    """The reference."""
+    baseline: SensorModel
+    """The model to be extended."""
+    effects: Sequence[Effect]
+    """Candidate effects."""
+    locked: np.ndarray
+    """
+    Mask of the windows reserved for the gain: they have columns, but are excluded from noise, fits
+    and choices, shape (k,).
+    """
+    bias_processes: dict | None = None
+    """Sensor -> its bias processes, where measured separately."""
+    any_size: bool = False
+    """Whether sizes above those of any known instrument are allowed."""
+    resolved: AbstractSet[str] = frozenset()
+    """Effects that were compared with each other already, as for `Search`."""
+
+    def linearised(
+        self,
+        point: tuple[SensorModel, np.ndarray] | None = None,
+        *,
+        effects: Sequence[Effect] | None = None,
+    ) -> 'LinearisedProblem':
+        """
+        Return the problem at a point, by default the baseline's solution.
+
+        With columns of some `effects`, by default of all.
+        """
+        if effects is None:
+            return LinearisedProblem(self, point)
+        return LinearisedProblem(replace(self, effects=effects), point)
+
+
 class LinearisedProblem:
     """
     One linearisation: the reduced recording, its noise, the evidence and the search.
 
     Parameters
     ----------
-    windows : sequence of Window
-        Of one recording, without clipped samples.
-    table : Table
-    baseline : SensorModel
-        The model to be extended.
-    effects : sequence of Effect
-        Candidate effects.
+    searched : SearchedWindows
     point : (SensorModel, array), optional
         Point of linearisation; default: the baseline's solution.
-    locked : array, shape (k,)
-        Mask of the windows reserved for the gain: they have columns, but are excluded from noise,
-        fits and choices.
-    bias_processes : dict, optional
-        Sensor -> its bias processes, where measured separately.
-    any_size : bool
-        Whether sizes above those of any known instrument are allowed.
-    resolved : set of str
-        Effects that were compared with each other already, as for `Search`.
 
     """
 
     def __init__(
-        self,
-        windows: Sequence[Window],
-        table: Table,
-        baseline: SensorModel,
-        *,
-        effects: Sequence[Effect],
-        locked: np.ndarray,
-        point: tuple[SensorModel, np.ndarray] | None = None,
-        bias_processes: dict | None = None,
-        any_size: bool = False,
-        resolved: AbstractSet[str] = frozenset(),
+        self, searched: SearchedWindows, point: tuple[SensorModel, np.ndarray] | None = None
     ):
+        windows = searched.windows
+        baseline = searched.baseline
+        effects = searched.effects
+        locked = searched.locked
         self.baseline = baseline
         self.effects = effects
         self.locked = locked
@@ -103,7 +122,7 @@ class LinearisedProblem:
         model = replace(model, folded_arms=mean_arms(model, values))
         recording = reduce_recording(
             windows,
-            table,
+            searched.table,
             model,
             values=values,
             bank=make_bank(effects, self.constants, model, values=values),
@@ -119,15 +138,17 @@ class LinearisedProblem:
         judged = in_trusted_band(self.all_samples)
         self.space = replace(judged, recording=recording)
         self.questions = questions(judged, effects)
-        self.noise = noise_beside_effects(judged, smooth_parameters(self.questions), bias_processes)
+        self.noise = noise_beside_effects(
+            judged, smooth_parameters(self.questions), searched.bias_processes
+        )
         self.evidence = WindowEvidence(judged, self.noise, folds_of(judged.recording.kind))
         self.search = Search(
             self.evidence,
             used,
             self.questions,
             encoder_step=judged.recording.encoder_step,
-            any_size=any_size,
-            resolved=resolved,
+            any_size=searched.any_size,
+            resolved=searched.resolved,
         )
 
     def asking_any_size(self) -> 'LinearisedProblem':

@@ -6,7 +6,7 @@ explanations.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -14,7 +14,10 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.scaled_solve import JITTER
-from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
+from imu_calibration.references.turntable.selection.linearised_problem import (
+    LinearisedProblem,
+    SearchedWindows,
+)
 from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
 from imu_calibration.selection.explained_share import Explained, needed_share
 from imu_calibration.selection.gain import LEAST_REDUCTION
@@ -48,7 +51,7 @@ class Rival:
 
 
 def settle_rivals(
-    problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable
+    problem: LinearisedProblem, chosen: Sequence[Question], searched: SearchedWindows
 ) -> tuple[LinearisedProblem, list[Rival]]:
     """
     Return (the LinearisedProblem at the best of a choice and its rivals, the rivals close to it).
@@ -63,9 +66,8 @@ def settle_rivals(
     problem : LinearisedProblem
         Linearised where none of them acts.
     chosen : sequence of Question
-    linearised_at : callable
-        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, or with some of
-        the effects.
+    searched : SearchedWindows
+        For the LinearisedProblem elsewhere, or with some of the effects.
 
     """
     chosen = [question for question in chosen if '@' not in question.label]
@@ -79,10 +81,12 @@ def settle_rivals(
         for question in choice:
             effects[question.name] = question.effect
     compared = list(effects.values())
-    start = linearised_at(effects=compared)
+    start = searched.linearised(effects=compared)
     attempts = []
     for number, choice in enumerate(choices):
-        there = linearised_at(effects=compared, point=start.point(same_questions(start, choice)))
+        there = searched.linearised(
+            effects=compared, point=start.point(same_questions(start, choice))
+        )
         attempts.append(there)
         choices[number] = same_questions(there, choice)
 
@@ -99,7 +103,7 @@ def settle_rivals(
     values = []
     for there, choice in zip(attempts, choices):
         values.append(dict(zip(there.space.names, there.values(choice))))
-    settled = linearised_at(point=problem.point(same_questions(problem, choices[best])))
+    settled = searched.linearised(point=problem.point(same_questions(problem, choices[best])))
     found = []
     for k, choice in enumerate(choices):
         if k == best or costs[k] - costs[best] >= TIE:
