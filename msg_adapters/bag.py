@@ -22,7 +22,7 @@ from msg_adapters.csv_log import (
     is_text_log,
     require_no_rows,
 )
-from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
+from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, take_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard, rosbags_missing
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
@@ -375,7 +375,7 @@ def _block(parts, decoders):
 
     These are the messages dropped by the decoders since the last block.
     """
-    dropped, notes = taken_counts(decoders.values())
+    dropped, notes = take_counts(decoders.values())
     joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
     return SampleBlock(
         joined.get(ImuSamples),

@@ -25,6 +25,8 @@ from msg_adapters.joint_state import (
 )
 from msg_adapters.layout import MessageLayout, Packed, UnusableMessage, group_by_layout
 
+Arrivals = Callable[[], np.ndarray]
+"""Returns the times of sending or reception of messages, int64, shape (n,); rarely needed."""
 JOINT_PATIENCE = 1000
 """So many JointState messages may pass before one fits the table."""
 KEPT_NAMES = 3
@@ -52,12 +54,15 @@ class Decoder:
     def __init__(self, message_type: str, deserialize: Callable | None = None, choice: Any = None):
         self.message_type = message_type
         self.name = message_type.rpartition('/')[2]
+        """Type without its package, for the reasons in the counts."""
         self.deserialize = deserialize
         self.choice = choice
         self.dropped = Counter()
+        """Reason -> messages that gave no sample, since `take_counts`."""
         self.notes = Counter()
+        """Reason -> messages that were used with a change, since `take_counts`."""
 
-    def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
+    def decode(self, packed: Packed, arrived_ns: Arrivals | None = None) -> Any:
         """
         Return the samples of a Packed in its order, or None when there are none.
 
@@ -66,9 +71,9 @@ class Decoder:
         Parameters
         ----------
         packed : Packed
+            Messages of the topic.
         arrived_ns : callable, optional
-            Returns the times of sending or reception, int64, shape (n,): used for messages whose
-            stamp is zero, counted in `notes`.
+            Times that replace the stamps that are zero, counted in `notes`.
 
         """
         if self.deserialize is not None:
@@ -76,14 +81,12 @@ class Decoder:
         groups, n_broken = group_by_layout(packed, FIND_LAYOUT[self.message_type])
         if n_broken:
             self.dropped[f'{self.name} message that cannot be decoded'] += n_broken
-        parts = [(index, self._samples(layout, group)) for layout, index, group in groups]
-        return in_order(
-            [
-                (index, self._stamped(samples, index, arrived_ns))
-                for index, samples in parts
-                if samples is not None
-            ]
-        )
+        parts = []
+        for layout, index, group in groups:
+            samples = self._samples(layout, group)
+            if samples is not None:
+                parts.append((index, self._stamped(samples, index, arrived_ns)))
+        return in_order(parts)
 
     def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
         """
@@ -93,24 +96,30 @@ class Decoder:
         """
         if self.choice is not None and not self.choice.wants(layout.names[0], len(packed)):
             return None
-        return (decode_imu if self.message_type == IMU_TYPE else decode_temperature)(layout, packed)
+        decode = decode_imu if self.message_type == IMU_TYPE else decode_temperature
+        return decode(layout, packed)
 
-    def _stamped(self, samples, index, arrived_ns):
-        """Return the samples with the time of arrival where a driver has set no stamp."""
+    def _stamped(self, samples: Any, index: np.ndarray, arrived_ns: Arrivals | None) -> Any:
+        """
+        Return the samples with the time of arrival where a driver has set no stamp.
+
+        `index`: place of each sample in the arrival times.
+        """
         unset = samples.stamp_ns == 0
         if arrived_ns is None or not unset.any():
             return samples
         self.notes[f'{self.name} zero stamp'] += int(unset.sum())
         return replace(samples, stamp_ns=np.where(unset, arrived_ns()[index], samples.stamp_ns))
 
-    def _samples(self, layout, packed):
+    def _samples(self, layout: MessageLayout, packed: Packed) -> Any:
+        """Return the samples of messages of one layout; None, and counted, for unusable ones."""
         try:
             return self.decode_group(layout, packed)
         except UnusableMessage as error:
             self.dropped[str(error)] += len(packed)
             return None
 
-    def _standard(self, data):
+    def _standard(self, data: bytes) -> bytes:
         """Return a message as standard CDR; no bytes for one that cannot be read."""
         # Called only with a definition that is not the standard one.
         assert self.deserialize is not None
@@ -140,15 +149,19 @@ class FrameChoice:
         self.topic = topic
         self.frame_id = frame_id
         self.counts = Counter()
+        """frame_id -> messages so far."""
         self._n_frequent = 0
+        """Frames with at least OTHER_FRAME messages."""
 
     def wants(self, frame_id: str, n_messages: int = 1) -> bool:
         """
         Return whether messages of a frame are used; raises InputError if the choice is ambiguous.
         """
-        before = self.counts[frame_id]
-        self.counts[frame_id] = before + n_messages
-        self._n_frequent += before < OTHER_FRAME <= before + n_messages
+        n_before = self.counts[frame_id]
+        self.counts[frame_id] = n_before + n_messages
+        # A frame is counted once, in the call that reaches the threshold.
+        if n_before < OTHER_FRAME <= n_before + n_messages:
+            self._n_frequent += 1
         if self.frame_id is None and self._n_frequent > 1:
             raise InputError(
                 f'{self.topic} must have messages of one frame_id, got {self._listed()};'
@@ -168,7 +181,8 @@ class FrameChoice:
                 code='frame_unknown',
             )
 
-    def _listed(self):
+    def _listed(self) -> str:
+        """Return the most frequent frames as text."""
         return ', '.join(f"'{name}'" for name, _ in self.counts.most_common(KEPT_NAMES))
 
 
@@ -189,12 +203,17 @@ class JointDecoder(Decoder):
         self, joint_names: Sequence[str] | None = None, deserialize: Callable | None = None
     ):
         super().__init__(JOINT_STATE_TYPE, deserialize)
-        self.asked = joint_names is not None
+        self.requires_names = joint_names is not None
+        """Whether the joints of a table must occur."""
         self.names = () if joint_names is None else tuple(joint_names)
-        self.seen = []
-        self.n_messages, self.n_fitting = 0, 0
+        """Joints of the samples, in their order; () before a message has named any."""
+        self.seen_names = []
+        """The first KEPT_NAMES different lists of joints in the messages."""
+        self.n_messages = 0
+        self.n_fitting = 0
+        """Messages that contain the joints `names`."""
 
-    def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
+    def decode(self, packed: Packed, arrived_ns: Arrivals | None = None) -> Any:
         """
         As for Decoder.
 
@@ -213,59 +232,70 @@ class JointDecoder(Decoder):
 
         Its joints are those of the first message where none were given.
         """
-        if layout.names not in self.seen and len(self.seen) < KEPT_NAMES:
-            self.seen.append(layout.names)
-        if not self.asked and not self.names:
+        if layout.names not in self.seen_names and len(self.seen_names) < KEPT_NAMES:
+            self.seen_names.append(layout.names)
+        # Without a table the first message that names joints determines them.
+        if not self.requires_names and not self.names:
             self.names = layout.names
-        # Joints are those of the first message that names any.
         if not self.names:
             raise UnusableMessage(NO_NAMES)
         return decode_joints(layout, packed, self.names)
 
     def check(self) -> None:
         """Raise InputError when no message so far contains the joints of the table."""
-        if self.asked and self.seen and not self.n_fitting:
-            if any(set(self.names) <= set(names) for names in self.seen):
-                raise InputError(
-                    'JointState must have one position for each named joint, the messages so far do'
-                    ' not; correct the driver, or choose a different topic',
-                    key='joint_topic',
-                )
-            came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
-            missing = min(
-                ([name for name in self.names if name not in names] for names in self.seen), key=len
-            )
+        if not self.requires_names or not self.seen_names or self.n_fitting:
+            return
+        # All joints are named, so the messages were refused for their positions.
+        if any(set(self.names) <= set(names) for names in self.seen_names):
             raise InputError(
-                f'JointState must name the joints of the table ({", ".join(self.names)}), got'
-                f' {came}, which lacks {", ".join(missing)}; correct the names in the table'
-                ' description, or choose another topic',
+                'JointState must have one position for each named joint, the messages so far do'
+                ' not; correct the driver, or choose a different topic',
                 key='joint_topic',
-                code='joint_names',
             )
+        got = '; '.join(', '.join(names) or 'no names' for names in self.seen_names)
+        missing = [[name for name in self.names if name not in names] for names in self.seen_names]
+        raise InputError(
+            f'JointState must name the joints of the table ({", ".join(self.names)}), got'
+            f' {got}, which lacks {", ".join(min(missing, key=len))}; correct the names in the'
+            ' table description, or choose another topic',
+            key='joint_topic',
+            code='joint_names',
+        )
 
 
-def taken_counts(decoders: Iterable[Decoder]) -> tuple[dict[str, int] | None, ...]:
+def take_counts(
+    decoders: Iterable[Decoder],
+) -> tuple[dict[str, int] | None, dict[str, int] | None]:
     """
-    Return ({reason: messages dropped}, {reason: messages used with a change}) since the last call.
+    Return the sums of `dropped` and of `notes` over the decoders, and set these counts to zero.
 
-    None for none.
+    None in place of a sum without entries.
     """
-    totals: tuple[Counter[str], ...] = Counter(), Counter()
+    dropped: Counter[str] = Counter()
+    notes: Counter[str] = Counter()
     for decoder in decoders:
-        for total, own in zip(totals, (decoder.dropped, decoder.notes), strict=True):
-            total.update(own)
-            own.clear()
-    return tuple(dict(total) or None for total in totals)
+        dropped.update(decoder.dropped)
+        notes.update(decoder.notes)
+        decoder.dropped.clear()
+        decoder.notes.clear()
+    return dict(dropped) or None, dict(notes) or None
 
 
-def in_order(parts: Sequence[Any]) -> Any:
-    """Join (index, samples) pairs in the order of the indices; None when there are none."""
-    if len(parts) < 2:
-        return parts[0][1] if parts else None
-    # So that the frame is that of the first message.
+def in_order(parts: Sequence[tuple[np.ndarray, Any]]) -> Any:
+    """
+    Join parts (index, samples) to samples in ascending order of the index; None without a part.
+
+    The index of a part is ascending, shape (n,), for its n samples.
+    """
+    if not parts:
+        return None
+    if len(parts) == 1:
+        return parts[0][1]
+    # The joined samples have the frame of the first part, which must be that of the first message.
     parts = sorted(parts, key=lambda part: part[0][0])
     joined = type(parts[0][1]).concatenate(samples for _, samples in parts)
-    return joined.select(np.argsort(np.concatenate([index for index, _ in parts]), kind='stable'))
+    index = np.concatenate([index for index, _ in parts])
+    return joined.select(np.argsort(index, kind='stable'))
 
 
 FIND_LAYOUT: dict[str, Callable[[bytes], MessageLayout]] = {

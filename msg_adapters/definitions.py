@@ -14,10 +14,10 @@ from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE
 
 SEPARATOR = '=' * 80
-MAX_DEFINITION_CHARACTERS, MAX_ELEMENTS = 100_000, 10_000
-"""
-Characters of a definition and elements of a message at most, an array counted by its elements.
-"""
+MAX_DEFINITION_CHARACTERS = 100_000
+"""Largest number of characters of a definition."""
+MAX_ELEMENTS = 10_000
+"""Largest number of elements of a message; an array counts its elements, a sequence one of them."""
 DEFAULT_TOPICS = {
     IMU_TYPE: '/imu/data_raw',
     JOINT_STATE_TYPE: '/joint_states',
@@ -103,7 +103,7 @@ def standard_definition(message_type: str) -> TypeDefinition:
     return TypeDefinition(message_type, 'ros2msg', text, DIGESTS[message_type])
 
 
-def _nested_types(message_type):
+def _nested_types(message_type: str) -> list[str]:
     """Return the types of the fields and of their fields, each once, in the order of the fields."""
     nested = {}
     for kind, _ in _fields(FIELDS_OF_TYPE[message_type], message_type)[message_type]:
@@ -141,22 +141,26 @@ def is_standard(message_type: str, encoding: str, text: str) -> bool:
         return False
 
 
-COMMENT, FIELD = re.compile(r'#.*'), re.compile(r'(\S+)\s+(\w+)(?!\w)\s*(=?)')
-"""A comment, and one line: type, name, and the sign of a constant."""
+COMMENT = re.compile(r'#.*')
+FIELD = re.compile(r'(\S+)\s+(\w+)(?!\w)\s*(=?)')
+"""A line of a definition: type, name, and '=' for a constant."""
 
 
-def _fields(text, message_type):
+def _fields(text: str, message_type: str) -> dict[str, tuple[tuple[str, str], ...]]:
     """
     Return {type: ((type, name) of each field)} of a ros2msg definition with its nested types.
 
-    Without comments, constants and default values. ValueError for another text.
+    The text is the fields of `message_type`, then per nested type a line of ``=``, a line ``MSG:
+    NAME`` and its fields. Comments, constants and default values are left out. ValueError for
+    another text.
     """
-    found = {}
-    for part in re.split(r'^={10,}$', text, flags=re.MULTILINE):
-        lines = [COMMENT.sub('', line).strip() for line in part.splitlines()]
+    fields_of = {}
+    for section in re.split(r'^={10,}$', text, flags=re.MULTILINE):
+        lines = [COMMENT.sub('', line).strip() for line in section.splitlines()]
         lines = [line for line in lines if line]
         name = message_type
-        if found:
+        is_nested = bool(fields_of)
+        if is_nested:
             if not lines or not lines[0].startswith('MSG: '):
                 raise ValueError('a part of a definition must begin with MSG')
             name = _full_name(lines.pop(0).removeprefix('MSG: ').strip(), message_type)
@@ -165,14 +169,20 @@ def _fields(text, message_type):
             match = FIELD.match(line)
             if match is None:
                 raise ValueError(f'not a field: {line}')
-            if not match[3]:
+            is_constant = bool(match[3])
+            if not is_constant:
                 fields.append((_full_name(match[1], name), match[2]))
-        found[name] = tuple(fields)
-    return found
+        fields_of[name] = tuple(fields)
+    return fields_of
 
 
-def _full_name(kind, owner):
-    """Return a type with its package; a name without one is basic or of the owner's package."""
+def _full_name(kind: str, owner: str) -> str:
+    """
+    Return the type of a field as package/msg/Name, with its array size.
+
+    A name without a package is basic, if in lower case, or of the package of `owner`:
+    ``Vector3[3]`` in geometry_msgs/msg/Accel is ``geometry_msgs/msg/Vector3[3]``.
+    """
     name, bracket, size = kind.partition('[')
     if '/' in name:
         package, _, short = name.rpartition('/')
@@ -220,14 +230,14 @@ def deserializer(
     if text and encoding == 'ros2msg':
         types.update(get_types_from_msg(text, message_type))
     elif text:
-        parts = (
-            [part.split('\n', 1)[1] for part in text.split(SEPARATOR + '\n')[1:]]
-            if text.startswith(SEPARATOR)
-            else [text]
-        )
-        for part in parts:
-            types.update(get_types_from_idl(part))
-    _require_size(types, message_type)
+        # One IDL text, or several, each behind a separator and a line with its name.
+        idl_texts = [text]
+        if text.startswith(SEPARATOR):
+            sections = text.split(SEPARATOR + '\n')[1:]
+            idl_texts = [section.split('\n', 1)[1] for section in sections]
+        for idl in idl_texts:
+            types.update(get_types_from_idl(idl))
+    _require_bounded_size(types, message_type)
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
@@ -243,46 +253,73 @@ def standard_bytes(message: Any, message_type: str) -> bytes:
     return bytes(standard_store().serialize_cdr(_standard(message, message_type), message_type))
 
 
-def _standard(message, message_type):
+def _standard(message: Any, message_type: str) -> Any:
+    """
+    Return a message object of any definition as the object of the standard definition.
+
+    rosbags describes a field as (kind, content). The content is a message type for the kind NAME,
+    (basic type, size limit) for BASE, and (description of an item, size) for ARRAY and SEQUENCE.
+    """
     store = standard_store()
     fields = []
     for name, (kind, content) in store.fielddefs[message_type][1]:
         value = getattr(message, name)
         if kind.name == 'NAME':
             value = _standard(value, content)
-        elif kind.name in ('ARRAY', 'SEQUENCE') and content[0][1][0] == 'float64':
-            value = np.asarray(value, np.float64)
+        elif kind.name in ('ARRAY', 'SEQUENCE'):
+            item_kind, item_type = content[0]
+            if item_kind.name == 'BASE' and item_type[0] == 'float64':
+                value = np.asarray(value, np.float64)
         fields.append(value)
     return store.types[message_type](*fields)
 
 
-def _require_size(types, message_type):
+def _require_bounded_size(types: dict[str, Any], message_type: str) -> None:
     """
     Refuse a type with too many elements, recursion, or sequences of an empty type.
 
-    A message of few bytes would fill the memory.
+    A message of few bytes would fill the memory. `types`: message type -> its entry of rosbags,
+    which ends in the list of (name, description) of its fields.
     """
-    known = {}
+    _ElementCounter(types, message_type).count_in_type(message_type)
 
-    def elements(name):
-        if known.setdefault(name, -1) >= 0:
-            return known[name]
-        known[name] = sum(_of(description) for _, description in types[name][1])
-        if known[name] > MAX_ELEMENTS:
+
+class _ElementCounter:
+    """Counts the smallest numbers of elements that messages have, from the fields of their type."""
+
+    def __init__(self, types: dict[str, Any], message_type: str):
+        self.types = types
+        self.message_type = message_type
+        """The outermost type, for errors."""
+        self.n_elements: dict[str, int | None] = {}
+        """Type -> its elements; None while its fields are counted."""
+
+    def count_in_type(self, name: str) -> int:
+        """Return the sum of the elements of the fields of a type."""
+        if name in self.n_elements:
+            n_elements = self.n_elements[name]
+            if n_elements is None:
+                raise ValueError(f'{name} contains itself')
+            return n_elements
+        self.n_elements[name] = None
+        fields = self.types[name][1]
+        n_elements = sum(self._count_in_field(description) for _, description in fields)
+        if n_elements > MAX_ELEMENTS:
             raise ValueError(f'{name} has more than {MAX_ELEMENTS} elements')
-        return known[name]
+        self.n_elements[name] = n_elements
+        return n_elements
 
-    def _of(description):
+    def _count_in_field(self, description: Any) -> int:
+        """Return the elements of a field: of an array all, of a sequence those of one item."""
         kind, content = description
         if kind.name == 'NAME':
-            if known.get(content) == -1:
-                raise ValueError(f'{content} contains itself')
-            return elements(content)
+            return self.count_in_type(content)
         if kind.name == 'BASE':
             return 1
-        one = _of(content[0])
-        if one == 0:
-            raise ValueError(f'{message_type} has a sequence of elements without fields')
-        return one * content[1] if kind.name == 'ARRAY' else one
-
-    elements(message_type)
+        item, size = content
+        n_per_item = self._count_in_field(item)
+        if n_per_item == 0:
+            raise ValueError(f'{self.message_type} has a sequence of elements without fields')
+        if kind.name == 'ARRAY':
+            return n_per_item * size
+        return n_per_item

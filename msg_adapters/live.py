@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.samples import SampleBlock
-from msg_adapters.decode import Decoder, JointDecoder, taken_counts
+from msg_adapters.decode import Decoder, JointDecoder, take_counts
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.layout import Packed, UnusableMessage, clean_name
 
@@ -64,7 +64,7 @@ class LiveGatherer:
 
         """
         samples = {name: topic.take() for name, topic in self._topics.items()}
-        dropped, notes = taken_counts(topic.decoder for topic in self._topics.values())
+        dropped, notes = take_counts(topic.decoder for topic in self._topics.values())
         return SampleBlock(**samples, dropped=dropped, notes=notes)
 
 
