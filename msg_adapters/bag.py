@@ -59,7 +59,7 @@ def description_in(path: str, imu_topic: str | None = None) -> str:
 
     """
     texts = list(
-        _messages(
+        _read_messages(
             path, imu_topic, DESCRIPTION_TOPIC, STRING_TYPE, lambda message: str(message.data)
         )
     )
@@ -79,45 +79,49 @@ def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str
 
     The quaternion is x y z w of the child in the parent.
     """
-    found = []
-    for rows in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows):
-        found.extend(rows)
-    return found
+    transforms = []
+    for rows in _read_messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows):
+        transforms.extend(rows)
+    return transforms
 
 
 def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
     """
     Return (parent, child, quaternion) of each transform of a TFMessage.
 
-    As an object of rclpy or rosbags.
+    `message`: an object of rclpy or rosbags. Quaternion: x y z w of the child in the parent.
     """
-    found = []
-    for t in message.transforms:
-        found.append(
-            (
-                clean_name(t.header.frame_id).lstrip('/'),
-                clean_name(t.child_frame_id).lstrip('/'),
-                np.array([float(getattr(t.transform.rotation, a)) for a in 'xyzw']),
-            )
-        )
-    return found
+    rows = []
+    for transform in message.transforms:
+        parent = clean_name(transform.header.frame_id).lstrip('/')
+        child = clean_name(transform.child_frame_id).lstrip('/')
+        rotation = transform.transform.rotation
+        quaternion = np.array([float(getattr(rotation, axis)) for axis in 'xyzw'])
+        rows.append((parent, child, quaternion))
+    return rows
 
 
-def _messages(
-    path, imu_topic, topic, message_type, read: Callable[[Any], Sample]
+def _read_messages(
+    path: str,
+    imu_topic: str | None,
+    topic: str,
+    message_type: str,
+    read: Callable[[Any], Sample],
 ) -> Iterator[Sample]:
     """
-    Yield the result of `read` for each decodable message of a topic.
+    Yield ``read(message object)`` for each message of a topic that can be decoded and read.
 
-    No results when the recording lacks it.
+    No results where the recording has no topic of this name and type. `imu_topic`: as for
+    `open_recording`.
     """
     with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
-        if recording.source.types.get(topic) == message_type:
-            deserialize = recording.deserializer(message_type)
-            for raw in recording.source.stretches([topic]):
-                for k in range(len(raw.packed)):
-                    with suppress(Exception):  # rosbags raises many kinds on broken bytes
-                        yield read(deserialize(raw.packed.message(k)))
+        if recording.source.types.get(topic) != message_type:
+            return
+        deserialize = recording.deserializer(message_type)
+        for raw in recording.source.stretches([topic]):
+            for k in range(len(raw.packed)):
+                with suppress(Exception):  # rosbags raises many kinds on broken bytes
+                    yield read(deserialize(raw.packed.message(k)))
 
 
 LISTED_TOPICS = 20
@@ -201,8 +205,8 @@ def open_recording(
                 topics,
                 JOINT_STATE_TYPE,
                 joint_topic,
-                want_joints is True,
-                want_joints == 'optional',
+                required=want_joints is True,
+                lenient=want_joints == 'optional',
             )
         if want_temperature:
             temperature = _choose(
@@ -210,8 +214,7 @@ def open_recording(
                 topics,
                 TEMPERATURE_TYPE,
                 temperature_topic,
-                False,
-                want_temperature == 'optional',
+                lenient=want_temperature == 'optional',
             )
     except BaseException:
         source.close()
@@ -245,8 +248,12 @@ class Recording:
         self.topics = topics
         self.imu_topic = imu_topic
         self.joint_topic = joint_topic
+        """None where no joints are read."""
         self.temperature_topic = temperature_topic
-        self.source, self.frame_id = source, frame_id
+        """None where no temperatures are read."""
+        self.source = source
+        self.frame_id = frame_id
+        """Frame of the Imu messages that are read; None: of all, which must have one frame."""
 
     @property
     def message_counts(self) -> dict[str, int]:
@@ -289,7 +296,9 @@ class Recording:
 
         """
         decoders = self._decoders(joint_names, self.frame_id)
-        parts, n_samples = {}, 0
+        # Class of the samples -> samples of the present block.
+        parts = {}
+        n_samples = 0
         for raw in self.source.stretches(list(decoders)):
             for number, decoder in enumerate(decoders.values()):
                 samples = decoder.decode(*raw.of(number))
@@ -297,32 +306,38 @@ class Recording:
                     parts.setdefault(type(samples), []).append(samples)
                     n_samples += len(samples)
             if n_samples >= block_samples:
-                yield _block(parts, decoders)
-                parts, n_samples = {}, 0
+                yield _block(parts, decoders.values())
+                parts = {}
+                n_samples = 0
+        # A short recording ends before the decoders report joints or a frame that never occur.
         if self.joint_topic:
             decoders[self.joint_topic].check()
         decoders[self.imu_topic].choice.check()
-        last = _block(parts, decoders)
+        last = _block(parts, decoders.values())
         if parts or last.dropped:
             yield last
 
-    def _decoders(self, joint_names, frame_id):
+    def _decoders(
+        self, joint_names: Iterable[str] | None, frame_id: str | None
+    ) -> dict[str, Decoder]:
+        """
+        Return topic -> decoder of the topics that are read.
+
+        `joint_names`: joints of the table; `frame_id`: frame of the Imu messages, None for any.
+        """
         source = self.source
         decoders: dict[str, Decoder] = {}
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
-            standard = not source.ros1 and is_standard(
-                message_type, *source.definitions.get(message_type, ('', ''))
-            )
-            deserialize = None if standard else self.deserializer(message_type)
+            encoding, text = source.definitions.get(message_type, ('', ''))
+            deserialize = None
+            if source.ros1 or not is_standard(message_type, encoding, text):
+                deserialize = self.deserializer(message_type)
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize)
-            else:
-                decoders[topic] = Decoder(
-                    message_type,
-                    deserialize,
-                    FrameChoice(topic, frame_id) if message_type == IMU_TYPE else None,
-                )
+                continue
+            choice = FrameChoice(topic, frame_id) if message_type == IMU_TYPE else None
+            decoders[topic] = Decoder(message_type, deserialize, choice)
         return decoders
 
     def frames(self) -> list[str]:
@@ -369,13 +384,13 @@ class Recording:
         self.close()
 
 
-def _block(parts, decoders):
+def _block(parts: dict[type, list], decoders: Iterable[Decoder]) -> SampleBlock:
     """
-    Join the parts of a block and add the counts of dropped messages.
+    Return the samples of a block and the counts of the decoders since the last block.
 
-    These are the messages dropped by the decoders since the last block.
+    `parts`: class of the samples -> consecutive samples.
     """
-    dropped, notes = take_counts(decoders.values())
+    dropped, notes = take_counts(decoders)
     joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
     return SampleBlock(
         joined.get(ImuSamples),
@@ -386,7 +401,8 @@ def _block(parts, decoders):
     )
 
 
-def _open_source(path, log=LogOptions()):
+def _open_source(path: Path, log: LogOptions = LogOptions()) -> 'Rosbag2 | Ros1File':
+    """Return the reader of a recording, by the name of its file or folder; raises InputError."""
     if not path.exists():
         raise InputError(
             f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file,'
@@ -403,16 +419,16 @@ def _open_source(path, log=LogOptions()):
         require_no_rows(log, path)
         if path.suffix == '.bag':
             return Ros1File(path)
-        by_ros = RosReader.needed(path) and RosReader.installed()
-        return RosReader(path) if by_ros else Rosbag2(path)
+        if RosReader.needed(path) and RosReader.installed():
+            return RosReader(path)
+        return Rosbag2(path)
     except InputError:
         raise
     except Exception as error:  # rosbags, sqlite3 and the system raise many kinds
-        came = shortened(str(error), 300)
         raise InputError(
             f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file)'
-            f' or a text log ({", ".join(SUFFIXES)}), got: {came}; check the path, record again, or'
-            ' write the data as CSV and use the verb convert'
+            f' or a text log ({", ".join(SUFFIXES)}), got: {shortened(str(error), 300)}; check the'
+            ' path, record again, or write the data as CSV and use the verb convert'
         ) from error
 
 
@@ -429,30 +445,40 @@ def list_topics(path: str | PathLike[str], log: LogOptions = LogOptions()) -> tu
         source.close()
 
 
-def _listed(source):
+def _listed(source: 'Rosbag2 | Ros1File') -> tuple[Topic, ...]:
+    """Return the topics of a recording in order of name."""
     return tuple(
         Topic(name, source.types[name], source.counts[name]) for name in sorted(source.types)
     )
 
 
-def _choose(path, topics, message_type, asked, required, lenient=False):
+def _choose(
+    path: Path,
+    topics: Sequence[Topic],
+    message_type: str,
+    requested: str | None,
+    *,
+    required: bool = False,
+    lenient: bool = False,
+) -> Any:
     """
-    Return the topic of a type by the rule of `open_recording`, or None.
+    Return the name of the topic of a type: `requested`, the default name, or the only one.
 
-    Where there is none, or, when `lenient`, no telling which.
+    None without a topic of the type unless `required`, and with several if `lenient`; otherwise
+    InputError.
     """
     key = TOPIC_KEYS[message_type]
     fitting = [topic.name for topic in topics if topic.type == message_type]
-    if asked is not None:
-        names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
-        if not names:
-            raise InputError(
-                f'the topic that is read must be a {message_type} topic of {path}, got {asked}'
-                f'{did_you_mean(asked, fitting)}; {_listing(topics, fitting)}',
-                key=key,
-                code='topic_unknown',
-            )
-        return names[0]
+    if requested is not None:
+        for name in (requested, '/' + requested.lstrip('/')):
+            if name in fitting:
+                return name
+        raise InputError(
+            f'the topic that is read must be a {message_type} topic of {path}, got {requested}'
+            f'{did_you_mean(requested, fitting)}; {_listing(topics, fitting)}',
+            key=key,
+            code='topic_unknown',
+        )
     if DEFAULT_TOPICS[message_type] in fitting:
         return DEFAULT_TOPICS[message_type]
     if len(fitting) == 1:
@@ -460,30 +486,32 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
     if fitting and not lenient:
         raise InputError(
             f'{path} must have one {message_type} topic or one named'
-            f' {DEFAULT_TOPICS[message_type]}, got {_some(fitting)}; choose one',
+            f' {DEFAULT_TOPICS[message_type]}, got {_first_names(fitting)}; choose one',
             key=key,
             code='topic_ambiguous',
         )
     if required:
+        remedy = 'record it'
+        if message_type == JOINT_STATE_TYPE:
+            remedy += ', or calibrate by hand, without a table'
         raise InputError(
             f'{path} must have a {message_type} topic, got none: {_listing(topics, fitting)};'
-            ' record'
-            f' it{", or calibrate by hand, without a table" * (message_type == JOINT_STATE_TYPE)}',
+            f' {remedy}',
             code='no_topic_of_type',
         )
     return None
 
 
-def _listing(topics, fitting):
+def _listing(topics: Sequence[Topic], fitting: Sequence[str]) -> str:
+    """Return the end of an error: the `fitting` names, or all topics where none fits."""
     if fitting:
-        return f'choose one of {_some(fitting)}'
-    return 'it holds ' + (
-        _some([f'{topic.name} ({topic.type})' for topic in topics]) or 'no topics'
-    )
+        return f'choose one of {_first_names(fitting)}'
+    listed = _first_names([f'{topic.name} ({topic.type})' for topic in topics])
+    return f'it holds {listed or "no topics"}'
 
 
-def _some(names):
-    """Return the first names as a text, and how many more there are."""
+def _first_names(names: Sequence[str]) -> str:
+    """Return the first names as a text, and the number of the further ones."""
     text = ', '.join(names[:LISTED_TOPICS])
     if len(names) > LISTED_TOPICS:
         text += f' and {len(names) - LISTED_TOPICS} more'
@@ -504,10 +532,14 @@ class Ros1File:
         self.reader.open()
         self.reader.chunks = {place: _bounded(chunk) for place, chunk in self.reader.chunks.items()}
         self.lost = {}
+        """Unreadable data, reason -> count."""
         self._drop_repeated_entries()
         self.counts = {}
+        """Topic -> messages."""
         self.types = {}
+        """Topic -> message type."""
         self.definitions = {}
+        """Message type -> (language, text)."""
         self.topics = {}
         """Id of a connection -> topic."""
         for connection in self.reader.connections:
@@ -518,7 +550,8 @@ class Ros1File:
 
     def _drop_repeated_entries(self):
         """Keep one index entry for each place of a message, so that none is read twice."""
-        indexes, n_repeated = {}, 0
+        indexes = {}
+        n_repeated = 0
         for connection, entries in self.reader.indexes.items():
             by_place = {}
             for entry in entries:
@@ -532,11 +565,10 @@ class Ros1File:
     @property
     def duration_ns(self) -> int:
         """Time between the first and the last message by the clock of the recorder."""
-        return (
-            max(self.reader.end_time - self.reader.start_time - 1, 0)
-            if self.reader.message_count
-            else 0
-        )
+        if not self.reader.message_count:
+            return 0
+        # The end time of rosbags is one nanosecond after the last message.
+        return max(self.reader.end_time - self.reader.start_time - 1, 0)
 
     def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
         """
@@ -546,8 +578,8 @@ class Ros1File:
         """
         return grouped(self._messages(topics))
 
-    def _messages(self, topics):
-        """Yield (index of the topic, receive time, message); count what is lost by damage."""
+    def _messages(self, topics: Sequence[str]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (index of the topic, receive time, message); count the loss by damage in `lost`."""
         connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
         if not connections:
             return
@@ -559,8 +591,8 @@ class Ros1File:
                 yield topics.index(self.topics[connection.id]), received_ns, bytes(data)
         except Exception as error:  # rosbags raises various errors on damaged files
             extent = '' if expected > n_read else f' {UNKNOWN_EXTENT}'
-            lost = max(expected - n_read, 1)
-            self.lost[f'messages{extent} after damage ({error})'] = lost
+            n_lost = max(expected - n_read, 1)
+            self.lost[f'messages{extent} after damage ({error})'] = n_lost
 
     def close(self) -> None:
         """Close the file."""
@@ -573,8 +605,6 @@ def _bounded(chunk: Any) -> Any:
     from lz4 import frame
 
     compression = {bz2.decompress: 'bz2', frame.decompress: 'lz4'}.get(chunk.decompressor)
-    return (
-        chunk
-        if compression is None
-        else chunk._replace(decompressor=lambda data: decompress(compression, data, LARGEST_CHUNK))
-    )
+    if compression is None:
+        return chunk
+    return chunk._replace(decompressor=lambda data: decompress(compression, data, LARGEST_CHUNK))

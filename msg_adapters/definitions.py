@@ -141,7 +141,7 @@ def is_standard(message_type: str, encoding: str, text: str) -> bool:
         return False
 
 
-COMMENT = re.compile(r'#.*')
+LINE_COMMENT = re.compile(r'#.*')
 FIELD = re.compile(r'(\S+)\s+(\w+)(?!\w)\s*(=?)')
 """A line of a definition: type, name, and '=' for a constant."""
 
@@ -156,7 +156,7 @@ def _fields(text: str, message_type: str) -> dict[str, tuple[tuple[str, str], ..
     """
     fields_of = {}
     for section in re.split(r'^={10,}$', text, flags=re.MULTILINE):
-        lines = [COMMENT.sub('', line).strip() for line in section.splitlines()]
+        lines = [LINE_COMMENT.sub('', line).strip() for line in section.splitlines()]
         lines = [line for line in lines if line]
         name = message_type
         is_nested = bool(fields_of)
@@ -230,7 +230,7 @@ def deserializer(
     if text and encoding == 'ros2msg':
         types.update(get_types_from_msg(text, message_type))
     elif text:
-        # One IDL text, or several, each behind a separator and a line with its name.
+        # One IDL text, or several, each after a separator and a line with its name.
         idl_texts = [text]
         if text.startswith(SEPARATOR):
             sections = text.split(SEPARATOR + '\n')[1:]

@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,25 +48,22 @@ class Packed:
         """
         return self._parts(bytearray(self.buffer))
 
-    def _parts(self, data):
-        return (
-            data[start:end]
-            for start, end in zip(
-                self.start.tolist(), (self.start + self.size).tolist(), strict=True
-            )
-        )
+    def _parts(self, data: Any) -> Iterator:
+        """Yield the bytes of each message in the buffer `data`, in its type."""
+        ends = (self.start + self.size).tolist()
+        return (data[start:end] for start, end in zip(self.start.tolist(), ends, strict=True))
 
     def copy_to(self, target: np.ndarray, place: np.ndarray) -> None:
         """
         Copy each message into the bytes `target`, from its `place` on: one gather for each size.
         """
         order = np.argsort(self.size, kind='stable')
-        for some in np.split(order, np.flatnonzero(np.diff(self.size[order])) + 1):
-            if len(some) and self.size[some[0]]:
-                kind = f'V{self.size[some[0]]}'
-                overlapping(target, kind)[place[some]] = overlapping(self.buffer, kind)[
-                    self.start[some]
-                ]
+        size_changes = np.flatnonzero(np.diff(self.size[order])) + 1
+        for of_size in np.split(order, size_changes):
+            if len(of_size) and self.size[of_size[0]]:
+                word = f'V{self.size[of_size[0]]}'
+                words = overlapping(self.buffer, word)[self.start[of_size]]
+                overlapping(target, word)[place[of_size]] = words
 
     def items_at(self, offset: int, dtype: str) -> np.ndarray:
         """
@@ -126,9 +123,9 @@ class Packed:
 @dataclass(frozen=True, eq=False)
 class MessageLayout:
     """
-    Where the numbers of a message lie, and which bytes must be equal in another one.
+    Positions of the numbers of a message, and its bytes that decide on the layout.
 
-    These bytes must be equal for another message to share this layout.
+    Another message has the same layout if its size and its `fixed` bytes are equal.
     """
 
     order: str
@@ -150,7 +147,7 @@ class MessageLayout:
     def matches(self, packed: Packed) -> np.ndarray:
         """Return which messages have this layout, bool, shape (n,)."""
         same = packed.size == self.size
-        # A shorter message could end beyond the buffer: one of the right size replaces it.
+        # A message of another size could end beyond the buffer: one of this size replaces it.
         start = np.where(same, packed.start, packed.start[np.argmax(same)])
         complete = Packed(packed.buffer, start, packed.size)
         for offset, mask, expected in _checks(self.fixed, self.sample):
@@ -211,7 +208,7 @@ def group_by_layout(
             n_broken += 1
             remaining = remaining[1:]
             continue
-        # With many layouts a comparison of all messages with each one would take long.
+        # With many layouts a comparison of all messages with each one would be slow.
         if len(groups) + n_broken < MAX_LAYOUTS:
             same = layout.matches(packed.select(remaining))
             of_layout = remaining[same]
@@ -229,24 +226,25 @@ def overlapping(buffer: np.ndarray, dtype: str) -> np.ndarray:
     return np.ndarray((max(len(buffer) - dtype.itemsize + 1, 0),), dtype, buffer, strides=(1,))
 
 
-def _checks(fixed, sample):
+def _checks(fixed: tuple, sample: bytes) -> Iterator[tuple[int, np.uint64, np.uint64]]:
     """
-    Cover the fixed bytes by few 8-byte words inside the message: (offset, mask, expected value).
+    Yield (offset, mask, value) of few 8-byte words that cover the fixed bytes of a message.
+
+    A message has the fixed bytes of `sample` if ``word & mask == value`` for each word, read as a
+    little-endian integer at the offset.
     """
-    left = np.zeros(len(sample), dtype=bool)
-    for first, last in fixed:
-        left[first:last] = True
-    while left.any():
-        offset = min(int(np.argmax(left)), len(sample) - 8)
-        mask = int.from_bytes(
-            np.where(left[offset : offset + 8], 0xFF, 0).astype(np.uint8).tobytes(), 'little'
-        )
-        left[offset : offset + 8] = False
-        yield (
-            offset,
-            np.uint64(mask),
-            np.uint64(int.from_bytes(sample[offset : offset + 8], 'little') & mask),
-        )
+    uncovered = np.zeros(len(sample), dtype=bool)
+    for first, end in fixed:
+        uncovered[first:end] = True
+    while uncovered.any():
+        # Inside the message: the last word may begin before the first uncovered byte.
+        offset = min(int(np.argmax(uncovered)), len(sample) - 8)
+        place = slice(offset, offset + 8)
+        mask_bytes = np.where(uncovered[place], 0xFF, 0).astype(np.uint8).tobytes()
+        mask = int.from_bytes(mask_bytes, 'little')
+        value = int.from_bytes(sample[place], 'little') & mask
+        uncovered[place] = False
+        yield offset, np.uint64(mask), np.uint64(value)
 
 
 NS_PER_S = 1_000_000_000
@@ -323,17 +321,15 @@ def open_header(data: bytes) -> Header:
     sec, nanosec, length = _STARTS[order].unpack_from(data, ENCAPSULATION_SIZE)
     if length > LONGEST_FRAME:
         raise MessageError(f'a frame_id must have at most {LONGEST_FRAME} bytes, got {length}')
-    end = FRAME_OFFSET + 4 + length
+    start = FRAME_OFFSET + 4
+    end = start + length
     if end > len(data):
         raise MessageError(
             f'a frame_id of {length} bytes ends at byte {end}, the message has {len(data)}'
         )
-    return Header(
-        order,
-        sec * NS_PER_S + nanosec,
-        bytes(data[FRAME_OFFSET + 4 : end - 1 if length else end]),
-        end,
-    )
+    # Without the closing zero.
+    frame = data[start : end - 1] if length else b''
+    return Header(order, sec * NS_PER_S + nanosec, bytes(frame), end)
 
 
 def frame_head(frame_id: str, order: str = '<') -> bytes:

@@ -5,7 +5,7 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from os import PathLike
@@ -34,6 +34,10 @@ Records that are not messages in one buffer; there are at most 65,536 schemas an
 """
 RUN = 8
 """After so many records of one size, the next ones are searched by stride."""
+ChannelMessages = tuple[np.ndarray, Packed]
+"""Channel id of each message, int64, shape (n,), and the messages in file order."""
+MessageIndexes = Sequence[tuple[int, np.ndarray]]
+"""Channel id and offsets of its Message records in a chunk, for the channels of the chunk."""
 
 
 class Schema(NamedTuple):
@@ -56,6 +60,43 @@ class Channel(NamedTuple):
     """Name."""
     encoding: str
     """Serialization of the messages."""
+
+
+class Walk(NamedTuple):
+    """Records from one place of a file on, up to a chunk, the end or damage."""
+
+    channels: np.ndarray
+    """Channel id of each message, int64, shape (n,)."""
+    messages: Packed
+    """The messages in file order."""
+    others: list[tuple[int, bytes]]
+    """(opcode, content) of the records that are not messages."""
+    end: int
+    """Where the next record would start, in bytes from the first one."""
+
+
+class McapRecord(NamedTuple):
+    """A record of the data section of a file, or a run of messages outside of chunks."""
+
+    opcode: int
+    """Of a run: MESSAGE."""
+    position: int
+    """First byte of the content in the file; of a run, of its first record."""
+    length: int
+    """Bytes of the content; of a run, of all its records."""
+    run: Walk | None = None
+    """The records of a run."""
+
+
+class Statistics(NamedTuple):
+    """Content of a Statistics record."""
+
+    first_ns: int
+    """Receive time of the first message, 0 if unknown."""
+    last_ns: int
+    """Receive time of the last message, 0 if unknown."""
+    counts: dict[int, int]
+    """Channel id -> messages."""
 
 
 class McapDamage(Exception):
@@ -85,16 +126,12 @@ def parse_message_index(content: bytes) -> tuple[int, np.ndarray]:
     return channel, entries[1::2].astype(np.int64)
 
 
-def parse_statistics(content: bytes) -> tuple[int, int, dict[int, int]]:
-    """Return (first time, last time, channel id -> messages) from a Statistics record."""
-    first, last = struct.unpack_from('<QQ', content, 26)
-    return (
-        first,
-        last,
-        dict(
-            struct.iter_unpack('<HQ', content[46 : 46 + struct.unpack_from('<I', content, 42)[0]])
-        ),
-    )
+def parse_statistics(content: bytes) -> Statistics:
+    """Return the Statistics from the content of a Statistics record."""
+    first_ns, last_ns = struct.unpack_from('<QQ', content, 26)
+    (n_bytes,) = struct.unpack_from('<I', content, 42)
+    counts = dict(struct.iter_unpack('<HQ', content[46 : 46 + n_bytes]))
+    return Statistics(first_ns, last_ns, counts)
 
 
 def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
@@ -110,32 +147,39 @@ def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
     -------
     records : bytes-like
         The records.
-    whole : bool
+    complete : bool
         False when the end is missing.
 
     """
     try:
-        size, crc, length = struct.unpack_from('<QII', content, 16)
-        compression = bytes(content[32 : 32 + length]).decode()
-        (packed_size,) = struct.unpack_from('<Q', content, 32 + length)
+        size, crc, name_length = struct.unpack_from('<QII', content, 16)
+        compression = bytes(content[32 : 32 + name_length]).decode()
+        (packed_size,) = struct.unpack_from('<Q', content, 32 + name_length)
     except (struct.error, UnicodeDecodeError):
         raise McapDamage('a chunk without its header') from None
-    packed = content[40 + length : 40 + length + packed_size]
+    start = 40 + name_length
+    packed = content[start : start + packed_size]
     try:
         records = packed if compression == '' else decompress_chunk(compression, packed, size)
     except ValueError as error:
         raise McapDamage(str(error)) from error
-    whole = len(records) == size and len(packed) == packed_size
-    if whole and crc and zlib.crc32(records) != crc:
+    complete = len(records) == size and len(packed) == packed_size
+    # A checksum of 0 means none.
+    if complete and crc and zlib.crc32(records) != crc:
         raise McapDamage('a chunk whose checksum does not fit')
-    return records, whole
+    return records, complete
 
 
-def indexed_messages(
-    buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]
-) -> tuple[np.ndarray, Packed] | None:
+def indexed_messages(buffer: np.ndarray, indexes: MessageIndexes) -> ChannelMessages | None:
     """
     Find the messages of a chunk by its message indexes.
+
+    Parameters
+    ----------
+    buffer : ndarray
+        Records of the chunk, uint8, shape (n_bytes,).
+    indexes : MessageIndexes
+        Of its channels.
 
     Returns
     -------
@@ -147,86 +191,75 @@ def indexed_messages(
     if not indexes or len(buffer) < MESSAGE_PREFIX:
         return None
     offset = np.concatenate([offsets for _, offsets in indexes])
-    channel = np.repeat([number for number, _ in indexes], [len(offsets) for _, offsets in indexes])
+    n_of_channel = [len(offsets) for _, offsets in indexes]
+    channel = np.repeat([number for number, _ in indexes], n_of_channel)
     order = np.argsort(offset, kind='stable')
     offset = offset[order]
     channel = channel[order]
     if not len(offset) or offset[0] < 0 or offset[-1] + MESSAGE_PREFIX > len(buffer):
         return None
+    # The records follow each other without a gap, from the first byte to the last one.
     length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
-    gapless = offset[0] == 0 and np.array_equal(
-        offset + PREFIX.size + length, np.append(offset[1:], len(buffer))
-    )
-    if (
-        not gapless
-        or (buffer[offset] != MESSAGE).any()
-        or (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any()
-    ):
+    next_offset = np.append(offset[1:], len(buffer))
+    if offset[0] != 0 or not np.array_equal(offset + PREFIX.size + length, next_offset):
+        return None
+    if (buffer[offset] != MESSAGE).any():
+        return None
+    if (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any():
         return None
     return channel, Packed(buffer, offset + MESSAGE_PREFIX, length - 22)
 
 
-def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int, bytes]], int]:
+def walk(buffer: np.ndarray) -> Walk:
     """
     Step through records until a chunk, the end, or an incomplete or impossible one.
 
-    Runs of one size are parsed at once.
-
-    Returns
-    -------
-    (channel, messages) : (ndarray, Packed)
-        Channel ids, int64, shape (n,), and the messages in file order.
-    others : list of (opcode, content)
-        Records that are not messages.
-    end : int
-        Where the next record would start.
-
+    Runs of one size are parsed at once. `buffer`: uint8, shape (n_bytes,).
     """
     view = buffer.data
     offsets = []
     others = []
     position = 0
-    previous = -1
-    run = 0
+    last_length = -1
+    n_of_length = 0  # messages of this length in front of the present one, without interruption
     end = len(buffer)
     while position + PREFIX.size <= end:
         opcode, length = PREFIX.unpack_from(view, position)
-        behind = position + PREFIX.size + length
-        if (
-            not is_record(opcode)
-            or opcode in (CHUNK, DATA_END, FOOTER)
-            or behind > end
-            or (opcode == MESSAGE and length < 22)
-        ):
+        record_end = position + PREFIX.size + length
+        if not is_record(opcode) or opcode in (CHUNK, DATA_END, FOOTER):
             break
-        # After `RUN` records of one length the next ones are compared in one step.
+        if record_end > end:
+            break
         if opcode != MESSAGE:
             if len(others) == MOST_OTHERS:
                 break
-            others.append((opcode, bytes(view[position + PREFIX.size : behind])))
+            others.append((opcode, bytes(view[position + PREFIX.size : record_end])))
+            position = record_end
+            continue
+        # Channel, sequence and two times have 22 bytes.
+        if length < 22:
+            break
+        n_of_length = n_of_length + 1 if length == last_length else 0
+        last_length = length
+        stride = PREFIX.size + length
+        # After `RUN` messages of one length the next ones are compared in one step.
+        if n_of_length < RUN:
+            run_offsets = np.array([position])
         else:
-            run = run + 1 if length == previous else 0
-            previous = length
-            offsets.append(
-                np.array([position])
-                if run < RUN
-                else _run(buffer, position, PREFIX.size + length, 4 * run)
-            )
-            run += len(offsets[-1]) - 1
-            behind = int(offsets[-1][-1]) + PREFIX.size + length
-        position = behind
+            run_offsets = _run_offsets(buffer, position, stride, 4 * n_of_length)
+        offsets.append(run_offsets)
+        n_of_length += len(run_offsets) - 1
+        position = int(run_offsets[-1]) + stride
 
+    if not offsets:
+        nothing = np.zeros(0, np.int64)
+        return Walk(nothing, Packed(buffer[:position], nothing, nothing), others, position)
     # Length and channel of each message.
-    offset = np.concatenate(offsets) if offsets else np.zeros(0, np.int64)
-    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64) if len(offset) else offset
-    channel = (
-        overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64) if len(offset) else offset
-    )
-    return (
-        (channel, Packed(buffer[:position], offset + MESSAGE_PREFIX, length - 22)),
-        others,
-        position,
-    )
+    offset = np.concatenate(offsets)
+    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
+    channel = overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64)
+    messages = Packed(buffer[:position], offset + MESSAGE_PREFIX, length - 22)
+    return Walk(channel, messages, others, position)
 
 
 def log_times(messages: Packed, index: np.ndarray) -> np.ndarray:
@@ -239,20 +272,23 @@ def is_record(opcode: int) -> bool:
     return 1 <= opcode <= LAST_OPCODE or opcode >= 0x80
 
 
-def _run(buffer, position, stride, reach):
+def _run_offsets(buffer: np.ndarray, position: int, stride: int, most: int) -> np.ndarray:
     """
-    Return offsets of up to `reach` records from `position` on.
+    Return the offsets of up to `most` Message records of `stride` bytes from `position` on.
 
-    The records follow each other with the same opcode and length.
+    They end at the first record of another kind or length.
     """
-    offset = position + stride * np.arange(min((len(buffer) - position) // stride, reach))
-    same = (buffer[offset] == MESSAGE) & (
-        overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size
-    )
-    return offset[: len(offset) if same.all() else int(np.argmin(same))]
+    n_fitting = (len(buffer) - position) // stride
+    offset = position + stride * np.arange(min(n_fitting, most))
+    same_length = overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size
+    same = (buffer[offset] == MESSAGE) & same_length
+    if same.all():
+        return offset
+    return offset[: int(np.argmin(same))]
 
 
-def _strings(content, position, count):
+def _strings(content: bytes | memoryview, position: int, count: int) -> list[bytes]:
+    """Return `count` consecutive strings with their lengths in front, from `position` on."""
     texts = []
     for _ in range(count):
         (length,) = struct.unpack_from('<I', content, position)
@@ -289,11 +325,17 @@ class McapFile(StorageFile):
         self.unpack = unpack
         self.file = open_regular(path)
         self.size = os.fstat(self.file.fileno()).st_size
-        self.schemas = {}
-        self.channels = {}
+        self.schemas: dict[int, Schema] = {}
+        """Schema id -> Schema."""
+        self.channels: dict[int, Channel] = {}
+        """Channel id -> Channel."""
         self.lost = {}
-        self.chunk_starts, self.n_unpacked = [], 0
+        self.chunk_starts: list[int] = []
+        """Positions of the chunks by the summary, ascending."""
+        self.n_unpacked = 0
+        """Decompressed bytes since the begin of a pass through the file."""
         self.statistics: Any = None
+        """Statistics of the summary or of a scan; None before either."""
         try:
             if self._read(0, len(MAGIC)) != MAGIC:
                 raise ValueError('the file does not begin as an MCAP file')
@@ -309,14 +351,11 @@ class McapFile(StorageFile):
         """Topic -> message type; serializations other than CDR are named after the type."""
         types = {}
         for channel in self.channels.values():
-            name = (
-                self.schemas[channel.schema_id].name
-                if channel.schema_id in self.schemas
-                else 'unknown'
-            )
-            types[channel.topic] = (
-                name if channel.encoding == 'cdr' else f'{name} ({channel.encoding})'
-            )
+            schema = self.schemas.get(channel.schema_id)
+            name = 'unknown' if schema is None else schema.name
+            if channel.encoding != 'cdr':
+                name = f'{name} ({channel.encoding})'
+            types[channel.topic] = name
         return types
 
     @property
@@ -327,15 +366,15 @@ class McapFile(StorageFile):
     def count(self) -> dict[str, int]:
         """Return topic -> messages."""
         counts = Counter({channel.topic: 0 for channel in self.channels.values()})
-        for number, count in self.statistics[2].items():
+        for number, count in self.statistics.counts.items():
             if number in self.channels:
                 counts[self.channels[number].topic] += count
         return dict(counts)
 
     def time_range(self) -> tuple[int, int] | None:
         """Return (first, last) receive time in ns, or None when the file lacks it."""
-        first, last, counts = self.statistics
-        return (first, last) if any(counts.values()) and last else None
+        first_ns, last_ns, counts = self.statistics
+        return (first_ns, last_ns) if any(counts.values()) and last_ns else None
 
     def close(self) -> None:
         """Close the file."""
@@ -349,9 +388,10 @@ class McapFile(StorageFile):
             ids.setdefault(channel.topic, []).append(number)
         return ids
 
-    def _stretches(self, topics):
-        known = self.topic_ids
-        wanted = {number for topic in topics for number in known.get(topic, ())}
+    def _stretches(self, topics: Sequence[str]) -> Iterator[Stretch]:
+        """Yield the Stretches that may hold messages of the topics, read ahead in a thread."""
+        channels_of_topic = self.topic_ids
+        wanted = {number for topic in topics for number in channels_of_topic.get(topic, ())}
         with closing(read_ahead(self._joined_pieces(wanted))) as pieces:
             for channel, packed in pieces:
                 yield Stretch(
@@ -360,121 +400,127 @@ class McapFile(StorageFile):
                     partial(log_times, packed),
                 )
 
-    def _joined_pieces(self, wanted):
-        """Join pieces to stretches."""
-        waiting, n_waiting = [], 0
-        for piece in self._pieces(wanted):
-            waiting.append(piece)
-            n_waiting += len(piece[1].buffer)
-            if n_waiting >= CHUNK_STRETCH_BYTES:
-                yield _join(waiting)
-                waiting, n_waiting = [], 0
-        if waiting:
-            yield _join(waiting)
+    def _joined_pieces(self, wanted: set[int]) -> Generator[ChannelMessages, None, None]:
+        """Yield the pairs of `_pieces`, joined to at least `CHUNK_STRETCH_BYTES`."""
+        pending = []
+        n_bytes = 0
+        for channels, messages in self._pieces(wanted):
+            pending.append((channels, messages))
+            n_bytes += len(messages.buffer)
+            if n_bytes >= CHUNK_STRETCH_BYTES:
+                yield _join(pending)
+                pending = []
+                n_bytes = 0
+        if pending:
+            yield _join(pending)
 
-    def _pieces(self, wanted):
+    def _pieces(self, wanted: set[int]) -> Iterator[ChannelMessages]:
         """
-        Yield (channel ids, Packed) for chunks and for runs of messages outside of chunks.
+        Yield (channel ids, messages) of each chunk and of each run of messages outside of chunks.
 
-        Each chunk with wanted channels and each such run gives one pair.
+        Chunks without a channel of `wanted`, by their indexes, are skipped.
         """
-        for opcode, position, length, walked in self._records():
-            if opcode == CHUNK:
-                indexes = self._indexes_behind(position + length)
+        for record in self._records():
+            if record.opcode == CHUNK:
+                indexes = self._indexes_at(record.position + record.length)
                 if not indexes or any(number in wanted for number, _ in indexes):
-                    yield from self._chunk(position, length, indexes)
-            elif opcode == MESSAGE:
-                self._register(walked[1])
-                yield walked[0]
-            elif opcode in (SCHEMA, CHANNEL):
-                self._register([(opcode, self._read(position, length))])
+                    yield from self._chunk(record, indexes)
+            elif record.run is not None:
+                self._register(record.run.others)
+                yield record.run.channels, record.run.messages
+            else:
+                self._register_at(record)
 
-    def _chunk(self, position, length, indexes):
-        content = memoryview(self._read(position, length))
+    def _chunk(self, record: McapRecord, indexes: MessageIndexes) -> Iterator[ChannelMessages]:
+        """
+        Yield (channel ids, messages) of one chunk; nothing, and counted in `lost`, for damage.
+
+        `indexes` of the chunk are used where they fit; otherwise its records are walked through.
+        """
+        content = memoryview(self._read(record.position, record.length))
         try:
-            records, whole = unpack_chunk(content)
+            records, complete = unpack_chunk(content)
             self.n_unpacked += len(records)
             if self.n_unpacked > largest_content(self.size):
                 raise McapDamage('chunks that expand far beyond the size of the file')
         except McapDamage as damage:
-            self._lose(f'messages in {damage}', max(sum(len(offsets) for _, offsets in indexes), 1))
+            n_lost = sum(len(offsets) for _, offsets in indexes)
+            self._lose(f'messages in {damage}', max(n_lost, 1))
             return
         buffer = np.frombuffer(records, np.uint8)
-        messages = indexed_messages(buffer, indexes) if whole else None
-        if messages is None:
-            messages, others, end = walk(buffer)
-            self._register(others)
-            if not whole or end < len(buffer):
-                self._lose(f'chunks that end early, {UNKNOWN_EXTENT}', 1)
-        yield messages
+        if complete:
+            indexed = indexed_messages(buffer, indexes)
+            if indexed is not None:
+                yield indexed
+                return
+        walked = walk(buffer)
+        self._register(walked.others)
+        if not complete or walked.end < len(buffer):
+            self._lose(f'chunks that end early, {UNKNOWN_EXTENT}', 1)
+        yield walked.channels, walked.messages
 
-    def _records(self):
+    def _records(self) -> Iterator[McapRecord]:
         """
-        Yield (opcode, position, length, None) of the records of the data section.
+        Yield the records of the data section; messages outside of chunks in runs.
 
         A truncated chunk is yielded with its remaining bytes.
-
-        Messages outside of chunks are yielded in groups, with ((channel ids, Packed), other
-        records) in place of None.
         """
-        position = len(MAGIC)
+        position: int | None = len(MAGIC)
         self.n_unpacked = 0
-        ahead = FIRST_BYTES
+        n_ahead = FIRST_BYTES  # bytes that are read for the next run
         while position is not None:
             opcode, length = self._prefix(position)
-            behind = position + PREFIX.size + length
+            content_start = position + PREFIX.size
+            record_end = content_start + length
             if opcode in (DATA_END, FOOTER):
                 return
-            if not is_record(opcode) or behind > self.size:
+            if not is_record(opcode) or record_end > self.size:
                 if opcode == CHUNK:  # up to the next one, so that no byte is read twice
-                    yield (
-                        CHUNK,
-                        position + PREFIX.size,
-                        (self._following(position) or self.size) - position - PREFIX.size,
-                        None,
-                    )
+                    chunk_end = self._next_chunk(position) or self.size
+                    yield McapRecord(CHUNK, content_start, chunk_end - content_start)
                 position = self._resume(position)
             elif opcode == MESSAGE:
-                buffer = np.frombuffer(
-                    self._read(position, max(ahead, behind - position)), np.uint8
-                )
-                messages, others, end = walk(buffer)
-                if 2 * end > len(buffer):
-                    ahead = min(2 * ahead, CHUNK_STRETCH_BYTES)
+                content = self._read(position, max(n_ahead, record_end - position))
+                buffer = np.frombuffer(content, np.uint8)
+                run = walk(buffer)
+                if 2 * run.end > len(buffer):
+                    n_ahead = min(2 * n_ahead, CHUNK_STRETCH_BYTES)
                 else:
-                    ahead = max(2 * end, MESSAGE_PREFIX)
-                if end:
-                    yield MESSAGE, position, end, (messages, others)
-                position = position + end if end else self._resume(position)
+                    n_ahead = max(2 * run.end, MESSAGE_PREFIX)
+                if run.end:
+                    yield McapRecord(MESSAGE, position, run.end, run)
+                    position += run.end
+                else:
+                    position = self._resume(position)
             else:
-                yield opcode, position + PREFIX.size, length, None
-                position = behind
+                yield McapRecord(opcode, content_start, length)
+                position = record_end
 
-    def _prefix(self, position):
+    def _prefix(self, position: int) -> tuple[int, int]:
         """Return (opcode, length) of the record at `position`, zeros at the end of the file."""
         prefix = self._read(position, PREFIX.size)
         return PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
 
-    def _resume(self, position):
-        """
-        Count the damage at `position` and return the start of the next chunk in the summary.
-
-        Or None.
-        """
-        following = self._following(position)
+    def _resume(self, position: int) -> int | None:
+        """Count the damage at `position`; return the start of the next known chunk, or None."""
+        next_chunk = self._next_chunk(position)
         self._lose(
             f'bytes that are no whole record, messages {UNKNOWN_EXTENT}',
-            max((following or self.size) - position, 1),
+            max((next_chunk or self.size) - position, 1),
         )
-        return following
+        return next_chunk
 
-    def _following(self, position):
-        """Return the first known start of a chunk after `position`, or None."""
+    def _next_chunk(self, position: int) -> int | None:
+        """Return the first start of a chunk after `position` by the summary, or None."""
         place = bisect_right(self.chunk_starts, position)
         return self.chunk_starts[place] if place < len(self.chunk_starts) else None
 
-    def _indexes_behind(self, position):
-        """Return (channel id, offsets) from the MessageIndex records that start at `position`."""
+    def _indexes_at(self, position: int) -> MessageIndexes:
+        """
+        Return (channel id, offsets) from the MessageIndex records that start at `position`.
+
+        Empty where one of them is damaged.
+        """
         indexes = []
         while True:
             opcode, length = self._prefix(position)
@@ -498,36 +544,44 @@ class McapFile(StorageFile):
         (start,) = struct.unpack_from('<Q', footer, PREFIX.size)
         if not len(MAGIC) <= start < self.size:
             return
-        _, records, _ = walk(np.frombuffer(self._read(start, self.size - start), np.uint8))
-        for opcode, content in records:
+        summary = walk(np.frombuffer(self._read(start, self.size - start), np.uint8))
+        for opcode, content in summary.others:
             if opcode == STATISTICS:
                 self.statistics = parse_statistics(content)
             elif opcode == CHUNK_INDEX:
                 self.chunk_starts.append(struct.unpack_from('<Q', content, 16)[0])
-        self._register(records)
+        self._register(summary.others)
         self.chunk_starts.sort()
 
-    def _scan(self):
+    def _scan(self) -> Statistics:
         """
         Find channels and counts without a summary, by the message indexes where there are any.
         """
         counts = Counter()
-        for opcode, position, length, walked in self._records():
-            indexes = self._indexes_behind(position + length) if opcode == CHUNK else []
-            if indexes and all(number in self.channels for number, _ in indexes):
-                counts.update({number: len(offsets) for number, offsets in indexes})
-            elif opcode == CHUNK:
-                for channel, _ in self._chunk(position, length, indexes):
-                    counts.update(channel.tolist())
-            elif opcode == MESSAGE:
-                self._register(walked[1])
-                counts.update(walked[0][0].tolist())
-            elif opcode in (SCHEMA, CHANNEL):
-                self._register([(opcode, self._read(position, length))])
+        for record in self._records():
+            if record.opcode == CHUNK:
+                indexes = self._indexes_at(record.position + record.length)
+                # A channel that is still unknown may be defined in the chunk.
+                if indexes and all(number in self.channels for number, _ in indexes):
+                    counts.update({number: len(offsets) for number, offsets in indexes})
+                    continue
+                for channels, _ in self._chunk(record, indexes):
+                    counts.update(channels.tolist())
+            elif record.run is not None:
+                self._register(record.run.others)
+                counts.update(record.run.channels.tolist())
+            else:
+                self._register_at(record)
         self.lost.clear()  # it will be counted again when the messages are read
-        return 0, 0, counts
+        return Statistics(0, 0, counts)
 
-    def _register(self, records):
+    def _register_at(self, record: McapRecord) -> None:
+        """Read a record and keep it if it is a Schema or a Channel."""
+        if record.opcode in (SCHEMA, CHANNEL):
+            self._register([(record.opcode, self._read(record.position, record.length))])
+
+    def _register(self, records: Sequence[tuple[int, bytes]]) -> None:
+        """Keep the Schemas and Channels among records (opcode, content)."""
         for opcode, content in records:
             if opcode == SCHEMA:
                 number, schema = parse_schema(content)
@@ -536,11 +590,12 @@ class McapFile(StorageFile):
                 number, channel = parse_channel(content)
                 self.channels[number] = channel
 
-    def _read(self, position, size):
+    def _read(self, position: int, size: int) -> bytes:
+        """Return up to `size` bytes from `position` on, fewer at the end of the file."""
         return os.pread(self.file.fileno(), size, position)
 
 
-def _join(pieces):
-    """Join (channel ids, Packed) pieces into one."""
-    channels, parts = zip(*pieces, strict=True)
-    return np.concatenate(channels), Packed.chain(parts)
+def _join(pieces: Sequence[ChannelMessages]) -> ChannelMessages:
+    """Return the (channel ids, messages) of consecutive pieces in one pair."""
+    channels, messages = zip(*pieces, strict=True)
+    return np.concatenate(channels), Packed.chain(messages)

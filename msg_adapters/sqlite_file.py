@@ -10,7 +10,7 @@ import os
 import sqlite3
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -33,8 +33,9 @@ BATCH_ROWS = 256
 SMALL_BYTES = 16384
 """Larger messages are read one by one, so that a batch has at most 4 MB."""
 STRETCH_ROWS = 8192
+"""Rows that complete a stretch."""
 STRETCH_BYTES = 16 << 20
-"""Rows, or bytes of messages, that complete a stretch."""
+"""Bytes of messages that complete a stretch."""
 RANGE_IDS = 4096
 """
 Ids whose messages SQLite appends to each other. Half as many rows of one topic complete a stretch:
@@ -46,8 +47,9 @@ CAN_LIMIT = sys.version_info >= (3, 11)
 """Whether the bytes of one result can be limited; without it all rows are read one by one."""
 FIRST_ID, LAST_ID = -(2**63), 2**63 - 1
 STEP_IDS = 16
+"""Ids of one step behind damage."""
 MOST_STEPS = 2000
-"""Ids of one step behind damage, and steps in a scan until the rest of the file is given up."""
+"""Steps in a scan until the remainder of the file is given up."""
 INSTRUCTIONS_PER_BYTE = 8
 """
 Instructions of SQLite in a scan, per byte of the file. A row has at least 11 bytes and costs about
@@ -56,8 +58,11 @@ Instructions of SQLite in a scan, per byte of the file. A row has at least 11 by
 INSTRUCTIONS_PER_CALL = 1_000_000
 """Instructions between two tests of this limit."""
 TABLES = ('topics', 'messages', 'message_definitions')
-MOST_TABLES, MOST_TOPICS = 1000, 100_000
-"""Entries of the schema and of the table of topics that are read."""
+"""Tables that are read."""
+MOST_TABLES = 1000
+"""Entries of the schema that are read."""
+MOST_TOPICS = 100_000
+"""Rows of the tables of topics and of definitions that are read."""
 
 
 class SqliteFile(StorageFile):
@@ -79,8 +84,13 @@ class SqliteFile(StorageFile):
         self.lost = {}
         log = Path(f'{path}-wal')
         self.logged = log.exists() and log.stat().st_size > 0
-        self.size = self.path.stat().st_size + (log.stat().st_size if self.logged else 0)
+        """Whether rows of a write-ahead log are read too."""
+        self.size = self.path.stat().st_size
+        """Bytes of the file and of its log."""
+        if self.logged:
+            self.size += log.stat().st_size
         self._n_calls = 0
+        """Millions of instructions of SQLite (`INSTRUCTIONS_PER_CALL`) in the present scan."""
         self.connection = self._open()
         try:
             self._read_topics()
@@ -96,10 +106,12 @@ class SqliteFile(StorageFile):
             self.connection.close()
             raise
         self._cut_page = None if self.logged else _incomplete_page(self.path)
+        """Bytes of an incomplete last page; None without one."""
         if self._cut_page is not None:
             self._lose(f'incomplete last page {UNKNOWN_EXTENT}', 1)
 
-    def _open(self):
+    def _open(self) -> sqlite3.Connection:
+        """Return a connection that stops beyond the limit; raises sqlite3.Error for no database."""
         connection = _connect(self.path, self.logged)
         connection.set_progress_handler(self._count_call, INSTRUCTIONS_PER_CALL)
         try:
@@ -111,33 +123,37 @@ class SqliteFile(StorageFile):
         self._is_utf8 = encoding == ('UTF-8',)
         return connection
 
-    def _count_call(self):
-        """Count the instructions of SQLite; it stops where this returns True."""
+    def _count_call(self) -> bool:
+        """Count `INSTRUCTIONS_PER_CALL`; SQLite stops where this returns True."""
         self._n_calls += 1
         return self._is_beyond_limit()
 
-    def _is_beyond_limit(self):
+    def _is_beyond_limit(self) -> bool:
+        """Return whether a scan has executed more instructions than an undamaged file needs."""
         limit = INSTRUCTIONS_PER_BYTE * self.size + 20 * INSTRUCTIONS_PER_CALL
         return self._n_calls * INSTRUCTIONS_PER_CALL > limit
 
-    def _read_topics(self):
+    def _read_topics(self) -> None:
+        """Read ids, types and definitions of the topics."""
         self._require_tables()
-        self.topic_ids, self.types, self.definitions = defaultdict(list), {}, {}
-        for topic_id, name, message_type, encoding in self.connection.execute(
+        self.topic_ids = defaultdict(list)
+        self.types: dict[str, str] = {}
+        """Topic -> message type; serializations other than CDR are named after the type."""
+        self.definitions: dict[str, tuple[str, str]] = {}
+        """Message type -> (language, text)."""
+        rows = self.connection.execute(
             'SELECT id, name, type, serialization_format FROM topics'
-        ).fetchmany(MOST_TOPICS):
-            if not (
-                isinstance(topic_id, int)
-                and isinstance(name, str)
-                and isinstance(message_type, str)
-            ):
+        ).fetchmany(MOST_TOPICS)
+        for topic_id, name, message_type, encoding in rows:
+            has_text = isinstance(name, str) and isinstance(message_type, str)
+            if not has_text or not isinstance(topic_id, int):
                 self._lose('topics without a name or type', 1)
                 continue
             topic = clean_name(name)
             self.topic_ids[topic].append(topic_id)
-            self.types[topic] = clean_name(
-                message_type if encoding == 'cdr' else f'{message_type} ({encoding})'
-            )
+            if encoding != 'cdr':
+                message_type = f'{message_type} ({encoding})'
+            self.types[topic] = clean_name(message_type)
         with suppress(sqlite3.Error):  # before schema version 4 there are no definitions
             rows = self.connection.execute(
                 'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
@@ -152,17 +168,16 @@ class SqliteFile(StorageFile):
 
         They are programs that can give rows without end.
         """
-        for kind, name, text in self.connection.execute(
-            'SELECT type, name, sql FROM sqlite_master'
-        ).fetchmany(MOST_TABLES):
-            if str(name).lower() not in TABLES or kind == 'index':
+        entries = self.connection.execute('SELECT type, name, sql FROM sqlite_master')
+        for kind, name, text in entries.fetchmany(MOST_TABLES):
+            table = str(name).lower()
+            if table not in TABLES or kind == 'index':
                 continue
-            columns = self.connection.execute(f'PRAGMA table_xinfo({str(name).lower()})').fetchall()
-            if (
-                kind != 'table'
-                or 'VIRTUAL' in str(text).upper().split()[:2]
-                or any(column[6] for column in columns)
-            ):
+            columns = self.connection.execute(f'PRAGMA table_xinfo({table})').fetchall()
+            is_virtual = 'VIRTUAL' in str(text).upper().split()[:2]
+            # Column 6 of table_xinfo: nonzero for hidden and generated columns.
+            is_generated = any(column[6] for column in columns)
+            if kind != 'table' or is_virtual or is_generated:
                 raise ValueError(
                     f"'{name}' must be a plain table, got a {kind} with {len(columns)} columns"
                 )
@@ -201,15 +216,21 @@ class SqliteFile(StorageFile):
         """Close the file."""
         self.connection.close()
 
-    def _stretches(self, topics):
+    def _stretches(self, topics: Sequence[str]) -> Iterator[Stretch]:
+        """Yield the Stretches of the rows of some topics, in the order of the ids."""
         wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
-        self._n_calls = self._n_steps = 0
+        self._n_calls = 0
+        self._n_steps = 0
+        """Steps behind damage in the present scan."""
         enough_rows = RANGE_IDS // 2 if len(wanted) == 1 else STRETCH_ROWS
-        n_total = n_rows = n_bytes = 0
+        # Bytes of the scan; rows and bytes of the present stretch.
+        n_scanned = 0
+        n_rows = 0
+        n_bytes = 0
         parts: list[Part] = []
         for part in self._parts(wanted):
-            n_total += len(part.messages)
-            if n_total > self.size:
+            n_scanned += len(part.messages)
+            if n_scanned > self.size:
                 self._lose(f'rest {UNKNOWN_EXTENT} after rows that share their pages', 1)
                 break
             parts.append(part)
@@ -223,34 +244,35 @@ class SqliteFile(StorageFile):
         if parts:
             yield _stretch(parts)
 
-    def _parts(self, wanted):
-        """Yield the Parts of the rows of some topics, in the order of the ids."""
-        after = FIRST_ID
+    def _parts(self, wanted: set[int]) -> Iterator['Part']:
+        """Yield the Parts of the rows with the topic ids `wanted`, in the order of the row ids."""
         if not wanted:
-            after = None
-        elif len(wanted) == 1 and self._is_utf8 and self._cut_page is None and CAN_LIMIT:
+            return
+        # Rows up to this id are done; None where no further row can be read.
+        after: int | None = FIRST_ID
+        if len(wanted) == 1 and self._is_utf8 and self._cut_page is None and CAN_LIMIT:
             after = yield from self._equal_messages(min(wanted))
-        known = {number for numbers in self.topic_ids.values() for number in numbers}
-        others = known - wanted
-        statement = _statement(wanted, others)
+        declared = {number for numbers in self.topic_ids.values() for number in numbers}
+        unwanted = declared - wanted
+        statement = _statement(wanted, unwanted)
         while after is not None:
             rows = []
             try:
                 cursor = self.connection.execute(statement, (after, LAST_ID))
-                while found := cursor.fetchmany(BATCH_ROWS):
-                    rows = found
+                while batch := cursor.fetchmany(BATCH_ROWS):
+                    rows = batch
                     yield from self._usable(rows, wanted)
                 return
             except sqlite3.Error as error:
                 damage = error
-            # The id of a row of an unknown topic is damaged too.
+            # Continue after the last good row. Of a row of an undeclared topic the id is damaged.
             ids = [row_id for row_id, topic_id, *_ in rows if topic_id in wanted]
             after = max([after, *ids[-1:]])
-            after = yield from self._behind_damage(after, wanted, others)
+            after = yield from self._behind_damage(after, wanted, unwanted)
             if after is None:
                 self._lose(f'rest {UNKNOWN_EXTENT} after damage ({damage})', 1)
 
-    def _equal_messages(self, topic_id):
+    def _equal_messages(self, topic_id: int) -> Generator['Part', None, int]:
         """
         Yield the Parts of one topic while its messages have one size and its ids are dense.
 
@@ -259,15 +281,16 @@ class SqliteFile(StorageFile):
         UTF-8. The sizes are equal where their sum is the number of messages times the largest one.
         Return the id behind which other rows may follow.
         """
-        chosen = (
+        rows_of_range = (
             f'FROM messages NOT INDEXED WHERE topic_id = {topic_id} AND _rowid_ > ?'
             ' AND _rowid_ <= ?'
         )
         statement = (
-            "SELECT count(*), max(length(data)), CAST(group_concat(data, '') AS BLOB) " + chosen
+            "SELECT count(*), max(length(data)), CAST(group_concat(data, '') AS BLOB) "
+            + rows_of_range
         )
         after = FIRST_ID
-        longest = self._limit_length(STRETCH_BYTES)
+        limit_before = self._limit_length(STRETCH_BYTES)
         try:
             (first,) = self.connection.execute('SELECT min(_rowid_) FROM messages').fetchone()
             until = FIRST_ID if first is None else max(first - 1, FIRST_ID)
@@ -276,59 +299,68 @@ class SqliteFile(StorageFile):
                 after = until
                 until = min(until + RANGE_IDS, LAST_ID)
                 ids = (after, until)
-                count, size, messages = self.connection.execute(statement, ids).fetchone()
-                if size is None or len(messages) != count * size:
+                count, longest, messages = self.connection.execute(statement, ids).fetchone()
+                if longest is None or len(messages) != count * longest:
                     return after
-                times = partial(self._times, f'SELECT timestamp {chosen}', ids)
-                yield Part(messages, np.full(count, size), np.full(count, topic_id), times)
+                times = partial(self._times, f'SELECT timestamp {rows_of_range}', ids)
+                yield Part(messages, np.full(count, longest), np.full(count, topic_id), times)
             return until
         except sqlite3.Error:
             return after
         finally:
-            self._limit_length(longest)
+            self._limit_length(limit_before)
 
-    def _limit_length(self, n_bytes):
+    def _limit_length(self, n_bytes: int) -> int:
         """Limit the bytes of one result of SQLite; return the limit before."""
         if sys.version_info >= (3, 11):  # CAN_LIMIT, in the form of type checkers
             return self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, n_bytes)
         return n_bytes
 
-    def _times(self, statement, ids):
+    def _times(self, statement: str, ids: tuple[int, int]) -> list:
+        """Return the receive times of the rows in a range of ids."""
         return [value for (value,) in self.connection.execute(statement, ids)]
 
-    def _behind_damage(self, after, wanted, others):
+    def _behind_damage(
+        self, after: int, wanted: set[int], unwanted: set[int]
+    ) -> Generator['Part', None, int | None]:
         """
         Yield the Parts of ranges of a few ids, to the first readable one behind damage.
 
         Ids that a range lacks are counted, because a damaged id ends a search without an error.
         Return the last id of the range, None where nothing behind the damage can be read.
         """
-        statement = _statement(wanted, ())
+        statement = _statement(wanted, set())
         after = max(after, 0)  # the first id of a recorder is 1
-        n_lost = n_found = 0
+        n_lost = 0
+        n_readable = 0
         while self._n_steps < MOST_STEPS and not self._is_beyond_limit():
             self._n_steps += 1
             until = min(after + STEP_IDS, LAST_ID)
-            found = []
+            readable = []
             with suppress(sqlite3.Error):
-                found = self.connection.execute(statement, (after, until)).fetchmany(STEP_IDS)
+                readable = self.connection.execute(statement, (after, until)).fetchmany(STEP_IDS)
             after = until
-            n_found += len(found)
-            n_lost += STEP_IDS - len(found)
-            rows = [row for row in found if row[1] not in others]
+            n_readable += len(readable)
+            n_lost += STEP_IDS - len(readable)
+            rows = [row for row in readable if row[1] not in unwanted]
             if rows:
                 yield from self._usable(rows, wanted)
-            # The damage lies within one batch behind the first id.
-            if found and n_lost:
+            if readable and n_lost:
                 self._lose('unreadable rows', n_lost)
                 return after
-            if n_found > BATCH_ROWS:
+            # The damage was in the batch after the first id: after a batch it is passed.
+            if n_readable > BATCH_ROWS:
                 return after
         return None
 
-    def _usable(self, rows, wanted):
-        """Yield the Parts of rows; those that cannot be used are counted and left out."""
+    def _usable(self, rows: list[tuple], wanted: set[int]) -> Iterator['Part']:
+        """
+        Yield the Parts of rows (id, topic id, receive time, message).
+
+        Rows that cannot be used are counted in `lost` and left out.
+        """
         _, topic_ids, times, messages = zip(*rows, strict=True)
+        # Usual rows at once, without a test of each.
         joined = None
         if self._cut_page is None:
             with suppress(TypeError):  # of a message that is None, text or a number
@@ -359,8 +391,8 @@ class SqliteFile(StorageFile):
         if kept:
             yield _part(kept, messages)
 
-    def _large(self, row_id):
-        """Return a large message, None where it cannot be read."""
+    def _large(self, row_id: int) -> Any:
+        """Return a message above `SMALL_BYTES`, None where it cannot be read."""
         with suppress(sqlite3.Error):
             (size,) = self.connection.execute(
                 'SELECT length(data) FROM messages WHERE _rowid_ = ?', (row_id,)
@@ -372,18 +404,21 @@ class SqliteFile(StorageFile):
                 return message
         return None
 
-    def _is_cut(self, message):
+    def _is_cut(self, message: bytes) -> bool:
         """
         Return whether a message may end in the missing part of an incomplete page.
 
-        In a leaf page the present part of the message ends the file; of a message that continues
-        in an overflow page, this page, after the number of the next one, ends the present part.
+        SQLite returns zeros for the missing part. The present part of the message is then at the
+        end of the file. Of a message that continues in an overflow page, the present part ends
+        with this page without its first four bytes, which are the number of the next one.
         """
         if self._cut_page is None:
             return False
         present = message.rstrip(b'\0')
+        if self._cut_page.endswith(present):
+            return True
         overflow = self._cut_page[4:]
-        return self._cut_page.endswith(present) or (overflow and present.endswith(overflow))
+        return bool(overflow) and present.endswith(overflow)
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,37 +435,39 @@ class Part:
     """Called without arguments: the receive times, of any type in a damaged file."""
 
 
-def _statement(wanted, others):
+def _statement(wanted: set[int], unwanted: set[int]) -> str:
     """
-    Return the statement for the rows of some topics within a range of ids.
+    Return the statement for (id, topic id, receive time, message) of rows in a range of ids.
 
-    The message is NULL where it is read separately. Only rows of ``others`` are left out: rows of
-    an unknown topic are damaged and are counted.
+    The message is NULL unless its topic is in `wanted` and it is small. Only rows of `unwanted`
+    topics are left out: rows of an undeclared topic are damaged and are counted.
     """
-    # NOT INDEXED: a table scan in the order of the ids, whatever indices the file declares.
+    # NOT INDEXED: a table scan in the order of the ids, without the indices that the file declares.
     return (
         f'SELECT _rowid_, topic_id, timestamp, CASE WHEN topic_id IN ({_listed(wanted)})'
         f' AND length(data) <= {SMALL_BYTES} THEN data END'
         ' FROM messages NOT INDEXED WHERE _rowid_ > ? AND _rowid_ <= ?'
-        f' AND (topic_id IN ({_listed(others)})) IS NOT TRUE'
+        f' AND (topic_id IN ({_listed(unwanted)})) IS NOT TRUE'
     )
 
 
-def _listed(numbers):
+def _listed(numbers: set[int]) -> str:
+    """Return numbers as a list in SQL."""
     return ', '.join(map(str, sorted(numbers)))
 
 
-def _part(rows, messages):
-    """Return the Part of a list of (topic number, receive time) and their messages."""
+def _part(rows: list[tuple[int, Any]], messages: list[bytes]) -> Part:
+    """Return the Part of a list of (topic id, receive time) and their messages."""
     topic_ids, times = zip(*rows, strict=True)
     return Part(b''.join(messages), _sizes(messages), np.array(topic_ids), lambda: times)
 
 
-def _sizes(messages):
+def _sizes(messages: Sequence[bytes]) -> np.ndarray:
+    """Return the bytes of each message, int64, shape (n,)."""
     return np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
 
 
-def _stretch(parts):
+def _stretch(parts: list[Part]) -> Stretch:
     """Return the Stretch of consecutive Parts."""
     packed = Packed.of_sizes(
         b''.join([part.messages for part in parts]), np.concatenate([part.sizes for part in parts])
@@ -444,12 +481,12 @@ def _stretch(parts):
     return Stretch(topic_ids, lambda index: (index, packed.select(index)), received_ns)
 
 
-def _integer(value):
+def _integer(value: Any) -> int:
     """Return a receive time; 0 for the values of other types in a damaged file."""
     return value if isinstance(value, int) else 0
 
 
-def _incomplete_page(path):
+def _incomplete_page(path: Path) -> bytes | None:
     """
     Return the bytes of an incomplete last page, without the zeros at their end; None without one.
 
@@ -462,17 +499,17 @@ def _incomplete_page(path):
         if page_size == 1:
             page_size = 65536
         n_bytes = os.fstat(file.fileno()).st_size
-        n_rest = n_bytes % max(page_size, 512)
-        file.seek(n_bytes - n_rest)
-        return file.read(n_rest).rstrip(b'\0') if n_rest else None
+        n_incomplete = n_bytes % max(page_size, 512)
+        file.seek(n_bytes - n_incomplete)
+        return file.read(n_incomplete).rstrip(b'\0') if n_incomplete else None
 
 
-def _connect(path, logged):
+def _connect(path: Path, logged: bool) -> sqlite3.Connection:
     """
-    Open read-only; ``immutable`` keeps SQLite from looking for locks, but hides a write-ahead log.
+    Open read-only; ``immutable`` makes SQLite ignore locks, but hides a write-ahead log.
 
-    A log is read without locks and with its index in memory, because SQLite would write the index
-    next to the recording (``-shm``).
+    `logged`: a log is read without locks and with its index in memory, because SQLite would write
+    the index next to the recording (``-shm``).
     """
     if os.path.getsize(path) < 512:
         raise sqlite3.DatabaseError('the file is shorter than one page')
@@ -549,10 +586,10 @@ class SqliteWriter:
             'INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
             (topic_id, name, definition.type, 'cdr', qos, definition.digest),
         )
-        known = self.connection.execute(
+        is_defined = self.connection.execute(
             'SELECT 1 FROM message_definitions WHERE topic_type = ?', (definition.type,)
         ).fetchone()
-        if not known and definition.text:
+        if not is_defined and definition.text:
             self.connection.execute(
                 'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition,'
                 ' type_description_hash) VALUES (?, ?, ?, ?)',
@@ -561,16 +598,23 @@ class SqliteWriter:
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
+        # topic id, receive time and message of each row, one after the other
         values = chain.from_iterable(
             zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True)
         )
-        whole = len(messages) // INSERTED_ROWS * INSERTED_ROWS
-        for count, rows in ((whole, INSERTED_ROWS), (len(messages) - whole, 1)):
-            self.connection.executemany(
-                'INSERT INTO messages (topic_id, timestamp, data) VALUES '
-                + ', '.join(['(?, ?, ?)'] * rows),
-                zip(*[islice(values, 3 * count)] * (3 * rows), strict=True),
-            )
+        n_in_groups = len(messages) // INSERTED_ROWS * INSERTED_ROWS
+        self._insert(islice(values, 3 * n_in_groups), INSERTED_ROWS)
+        self._insert(values, 1)
+
+    def _insert(self, values: Iterator, n_rows: int) -> None:
+        """Insert rows of three values by statements of `n_rows` rows."""
+        places = ', '.join(['(?, ?, ?)'] * n_rows)
+        # The same iterator for each place: a tuple of zip is the values of one statement.
+        values_of_statements = zip(*[values] * (3 * n_rows), strict=True)
+        self.connection.executemany(
+            f'INSERT INTO messages (topic_id, timestamp, data) VALUES {places}',
+            values_of_statements,
+        )
 
     def close(self, information: dict[str, Any], metadata: str) -> None:
         """Add the index by time and the metadata as text, and close."""

@@ -37,13 +37,9 @@ class RawMessages(NamedTuple):
     """The messages."""
 
     def of(self, number: int) -> tuple[Packed, Callable[[], np.ndarray]]:
-        """
-        Return the messages of one of the requested topics.
-
-        A function that returns their receive times is returned too.
-        """
-        mine = np.flatnonzero(self.topic == number)
-        return self.packed.select(mine), lambda: self.received_ns()[mine]
+        """Return (messages, function that returns their receive times) of a requested topic."""
+        index = np.flatnonzero(self.topic == number)
+        return self.packed.select(index), lambda: self.received_ns()[index]
 
 
 STRETCH_MESSAGES = 8192
@@ -52,18 +48,20 @@ STRETCH_MESSAGES = 8192
 
 def grouped(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[RawMessages]:
     """Yield RawMessages of (index of the topic, receive time, message) that arrive one by one."""
-    pending, n_bytes = [], 0
-    for message in messages:
-        pending.append(message)
-        n_bytes += len(message[2])
+    pending = []
+    n_bytes = 0
+    for number, received_ns, data in messages:
+        pending.append((number, received_ns, data))
+        n_bytes += len(data)
         if len(pending) == STRETCH_MESSAGES or n_bytes >= LARGEST_STRETCH:
             yield _raw(pending)
-            pending, n_bytes = [], 0
+            pending = []
+            n_bytes = 0
     if pending:
         yield _raw(pending)
 
 
-def _raw(pending):
+def _raw(pending: list[tuple[int, int, bytes]]) -> RawMessages:
     """Return the RawMessages of a list of (index of the topic, receive time, message)."""
     numbers, times, messages = zip(*pending, strict=True)
     return RawMessages(
@@ -100,15 +98,15 @@ class StorageFile:
         Lost messages of the file are counted in `lost`.
         """
         for stretch in self._stretches(topics):
-            code = self._codes(stretch.topic_ids, topics)
-            mine = np.flatnonzero(code >= 0)
-            if len(mine):
-                mine, packed = self._take(stretch, mine)
-                yield RawMessages(code[mine], partial(stretch.received_ns, mine), packed)
+            number = self._topic_numbers(stretch.topic_ids, topics)
+            index = np.flatnonzero(number >= 0)
+            if len(index):
+                index, packed = self._messages_at(stretch, index)
+                yield RawMessages(number[index], partial(stretch.received_ns, index), packed)
 
-    def _codes(self, topic_ids, topics):
+    def _topic_numbers(self, topic_ids: np.ndarray, topics: Sequence[str]) -> np.ndarray:
         """
-        Return the index into `topics` of each message, or -1.
+        Return the index into `topics` of each message, -1 for other topics, shape (n,).
 
         The ids are looked up at once, because a hostile file has thousands of topics.
         """
@@ -125,10 +123,15 @@ class StorageFile:
         place = np.minimum(np.searchsorted(ids, topic_ids), len(ids) - 1)
         return np.where(ids[place] == topic_ids, numbers[place], -1)
 
-    def _take(self, stretch, mine):
-        mine, packed = stretch.pack(mine)
+    def _messages_at(self, stretch: Stretch, index: np.ndarray) -> tuple[np.ndarray, Packed]:
+        """
+        Return (index, messages) of a stretch without unreadable ones, decompressed.
+
+        `index`: messages of the stretch, shape (n,).
+        """
+        index, packed = stretch.pack(index)
         if self.unpack is None:
-            return mine, packed
+            return index, packed
         kept = []
         messages = []
         n_bytes = 0
@@ -138,13 +141,13 @@ class StorageFile:
                 kept.append(k)
                 messages.append(message)
                 n_bytes += len(message)
-        return mine[kept], Packed.join(messages)
+        return index[kept], Packed.join(messages)
 
-    def _unpacked(self, data, n_before):
+    def _unpacked(self, data: bytes, n_before: int) -> bytes | None:
         """
         Return a decompressed message of a stretch that has `n_before` bytes already.
 
-        None when it is lost.
+        None, and counted in `lost`, when it is damaged or the stretch is too large.
         """
         if n_before >= LARGEST_STRETCH:
             return self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
@@ -155,8 +158,9 @@ class StorageFile:
         except Exception as error:  # decompressors raise various errors on damaged data
             return self._lose(f'messages that cannot be decompressed ({error})', 1)
 
-    def _lose(self, what, count):
-        reason = f'{what} of {self.path.name}'
+    def _lose(self, kind: str, count: int) -> None:
+        """Count lost data in `lost`; `kind` describes it without the name of the file."""
+        reason = f'{kind} of {self.path.name}'
         self.lost[reason] = self.lost.get(reason, 0) + count
 
 
@@ -166,6 +170,7 @@ PIECES_AHEAD = 3
 """Pieces that are read or wait at most; bounds the memory."""
 
 _END: Any = object()
+"""Result of `next` at the end of a generator."""
 
 
 def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, None]:
@@ -175,15 +180,16 @@ def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, N
     The thread ends with the generator, or soon after the consumer has closed this one.
     """
     with ThreadPoolExecutor(1) as thread:
-        waiting: deque[Future] = deque()
+        # Results of the next pieces, in order; the thread works on the first unfinished one.
+        futures: deque[Future] = deque()
         try:
             for _ in range(PIECES_AHEAD):
-                waiting.append(thread.submit(next, pieces, _END))
-            while (piece := waiting.popleft().result()) is not _END:
-                waiting.append(thread.submit(next, pieces, _END))
+                futures.append(thread.submit(next, pieces, _END))
+            while (piece := futures.popleft().result()) is not _END:
+                futures.append(thread.submit(next, pieces, _END))
                 yield piece
         finally:
-            for future in waiting:
+            for future in futures:
                 future.cancel()
             # In the thread, because an interruption may have left it within the generator.
             thread.submit(pieces.close)

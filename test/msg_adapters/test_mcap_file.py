@@ -146,14 +146,14 @@ def test_walking_finds_every_message_whatever_the_pattern(runs, cut):
     ]
     content = b''.join(records) + record(0x0C, b'')
     whole = np.frombuffer(content, np.uint8)
-    (channel, found), others, end = walk(whole)
+    channel, found, others, end = walk(whole)
     assert end == len(content) and others == [(0x0C, b'')]
     assert len(found.start) == len(records)
     expected = np.cumsum([0, *map(len, records)])[:-1] + 31
     np.testing.assert_array_equal(found.start, expected)
     np.testing.assert_array_equal(found.size, [len(data) - 31 for data in records])
     cut = min(cut, len(content))
-    (_, shorter), _, end = walk(whole[: len(content) - cut])
+    _, shorter, _, end = walk(whole[: len(content) - cut])
     assert end <= len(content) - cut and len(shorter.start) == int(
         (found.start + found.size <= end).sum()
     )
