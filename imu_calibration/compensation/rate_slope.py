@@ -1,7 +1,7 @@
 """
-The derivative of the measured rate for stamps of any kind.
+The derivative of the measured rate, and its error, for stamps of any kind.
 
-By equal steps or by least squares over the stamps, and its error.
+Samples of a clock count as equally spaced; irregular ones are fitted by least squares over stamps.
 """
 
 from collections import deque
@@ -45,11 +45,14 @@ only.
 """
 RECENT_SPAN = 5.0, 64, 2048
 """
-Seconds, smallest and largest number of samples of which the derivatives are stored: they show how
-large it may be after a gap.
+Seconds, smallest and largest number of derivatives that are stored: they show how large the
+derivative may be after a gap.
 """
 PRESENT_SPAN = 1.0
-"""Seconds of them, at least the smallest number, that show the error in a full window."""
+"""
+Seconds of the stored derivatives, but at least the smallest number in `RECENT_SPAN`, from which the
+error in a full window is estimated.
+"""
 POSSIBLE = 3.0
 """
 Standard deviation of each component of the angular acceleration before any motion was seen,
@@ -84,14 +87,14 @@ WITHOUT = (
 
 @dataclass(frozen=True, eq=False)
 class MotionEvidence:
-    """Rate and its slopes so far, which show whether the rate changes at all."""
+    """Measured rate and its slopes, from which the probability of a motion follows."""
 
     rate: np.ndarray
     """Newest rate less the bias of the gyroscope, rad/s, shape (3,)."""
     moment: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     """Mean of slope times slope, (rad/s^2)^2, shape (3, 3)."""
     noise_gain: float = 0.0
-    """The noise of a slope is this times the covariance of the rate, 1/s^2."""
+    """Covariance of a slope's noise over the covariance of the rate's noise, 1/s^2."""
     n_slopes: float = 0.0
     """Number of independent slopes; 0: one reading only."""
 
@@ -107,23 +110,30 @@ class MotionEvidence:
 
         A Gaussian of sd s that is tested with a much smaller noise n loses against zero by
         ``log(s / n)`` per component, and wins by half the excess of its square over the noise. A
-        square below that of the noise is no further evidence.
+        square below that of the noise is no further evidence. With the log likelihoods L relative
+        to motion, the result is ``1 / (1 + exp(L constant) + exp(L rest))``.
         """
+        # Without noise every change of the rate is a motion.
         if np.min(np.linalg.eigvalsh(rate_cov)) <= 0.0:
             return 1.0
         precision = np.linalg.inv(rate_cov)
-        volume = 0.5 * np.linalg.slogdet(rate_cov)[1]
-        for_constant = -np.inf
-        steady = 0.0
+        log_rate_noise = 0.5 * np.linalg.slogdet(rate_cov)[1]  # of the product of the three sds
+
+        # Log likelihood of b = 0. One reading has no slope and excludes nothing about it.
+        log_zero_slope = 0.0
+        log_constant_rate = -np.inf
         if self.n_slopes:
-            excess = np.trace(precision @ self.moment) / self.noise_gain - 3.0
-            noise_volume = volume + 1.5 * np.log(self.noise_gain)
-            steady = max(3.0 * np.log(POSSIBLE) - noise_volume, 0.0)
-            steady -= 0.5 * self.n_slopes * max(excess, 0.0)
-            for_constant = steady
-        excess = float(self.rate @ precision @ self.rate) - 3.0
-        for_rest = steady + max(3.0 * np.log(POSSIBLE_RATE) - volume, 0.0) - 0.5 * max(excess, 0.0)
-        return float(np.exp(-np.logaddexp.reduce([0.0, for_constant, for_rest])))
+            slope_excess = np.trace(precision @ self.moment) / self.noise_gain - 3.0
+            log_slope_noise = log_rate_noise + 1.5 * np.log(self.noise_gain)
+            log_zero_slope = max(3.0 * np.log(POSSIBLE) - log_slope_noise, 0.0)
+            log_zero_slope -= 0.5 * self.n_slopes * max(slope_excess, 0.0)
+            log_constant_rate = log_zero_slope
+
+        # Log likelihood of w = 0 in addition.
+        rate_excess = float(self.rate @ precision @ self.rate) - 3.0
+        log_zero_rate_prior = max(3.0 * np.log(POSSIBLE_RATE) - log_rate_noise, 0.0)
+        log_rest = log_zero_slope + log_zero_rate_prior - 0.5 * max(rate_excess, 0.0)
+        return float(np.exp(-np.logaddexp.reduce([0.0, log_constant_rate, log_rest])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +144,9 @@ class SlopeError:
     """Mean of error times error, noise of the rate included, (rad/s^2)^2, shape (3, 3)."""
     noise_gain: float = 0.0
     """
-    That noise is this times the covariance of the rate, 1/s^2.
+    Covariance of the noise in `moment` over the covariance of the rate's noise, 1/s^2.
 
-    Negative where noise is missing in `moment`.
+    Negative where noise has to be added to `moment`.
     """
     weights: np.ndarray | None = None
     """
@@ -144,13 +154,14 @@ class SlopeError:
     the full window.
     """
     evidence: MotionEvidence | None = None
-    """What the readings show of a motion; None: it is certain."""
+    """Rate and slopes from which the probability of a motion follows; None: it is 1."""
 
     def covariance(self, rate_cov: np.ndarray) -> np.ndarray:
         """
-        Return the covariance of the error without the noise, not negative in any direction.
+        Return the covariance of the error without the noise, (rad/s^2)^2, shape (3, 3).
 
-        Shape (3, 3). Without a motion there is no error: it counts with the chance of a motion.
+        ``p (moment - noise_gain rate_cov)`` with the probability p of a motion, because there is no
+        error without one; negative eigenvalues become zero.
         """
         sizes, directions = np.linalg.eigh(self.moment - self.noise_gain * rate_cov)
         covariance = (directions * np.maximum(sizes, 0.0)) @ directions.T
@@ -177,11 +188,13 @@ class RateSlope:
 
     The outcome does not depend on how the stream is cut.
 
-    Regular stamps show where samples are missing. Where stamps scatter about a clock (packets,
-    times of arrival, jitter, in any order) the samples are counted: `_count_on`. Irregular stamps
-    are used as they are: least squares over the stamped times. Where stamps are frozen the
-    derivative is zero and `error` returns its size. The kind of the stamps is reviewed every
-    `CLOCK_BLOCK` samples.
+    By the kind of the stamps, which is reviewed every `CLOCK_BLOCK` samples:
+
+    - regular: they show where samples are missing;
+    - scattered about a clock (packets, times of arrival, jitter, in any order): the samples are
+      counted (`_push_counted`);
+    - irregular: least squares over the stamped times;
+    - frozen: the derivative is zero and `error` returns its size.
 
     Parameters
     ----------
@@ -190,7 +203,7 @@ class RateSlope:
     changed : callable
         Called when another derivative is in use, or none.
     bias : sequence of 3 floats
-        Of the readings, rad/s.
+        Bias of the gyroscope's readings, rad/s.
 
     """
 
@@ -200,31 +213,60 @@ class RateSlope:
         changed: Callable[[], None] = lambda: None,
         bias: Sequence[float] = (0.0, 0.0, 0.0),
     ):
-        self._choose, self._changed = choose, changed
+        self._make_derivative = choose
+        self._notify = changed
         self._bias = np.array(bias)
+
+        # The kind of the stamps and its reviews.
         self.line: StampLine | None = None
         """Class of the stamps; None while they are too few."""
+        self._stamps: deque[int] = deque(maxlen=REVIEWED_STAMPS)
+        """Newest stamps in the order of arrival, ns."""
+        self._until_review = stamping.MIN_PERIOD_STEPS + 1
+        """Samples until the stamps are classified again."""
+        self._is_unreviewed = True
+        """Whether no review has followed the last change of the derivative."""
+        self._n_agreeing = 0
+        """Successive reviews that classify irregular stamps as counted."""
+
+        # The derivative and its window.
         self.derivative: CausalDerivative | None = None
         """The derivative in use, or None."""
         self._tracker: StampedDerivative | TimedDerivative | None = None
-        self._stamps: deque[int] = deque(maxlen=REVIEWED_STAMPS)
-        self._due = stamping.MIN_PERIOD_STEPS + 1
-        self._newest: int | None = None
+        """Window of the derivative in use; None without one."""
+        self._newest_ns: int | None = None
+        """Stamp of the newest sample."""
         self._reading: tuple = NO_SLOPE
+        """Rate of the newest sample, rad/s."""
         self._slope: tuple = NO_SLOPE
-        self._count = 0
-        self._longest_ns = 0.0
-        self._young = True
-        self._agreeing, self._ahead_ns = 0, 0
-        self._doubtful: list[tuple] = []
+        """Derivative after the newest sample, rad/s^2."""
         self._recent: deque[tuple] = deque(maxlen=RECENT_SPAN[1])
-        self._all_of_it: SlopeError | None = None
-        self.restarts, self.n_changes = 0, 0
-        """Number of windows begun, and of samples after which the error is no longer the same."""
-        self._n_young = CLOCK_BLOCK
+        """
+        Newest derivatives, `UNKNOWN` where the window was not full, rad/s^2; without a derivative
+        the newest rates, rad/s.
+        """
+        self._earlier_size: SlopeError | None = None
+        """Size of the derivative before the last change of the stamps."""
+
+        # Counted samples.
+        self._most_step_ns = 0.0
+        """Longest step between stamps without a lost sample; 0: samples are not counted."""
+        self._n_counted = 0
+        """Number of the newest counted sample, lost samples included."""
+        self._pending: list[tuple] = []
+        """Rates after a long step, until a later stamp decides between lost and late samples."""
+        self._pending_ns = 0
+        """Time from the stamp before `_pending` to the newest one."""
+
+        # Counters for the user of the derivative.
+        self.restarts = 0
+        """Number of windows that were restarted."""
+        self.n_changes = 0
+        """Number of samples after which the error was no longer the same."""
+        self._n_growing = CLOCK_BLOCK
         """Samples of a new window for which the error is estimated again after each."""
-        self._age = 0
-        """Samples in the derivative since its window was begun, at most `_n_young`."""
+        self._n_in_window = 0
+        """Samples in the derivative since its window was begun, at most `_n_growing`."""
         self.n_without = 0
         """Samples without a derivative because their stamps are frozen."""
 
@@ -235,44 +277,47 @@ class RateSlope:
 
     @property
     def doubt(self) -> str:
-        """Why there is no derivative; '' when there is one, or that is not known yet."""
+        """Reason why there is no derivative; '' with one, or before the stamps are classified."""
         return f'{self.line}{WITHOUT}' if self.line is not None and self._tracker is None else ''
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple:
         """Return the derivative (x, y, z) after one more sample, per second."""
-        if stamp_ns == self._newest and (x, y, z) == self._reading:  # the same message again
+        if stamp_ns == self._newest_ns and (x, y, z) == self._reading:  # the same message again
             return self._slope
-        step_ns = 0 if self._newest is None else stamp_ns - self._newest
-        self._newest = stamp_ns
+        step_ns = 0 if self._newest_ns is None else stamp_ns - self._newest_ns
+        self._newest_ns = stamp_ns
         self._reading = (x, y, z)
         self._stamps.append(stamp_ns)
-        self._due -= 1
-        if not self._due:
+        self._until_review -= 1
+        if not self._until_review:
             self._review()
         if self.line is None and self._begins_equally():
             period_ns = (stamp_ns - self._stamps[0]) / (len(self._stamps) - 1)
             self.settle(StampLine(REGULAR, period_ns))
         if self._tracker is None:
-            self.n_without += self.line is not None
-            self.n_changes += self.line is None
+            if self.line is None:
+                self.n_changes += 1
+            else:
+                self.n_without += 1
             self._recent.append((x, y, z))
             return NO_SLOPE
-        before = self._tracker.n_used
-        if self._longest_ns:
-            slope = self._count_on(self._tracker, step_ns, (x, y, z))
+        n_used_before = self._tracker.n_used
+        if self._most_step_ns:
+            slope = self._push_counted(self._tracker, step_ns, (x, y, z))
         else:
             slope = self._tracker.push(stamp_ns, x, y, z)
         n_used = self._tracker.n_used
         self._slope = slope
         self._recent.append(slope if n_used == self._tracker.taps else UNKNOWN)
         # In a new window each sample changes the derivative's noise, delay and error.
-        if n_used < before:
+        is_restarted = n_used < n_used_before
+        if is_restarted:
             self.restarts += 1
-            self._n_young = self._tracker.taps
-        if n_used < before or not n_used:
-            self._age = 0
-        if self._age < self._n_young:
-            self._age += 1
+            self._n_growing = self._tracker.taps
+        if is_restarted or not n_used:
+            self._n_in_window = 0
+        if self._n_in_window < self._n_growing:
+            self._n_in_window += 1
             self.n_changes += 1
         return slope
 
@@ -285,17 +330,17 @@ class RateSlope:
         out = np.empty(values.shape)
         start = 0
         while start < len(values):
-            stop = self._usual_until(stamp_ns, values, start)
+            stop = self._end_of_regular(stamp_ns, values, start)
             if stop > start:
                 assert isinstance(self._tracker, StampedDerivative), (
                     'regular stamps have equal steps'
                 )
-                full = np.empty(stop - start, bool)
+                is_full = np.empty(stop - start, bool)
                 out[start:stop] = self._tracker.push_block(
-                    stamp_ns[start:stop], values[start:stop], full
+                    stamp_ns[start:stop], values[start:stop], is_full
                 )
-                shown = np.where(full[:, None], out[start:stop], UNKNOWN)
-                self._note(stamp_ns[start:stop], values[stop - 1], out[start:stop], shown)
+                recent = np.where(is_full[:, None], out[start:stop], UNKNOWN)
+                self._store_block(stamp_ns[start:stop], values[stop - 1], out[start:stop], recent)
             if stop < len(values):
                 out[stop] = self.push(int(stamp_ns[stop]), *values[stop].tolist())
             start = stop + 1
@@ -317,75 +362,86 @@ class RateSlope:
 
     def settle(self, line: StampLine) -> None:
         """
-        Use the derivative for stamps of that kind.
+        Use the derivative for stamps of the class `line`.
 
         The window is kept while the period is unchanged.
         """
         is_first = self.line is None and bool(self._stamps)
         self.line = line
-        self._doubtful = []
-        self._agreeing = 0
-        self._longest_ns = (
-            line.high_ns - line.low_ns + stamping.MAX_REGULAR_STEP * line.period_ns
-            if line.word == COUNTED
-            else 0.0
-        )
-        if isinstance(self._tracker, StampedDerivative) and self._suits(line):
-            self._tracker.rebase(
-                round(self._count * 1e9 * self._tracker.period)
-                if self._longest_ns
-                else self._stamps[-2]
-            )
+        self._pending = []
+        self._n_agreeing = 0
+        self._most_step_ns = 0.0
+        if line.word == COUNTED:
+            scatter_ns = line.high_ns - line.low_ns
+            self._most_step_ns = scatter_ns + stamping.MAX_REGULAR_STEP * line.period_ns
+
+        # The same window with another time of its newest sample: the number of the counted sample,
+        # or the stamp before the newest, which is not in the window yet.
+        if isinstance(self._tracker, StampedDerivative) and self._is_kept_for(line):
+            if self._most_step_ns:
+                self._tracker.rebase(round(self._n_counted * 1e9 * self._tracker.period))
+            else:
+                self._tracker.rebase(self._stamps[-2])
             return
+
+        # The size of the derivative, before the past that shows it is discarded.
         if is_first:
-            self._all_of_it = self._size_at_start()
+            self._earlier_size = self._size_at_start()
         else:
-            self._all_of_it = self._size_of_all(np.array(self._recent).reshape(-1, 3))
-        stamps = list(self._stamps)[:-1]
+            self._earlier_size = self._size(np.array(self._recent).reshape(-1, 3))
+
+        # A new window.
+        stamps = list(self._stamps)[:-1]  # the newest sample is added by `push`
         readings = list(self._recent)
-        self.derivative = self._tracker = None
-        if not _stand_still(line):
-            self.derivative = self._choose(line.period_ns * 1e-9)
-            self._tracker = (TimedDerivative if line.word == IRREGULAR else StampedDerivative)(
-                self.derivative
-            )
+        self.derivative = None
+        self._tracker = None
+        if not _is_frozen(line):
+            self.derivative = self._make_derivative(line.period_ns * 1e-9)
+            if line.word == IRREGULAR:
+                self._tracker = TimedDerivative(self.derivative)
+            else:
+                self._tracker = StampedDerivative(self.derivative)
         seconds, least, most = RECENT_SPAN
         self._recent = deque(maxlen=int(min(max(seconds * 1e9 / line.period_ns, least), most)))
-        self._slope, self._young = NO_SLOPE, True
-        self._age, self._n_young = 0, CLOCK_BLOCK
-        # Counted samples need the number of lost ones, which these stamps do not show yet.
-        if is_first and self._tracker is not None and not self._longest_ns:
+        self._slope = NO_SLOPE
+        self._is_unreviewed = True
+        self._n_in_window = 0
+        self._n_growing = CLOCK_BLOCK
+
+        # The first readings were stored before there was a derivative and fill its window. Counted
+        # samples need the number of lost ones, which these stamps do not show yet.
+        if is_first and self._tracker is not None and not self._most_step_ns:
             for stamp_ns, reading in zip(stamps[-len(readings) :], readings[-len(stamps) :]):
                 slope = self._tracker.push(stamp_ns, *reading)
                 self._recent.append(
                     slope if self._tracker.n_used == self._tracker.taps else UNKNOWN
                 )
-        self._changed()
+        self._notify()
 
-    def _suits(self, line: StampLine) -> bool:
-        """Return whether the derivative in use suits stamps of that kind."""
-        if self._tracker is None or isinstance(self._tracker, TimedDerivative) != (
-            line.word == IRREGULAR
-        ):
-            return self._tracker is None and _stand_still(line)
+    def _is_kept_for(self, line: StampLine) -> bool:
+        """Return whether the derivative in use, or none, remains right for stamps of a class."""
+        if self._tracker is None:
+            return _is_frozen(line)
+        if isinstance(self._tracker, TimedDerivative) != (line.word == IRREGULAR):
+            return False
         return abs(1e-9 * line.period_ns / self._tracker.period - 1) <= CHANGED[line.word]
 
     def prepare(self, before: 'RateSlope') -> None:
-        """Settle for the stamps of another one, with the motion that it has seen."""
+        """Use the class of stamps and the recent derivatives of another RateSlope."""
         if before.line is not None:
             self.settle(before.line)
-            self._all_of_it = before._all_of_it
+            self._earlier_size = before._earlier_size
             self._recent.extend(list(before._recent))
 
     def follow(self, before: 'RateSlope') -> None:
-        """Continue from another one, after `prepare`."""
+        """Continue from the latest sample of another RateSlope, after `prepare`."""
         self._stamps = before._stamps
-        self._due = before._due
-        self._count = before._count
-        self._newest, self._reading = before._newest, before._reading
-        self._agreeing = before._agreeing
-        self._ahead_ns = before._ahead_ns
-        self._doubtful = before._doubtful
+        self._until_review = before._until_review
+        self._n_counted = before._n_counted
+        self._newest_ns, self._reading = before._newest_ns, before._reading
+        self._n_agreeing = before._n_agreeing
+        self._pending_ns = before._pending_ns
+        self._pending = before._pending
         if self._tracker is not None and isinstance(before._tracker, type(self._tracker)):
             self._tracker.seed(before._tracker)  # type: ignore[arg-type]
 
@@ -394,17 +450,17 @@ class RateSlope:
         Return the recent error of the derivative.
 
         The error of a delayed derivative is the change of the true one in that time, estimated a
-        delay later: ``alpha(t + delay) - alpha(t)``. Without one the error is the whole derivative:
-        its size before the gap, or from the rate over `ROUGH` seconds; also after a change of the
-        stamps, until there is new motion. Before any motion was seen it is `POSSIBLE`, unless the
-        rates exclude a motion (`MotionEvidence`).
+        delay later: ``alpha(t + delay) - alpha(t)``. Without a derivative the error is its
+        size: that before the gap, or that of the rate over `ROUGH` seconds; also after a change of
+        the stamps, until there is new motion. Before any motion it is `POSSIBLE`, unless the rates
+        exclude a motion (`MotionEvidence`).
         """
         error = self._error()
         return replace(error, evidence=self._evidence())
 
     def _evidence(self) -> MotionEvidence | None:
-        """Return what the rate and its slopes show of a motion; None without a derivative."""
-        if self._newest is None:
+        """Return the newest rate and its recent slopes; None without a slope to test."""
+        if self._newest_ns is None:
             return None
         rate = np.array(self._reading) - self._bias
         if self.line is None:
@@ -416,12 +472,13 @@ class RateSlope:
             return MotionEvidence(rate, moment, 1.0 / first.spread, 1.0)
         if self.derivative is None or self._tracker is None:
             return None
-        slopes = _known(self._recent_slopes(self._tracker))
+        slopes = _without_unknown(self._recent_slopes(self._tracker))
         if len(slopes):
             # Slopes of windows that share no reading are independent.
             gain = float(self.derivative.weights @ self.derivative.weights)
             n_slopes = max(len(slopes) / self._tracker.taps, 1.0)
-            return MotionEvidence(rate, _moment(slopes), gain, n_slopes)
+            return MotionEvidence(rate, _mean_square(slopes), gain, n_slopes)
+        # No window was full yet: the slope of the readings in the present window.
         weights = CausalDerivative(max(self._tracker.n_used, 2), self._tracker.period).weights
         slope = np.array(self._slope)
         if self._tracker.n_used < 2 or not slope.any():
@@ -429,35 +486,51 @@ class RateSlope:
         return MotionEvidence(rate, np.outer(slope, slope), float(weights @ weights), 1.0)
 
     def _error(self) -> SlopeError:
-        """Return the error of the derivative if there is a motion."""
+        """
+        Return the error of the derivative if there is a motion.
+
+        With the derivative a_k after sample k, its delay of d samples and the lag l, d rounded up::
+
+            moment     = (d / l)^2 mean (a_k - a_(k-l)) (a_k - a_(k-l))'
+            noise_gain = (d / l)^2 sum (weights of a_k - a_(k-l))^2
+        """
+        # Without a derivative the error is its size.
         recent = np.array(list(self._recent)).reshape(-1, 3)
         if self.line is None:
             return self._size_at_start()
         if self.derivative is None or self._tracker is None:
-            if len(recent) < stamping.MIN_PERIOD_STEPS and self._all_of_it is not None:
-                return self._all_of_it
-            return self._size_of_all(recent)
+            if len(recent) < stamping.MIN_PERIOD_STEPS and self._earlier_size is not None:
+                return self._earlier_size
+            return self._size(recent)
         n_used = self._tracker.n_used
         if not n_used:
-            return replace(self._size_of_all(recent), weights=np.zeros(1))
-        recent = self._recent_slopes(self._tracker)
+            return replace(self._size(recent), weights=np.zeros(1))
+
         # A window with fewer samples has a shorter delay.
+        recent = self._recent_slopes(self._tracker)
         weights = CausalDerivative(n_used, self._tracker.period).weights
-        late = (n_used - 1) / 2
-        lag = max(round(late + 0.01), 1)
-        change = _known(recent[lag:] - recent[:-lag])
+        delay = (n_used - 1) / 2  # in samples
+        lag = max(round(delay + 0.01), 1)
+        change = _without_unknown(recent[lag:] - recent[:-lag])
         if not len(change):
-            if not len(_known(recent)):
+            if not len(_without_unknown(recent)):
                 # The first slope of a stream shows the size of the motion, with its own noise.
                 slope = np.array(self._slope)
                 return SlopeError(np.outer(slope, slope), float(weights @ weights), weights)
-            return replace(self._size_of_all(recent), weights=weights)
-        share = (late / lag) ** 2
-        apart = np.convolve(self.derivative.weights, [1.0] + [0.0] * (lag - 1) + [-1.0])
-        return SlopeError(share * _moment(change), share * float(apart @ apart), weights)
+            return replace(self._size(recent), weights=weights)
+
+        # The change over the delay, from that over the lag.
+        share = (delay / lag) ** 2
+        change_weights = np.convolve(self.derivative.weights, [1.0] + [0.0] * (lag - 1) + [-1.0])
+        noise_gain = share * float(change_weights @ change_weights)
+        return SlopeError(share * _mean_square(change), noise_gain, weights)
 
     def _recent_slopes(self, tracker: StampedDerivative | TimedDerivative) -> np.ndarray:
-        """Return the recent derivatives; of a full window the ones in the present motion."""
+        """
+        Return the recent derivatives, shape (n, 3).
+
+        With a full window only those of the last `PRESENT_SPAN`.
+        """
         recent = np.array(list(self._recent)).reshape(-1, 3)
         if tracker.n_used < tracker.taps:
             return recent
@@ -466,18 +539,18 @@ class RateSlope:
 
     def _slope_at_start(self) -> FirstSlope:
         """
-        Return the least-squares slope b over stamps t of the last readings.
+        Return the least-squares slope b of the last `START_SPAN` of readings over their stamps t.
 
         Its covariance is ``N / Sxx``, ``Sxx = sum((t - mean t)^2)``, N the covariance of the rate.
         """
         n = min(len(self._stamps), len(self._recent))
-        most = START_SPAN[1]
         stamps = np.array(list(self._stamps)[len(self._stamps) - n :], np.int64)
         readings = np.array(list(self._recent)[len(self._recent) - n :]).reshape(-1, 3)
         if n:
             age = (stamps.max() - stamps) * 1e-9
-            stamps = stamps[age <= most]
-            readings = readings[age <= most]
+            is_recent = age <= START_SPAN[1]
+            stamps = stamps[is_recent]
+            readings = readings[is_recent]
         if not len(stamps) or not np.ptp(stamps):
             return FirstSlope(np.zeros(3), 0.0, 0.0)
         time = (stamps - stamps[0]) * 1e-9
@@ -497,25 +570,29 @@ class RateSlope:
         moment = np.outer(first.slope, first.slope)
         return SlopeError(moment, -1.0 / first.spread, np.zeros(1))
 
-    def _size_of_all(self, rates: np.ndarray) -> SlopeError:
-        """Return the size of the derivative, from rates, or from the derivative in use."""
+    def _size(self, recent: np.ndarray) -> SlopeError:
+        """
+        Return the size of the derivative from `_recent`, shape (n, 3).
+
+        These are derivatives, or where there is none rates, whose differences over `ROUGH` seconds
+        give it.
+        """
         if self.derivative is not None:
-            slopes = _known(rates)
+            slopes = _without_unknown(recent)
             if len(slopes):
                 weights = self.derivative.weights
-                return SlopeError(_moment(slopes), float(weights @ weights))
-            return self._all_of_it or SlopeError(POSSIBLE**2 * np.eye(3))
-        step = np.diff(np.array(list(self._stamps)[-len(rates) :], np.int64))
+                return SlopeError(_mean_square(slopes), float(weights @ weights))
+            return self._earlier_size or SlopeError(POSSIBLE**2 * np.eye(3))
+        step = np.diff(np.array(list(self._stamps)[-len(recent) :], np.int64))
         step = step[np.abs(step) <= PAUSE_NS]
         period = max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
-        if len(rates) < 3 or not period:
+        if len(recent) < 3 or not period:
             return SlopeError(POSSIBLE**2 * np.eye(3))
-        lag = int(min(max(round(ROUGH / period), 1), len(rates) - 2))
-        return SlopeError(
-            _moment((rates[lag:] - rates[:-lag]) / (lag * period)), 2.0 / (lag * period) ** 2
-        )
+        lag = int(min(max(round(ROUGH / period), 1), len(recent) - 2))
+        slopes = (recent[lag:] - recent[:-lag]) / (lag * period)
+        return SlopeError(_mean_square(slopes), 2.0 / (lag * period) ** 2)
 
-    def _count_on(
+    def _push_counted(
         self, tracker: StampedDerivative | TimedDerivative, step_ns: int, reading: tuple
     ) -> tuple:
         """
@@ -525,120 +602,138 @@ class RateSlope:
         late. The derivative is kept until a later stamp decides; the window is restarted when half
         a window of samples has not decided, or at once where the step exceeds a window.
         """
-        self._ahead_ns = step_ns + (self._ahead_ns if self._doubtful else 0)
-        self._doubtful.append(reading)
-        usual_ns = self._longest_ns + 1e9 * tracker.period * (len(self._doubtful) - 1)
-        in_order = -RESET_NS < step_ns and self._ahead_ns <= usual_ns
-        may_return = (
-            step_ns > 0 and self._ahead_ns <= usual_ns + 1e9 * tracker.period * tracker.taps
-        )
-        if not in_order and may_return and 2 * len(self._doubtful) <= tracker.taps:
-            return self._slope
-        self._count += 0 if in_order else tracker.taps
+        self._pending_ns = step_ns + (self._pending_ns if self._pending else 0)
+        self._pending.append(reading)
+        most_ns = self._most_step_ns + 1e9 * tracker.period * (len(self._pending) - 1)
+        none_lost = -RESET_NS < step_ns and self._pending_ns <= most_ns
+        if not none_lost:
+            is_within_window = self._pending_ns <= most_ns + 1e9 * tracker.period * tracker.taps
+            is_undecided = step_ns > 0 and is_within_window
+            if is_undecided and 2 * len(self._pending) <= tracker.taps:
+                return self._slope
+            self._n_counted += tracker.taps  # a gap of a window restarts it
         slope = self._slope
-        for x, y, z in self._doubtful:
-            self._count += 1
-            slope = tracker.push(round(self._count * 1e9 * tracker.period), x, y, z)
-        self._doubtful = []
+        for x, y, z in self._pending:
+            self._n_counted += 1
+            slope = tracker.push(round(self._n_counted * 1e9 * tracker.period), x, y, z)
+        self._pending = []
         return slope
 
     def _review(self) -> None:
-        """
-        Classify the latest stamps again.
+        """Classify the latest stamps again, and use the derivative for a new class."""
+        # The first block after a change shows the error of the new derivative.
+        if self.line is not None and self._is_unreviewed:
+            self._is_unreviewed = False
+            self._notify()
 
-        After the first block following a change, update the error of the derivative.
-        """
-        if self.line is not None and self._young:
-            self._young = False
-            self._changed()
+        # Class of the last block, or where that is not sufficient of all stored stamps.
         stamps = np.array(self._stamps, np.int64)
+        last_block = stamps[-CLOCK_BLOCK - 1 :]
         if self.line is None:
-            self._due = stamping.MIN_PERIOD_STEPS
+            self._until_review = stamping.MIN_PERIOD_STEPS
             line = describe_stamps(stamps)
         else:
-            self._due = CLOCK_BLOCK
-            if self.line.word == REGULAR and _usual(
-                stamps[-CLOCK_BLOCK - 1 :], self.line.period_ns
-            ):
+            self._until_review = CLOCK_BLOCK
+            if self.line.word == REGULAR and _has_clock_steps(last_block, self.line.period_ns):
                 return
+            line = None
             # Counted stamps may appear regular for some time; regular ones are identified at once.
-            line = (
-                None if self.line.word == COUNTED else describe_stamps(stamps[-CLOCK_BLOCK - 1 :])
-            )
-            line = line or (describe_stamps(stamps) if len(stamps) == REVIEWED_STAMPS else None)
+            if self.line.word != COUNTED:
+                line = describe_stamps(last_block)
+            if line is None and len(stamps) == REVIEWED_STAMPS:
+                line = describe_stamps(stamps)
         if line is None:
             if self.line is None:
-                self._changed()  # so that the omitted part is known
+                self._notify()  # so that the covariances contain the size of the derivative
             return
+
+        # Independent steps appear counted in one of four reviews.
         if (
             self.line is not None
             and (self.line.word, line.word) == (IRREGULAR, COUNTED)
             and self._tracker is not None
         ):
-            self._agreeing += 1  # independent steps appear counted in one of four reviews
-            if self._agreeing < AGREE:
+            self._n_agreeing += 1
+            if self._n_agreeing < AGREE:
                 return
-        self._agreeing = 0
-        if self.line is None or line.word != self.line.word or not self._suits(line):
+        self._n_agreeing = 0
+        if self.line is None or line.word != self.line.word or not self._is_kept_for(line):
             self.settle(line)
-        self._due = CLOCK_BLOCK
+        self._until_review = CLOCK_BLOCK
 
-    def _usual_until(self, stamp_ns: np.ndarray, values: np.ndarray, start: int) -> int:
+    def _end_of_regular(self, stamp_ns: np.ndarray, values: np.ndarray, start: int) -> int:
         """
-        Return the number of samples of a block for which only the window moves.
+        Return the first sample of a block, from `start` on, that `push` has to process.
 
-        No duplicate message, the same class of stamps.
+        It repeats a stamp, or its review may change the class of the stamps; before it only the
+        window moves.
         """
         if self.line is None or self.line.word != REGULAR:
             return start
-        before = np.array(self._stamps, np.int64)[-CLOCK_BLOCK:]
-        stamps = np.concatenate([before, stamp_ns[start:]])
-        step = np.diff(stamps)
-        # The counting branch compares their readings.
-        again = np.flatnonzero(step[max(len(before) - 1, 0) :] == 0)
-        stop = len(values) - start if not len(again) else int(again[0]) + (0 if len(before) else 1)
-        due = np.arange(self._due - 1, stop, CLOCK_BLOCK)
-        first = due + len(before) - CLOCK_BLOCK
-        unusual = first < 0
-        unusual[~unusual] = ~_usual(
-            stamps[first[~unusual, None] + np.arange(CLOCK_BLOCK + 1)], self.line.period_ns
-        )
-        return start + (int(due[unusual][0]) if unusual.any() else stop)
+        earlier = np.array(self._stamps, np.int64)[-CLOCK_BLOCK:]
+        stamps = np.concatenate([earlier, stamp_ns[start:]])
 
-    def _note(
-        self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray, shown: np.ndarray
+        # Samples are numbered from `start` below. A repeated stamp may be the same message again,
+        # which `push` recognises by its reading.
+        stop = len(values) - start
+        repeated = np.flatnonzero(np.diff(stamps) == 0) + 1 - len(earlier)
+        repeated = repeated[repeated >= 0]
+        if len(repeated):
+            stop = int(repeated[0])
+
+        # A review reads the stamps of its sample and of the CLOCK_BLOCK samples before.
+        reviewed = np.arange(self._until_review - 1, stop, CLOCK_BLOCK)
+        first_stamp = reviewed + len(earlier) - CLOCK_BLOCK
+        may_change = first_stamp < 0  # too few stamps
+        indices = first_stamp[~may_change, None] + np.arange(CLOCK_BLOCK + 1)
+        may_change[~may_change] = ~_has_clock_steps(stamps[indices], self.line.period_ns)
+        if may_change.any():
+            stop = int(reviewed[may_change][0])
+        return start + stop
+
+    def _store_block(
+        self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray, recent: np.ndarray
     ) -> None:
-        """Store the state after a block that was processed as a whole."""
+        """
+        Store the state after a block that was processed at once.
+
+        Parameters
+        ----------
+        stamp_ns : ndarray, shape (n,)
+        reading : ndarray, shape (3,)
+            Rate of the last sample.
+        slopes, recent : ndarray, shape (n, 3)
+            Derivatives; in `recent` they are `UNKNOWN` where the window was not full.
+
+        """
         self._stamps.extend(stamp_ns[-REVIEWED_STAMPS:].tolist())
-        self._newest, self._reading, self._slope = (
-            int(stamp_ns[-1]),
-            tuple(reading.tolist()),
-            tuple(slopes[-1].tolist()),
-        )
-        self._due = (self._due - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
-        self._recent.extend(map(tuple, shown[-(self._recent.maxlen or len(shown)) :].tolist()))
+        self._newest_ns = int(stamp_ns[-1])
+        self._reading = tuple(reading.tolist())
+        self._slope = tuple(slopes[-1].tolist())
+        self._until_review = (self._until_review - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
+        self._recent.extend(map(tuple, recent[-(self._recent.maxlen or len(recent)) :].tolist()))
 
 
-def _stand_still(line: StampLine) -> bool:
+def _is_frozen(line: StampLine) -> bool:
+    """Return whether irregular stamps advance too slowly for a derivative."""
     return line.word == IRREGULAR and line.period_ns < FASTEST_NS
 
 
-def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
+def _has_clock_steps(stamps: np.ndarray, period_ns: float) -> np.ndarray:
     """
     Return whether stamps, shape (..., n), are from a clock of that period, without a missing one.
     """
     step = np.diff(stamps, axis=-1)
-    within = np.all(stamping.is_regular(step, period_ns), axis=-1)
-    return within & (
-        np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1)
-        <= CHANGED[REGULAR]
-    )
+    none_lost = np.all(stamping.is_regular(step, period_ns), axis=-1)
+    mean_step = (stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1))
+    return none_lost & (np.abs(mean_step - 1) <= CHANGED[REGULAR])  # in periods
 
 
-def _known(rows: np.ndarray) -> np.ndarray:
+def _without_unknown(rows: np.ndarray) -> np.ndarray:
     """Return the rows without `UNKNOWN`."""
     return rows[np.isfinite(rows).all(axis=1)]
 
 
-def _moment(rows: np.ndarray) -> np.ndarray:
+def _mean_square(rows: np.ndarray) -> np.ndarray:
+    """Return the mean of ``row row'``, shape (3, 3), of rows, shape (n, 3)."""
     return rows.T @ rows / len(rows)

@@ -35,10 +35,10 @@ MOST_IN_MOTION = 16 * STANDARD_GRAVITY
 
 class GravityScale:
     """
-    The length of gravity after the correction by a calibration, which is that of gravity.
+    The length of the corrected specific force at rest, ``|matrix^-1 (reading - bias)|``.
 
-    A calibration of readings at half scale doubles readings in another unit or range, which may
-    be usual ones: ``|matrix^-1 (reading - bias)|``.
+    It must be that of gravity: a calibration of readings at half scale doubles readings in another
+    unit or range, whose length may be usual.
     """
 
     def __init__(self, calibration: FittedErrors):
@@ -53,26 +53,28 @@ class GravityScale:
 
     def error(self, lengths: np.ndarray) -> InputError | None:
         """Return the error for `lengths` whose median is not that of gravity; None for others."""
-        if _range_of(lengths) is not IMPOSSIBLE:
+        if _scale_of(lengths) is not IMPOSSIBLE:
             return None
         return InputError(
-            _said(lengths),
+            _scale_text(lengths),
             key='accelerometer_unit',
             code='corrected_scale',
         )
 
     def question(self, lengths: np.ndarray) -> str:
-        """Return the doubt about `lengths` at rest whose median may be gravity, or ''."""
+        """Return a text on `lengths` at rest whose median is a doubtful gravity, '' for others."""
         median = np.median(lengths)
         at_rest = np.median(np.abs(lengths - median)) < REST_SPREAD * median
-        return _said(lengths) if at_rest and _range_of(lengths) is DOUBTFUL else ''
+        return _scale_text(lengths) if at_rest and _scale_of(lengths) is DOUBTFUL else ''
 
 
-def _range_of(lengths: np.ndarray) -> ScaleRange:
+def _scale_of(lengths: np.ndarray) -> ScaleRange:
+    """Return the range of the median of lengths, m/s^2, relative to gravity."""
     return scale_range(float(np.median(lengths)) / STANDARD_GRAVITY)
 
 
-def _said(lengths: np.ndarray) -> str:
+def _scale_text(lengths: np.ndarray) -> str:
+    """Return the text of an error for corrected lengths that are not gravity, m/s^2."""
     return (
         'the corrected specific force must have the length of gravity,'
         f' {STANDARD_GRAVITY:.4g} m/s^2, with this calibration it is {np.median(lengths):.4g};'
@@ -106,15 +108,22 @@ class UnitGate:
     """
 
     def __init__(self, readings: RawReadings, scale: GravityScale | None = None):
-        self._readings, self._scale = readings, scale
+        self._readings = readings
+        self._scale = scale
         self._is_increments = bool(
             readings.accelerometer.per_second or readings.gyroscope.per_second
         )
+        # The readings of the present window.
         self._stamps: list[int] = []
+        """Stamps, ns."""
         self._lengths: list[float] = []
-        self._corrected: list[float] = []
-        self._judged = False
+        """Lengths of the specific force in the stated unit, converted to m/s^2."""
+        self._corrected_lengths: list[float] = []
+        """Lengths after the correction by the calibration, m/s^2."""
+        self._had_window = False
+        """Whether a window was complete, without opening the gate."""
         self.is_open = False
+        """Whether the output is published from now on."""
         self.error: InputError | None = None
         """Why the readings at rest are not in the stated unit; None: not known to be wrong."""
 
@@ -137,48 +146,57 @@ class UnitGate:
         if length == 0.0 or not np.isfinite(length):
             return True
         if not self._stamps or stamp_ns < self._stamps[0]:
-            self._begin()
-            # Only the very first reading opens by itself, where its length is usual: a shaken IMU
-            # in g reaches any length.
-            lengths = np.array([length, corrected])
-            is_usual = all(scale_range(each) is USUAL for each in lengths / STANDARD_GRAVITY)
-            if not self._judged and is_usual and not self._is_increments:
+            self._begin_window()
+            # One reading of usual length opens the gate only before the first window: a shaken IMU
+            # in g reaches any length later.
+            is_usual = scale_range(length / STANDARD_GRAVITY) is USUAL
+            is_usual &= scale_range(corrected / STANDARD_GRAVITY) is USUAL
+            if is_usual and not self._had_window and not self._is_increments:
                 self._open()
                 return True
         self._stamps.append(stamp_ns)
         self._lengths.append(length)
-        self._corrected.append(corrected)
+        self._corrected_lengths.append(corrected)
         is_long = stamp_ns - self._stamps[0] >= WINDOW_S * 1e9
         is_complete = is_long and len(self._lengths) >= LEAST_WINDOW_READINGS
         if not is_complete and len(self._lengths) < MOST_READINGS:
             return False
-        self._judge()
+        self._judge_window()
         return self.is_open
 
-    def _begin(self) -> None:
+    def _begin_window(self) -> None:
         """Begin a window with the next reading."""
         self._stamps = []
         self._lengths = []
-        self._corrected = []
+        self._corrected_lengths = []
 
-    def _judge(self) -> None:
-        """Open, or set the error of a window at rest; begin the next window."""
+    def _judge_window(self) -> None:
+        """Open the gate or set `error`, by the lengths of a complete window; begin the next one."""
+        # Errors of the median length and of the sampling rate; None without an error.
         median = float(np.median(self._lengths))
         per_second = samples_per_second(np.array(self._stamps))
-        error = force_error(median, 'at rest', self._readings.accelerometer, per_second=per_second)
-        if error is None and self._scale is not None:
-            error = self._scale.error(np.array(self._corrected))
-        moves = np.std(self._lengths) > REST_SPREAD * median
-        wrong_rate = increments_error(per_second, self._readings) if per_second else None
-        # A motion may exceed gravity, as no reading in g does; a motion must not stop the output.
-        if wrong_rate is not None:
-            self.error = wrong_rate
-        elif error is None or (moves and STANDARD_GRAVITY < median < MOST_IN_MOTION):
+        length_error = force_error(
+            median, 'at rest', self._readings.accelerometer, per_second=per_second
+        )
+        if length_error is None and self._scale is not None:
+            length_error = self._scale.error(np.array(self._corrected_lengths))
+        rate_error = increments_error(per_second, self._readings) if per_second else None
+
+        # A median above gravity may be a motion in m/s^2, which must not withhold the output;
+        # readings in g are never as large.
+        is_moving = np.std(self._lengths) > REST_SPREAD * median
+        may_be_motion = is_moving and STANDARD_GRAVITY < median < MOST_IN_MOTION
+        if rate_error is not None:
+            self.error = rate_error
+        elif length_error is None or may_be_motion:
             self._open()
-        elif not moves or error.code in ('without_gravity', 'increments'):
-            self.error = error
-        self._begin()
-        self._judged = True
+        # These two errors are certain in motion too.
+        elif not is_moving or length_error.code in ('without_gravity', 'increments'):
+            self.error = length_error
+        self._begin_window()
+        self._had_window = True
 
     def _open(self) -> None:
-        self.is_open, self.error = True, None
+        """Publish the output from now on."""
+        self.is_open = True
+        self.error = None

@@ -1056,7 +1056,7 @@ SIGNS = _of(
     (
         'unknown angular acceleration left out of the published covariance',
         'RateSlope._error',
-        'replace(self._size_of_all(_1), weights=np.zeros(1))',
+        'replace(self._size(_1), weights=np.zeros(1))',
         'SlopeError()',
         'test_covariance_of_a_new_slope.py',
     ),
