@@ -220,11 +220,11 @@ class Adopted:
     calibration: Calibration
     """Content of the document."""
     used: trust.Usable
-    """The part of the calibration that is used."""
+    """The calibration as it is applied, and the sensors that are not corrected."""
     compensation: LiveCompensation
     """Compensation by this calibration."""
     version: str
-    """Changes whenever the document does."""
+    """Hash of the document's text."""
     source: str
     """Source of the document, readable."""
     anchor: Calibration
@@ -235,12 +235,7 @@ class Adopted:
 
     @property
     def caveats(self) -> list[str]:
-        """
-        Sensors with no or cautious correction, and undetermined parameters.
-
-        The sensors are not corrected or are corrected with caution. The parameters are not
-        determined.
-        """
+        """Lines on sensors that are not corrected or with caution, and undetermined parameters."""
         return [*self.used.lines, *trust.caveats(self.calibration)]
 
     def line(self) -> str:
@@ -250,17 +245,15 @@ class Adopted:
             f' ({decisions_text(self.calibration.decisions)}) adopted'
         )
 
-    def says_more_than(self, other: 'Adopted | None') -> bool:
-        """
-        Return whether the change from `other` must be reported.
-
-        Its source, decisions or values differ.
-        """
-        if other is None or self.calibration.decisions != other.calibration.decisions:
+    def must_be_reported_after(self, reported: 'Adopted | None') -> bool:
+        """Return whether source, decisions or values differ from the last reported calibration."""
+        if reported is None or self.source != reported.source:
             return True
-        if self.source != other.source or self.used.refused.keys() != other.used.refused.keys():
+        if self.calibration.decisions != reported.calibration.decisions:
             return True
-        return moved_beyond_sd(other.calibration, self.calibration)
+        if self.used.refused.keys() != reported.used.refused.keys():
+            return True
+        return moved_beyond_sd(reported.calibration, self.calibration)
 
 
 def adopt(
@@ -292,7 +285,7 @@ def adopt(
         used = trust.usable(calibration, anyway=settings.anyway, live=True)
         _require_same_frame(calibration, before)
         # Compiled before its readings are compared: a document of nested powers is refused here.
-        compensation = _prepared(used.calibration, settings, frames, before)
+        compensation = _make_compensation(used.calibration, settings, frames, before)
         anchor = used.calibration
         if from_topic:
             anchor = _anchor_from_topic(used.calibration, settings, before)
@@ -307,36 +300,38 @@ def adopt(
     except ImuCalibrationError:
         raise
     except Exception as error:  # no document may end the node
-        what = shortened(f'{type(error).__name__}: {error}', 200)
+        reason = shortened(f'{type(error).__name__}: {error}', 200)
         raise DocumentError(
-            f'a calibration must be usable, this one is not: {what}', code='not_usable'
+            f'a calibration must be usable, this one is not: {reason}', code='not_usable'
         ) from error
 
 
-def again(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> Adopted:
+def with_settings(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> Adopted:
     """Return the same calibration under other settings or transforms."""
     return replace(
-        adopted, compensation=_prepared(adopted.used.calibration, settings, frames, adopted)
+        adopted,
+        compensation=_make_compensation(adopted.used.calibration, settings, frames, adopted),
     )
 
 
 def has_moved(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> bool:
     """Return whether the pose from the static transforms differs from the one in force."""
-    found = _transfer(adopted.calibration, settings, frames)
-    return found is not None and not found.is_close(adopted.compensation.transfer)
+    transfer = _transfer(adopted.calibration, settings, frames)
+    return transfer is not None and not transfer.is_close(adopted.compensation.transfer)
 
 
 def _transfer(
     calibration: Calibration, settings: CompensatorSettings, frames: StaticFrames
 ) -> Transfer | None:
     """
-    Return where the readings are to be moved.
+    Return the transfer of the readings to the target frame; None without a target frame.
 
-    By the pose in the parameters, without one by the static transforms.
+    The pose of the sensor is that of the parameters, or where these are zero that of the static
+    transforms; raises `Awaited` while that one has not been received.
     """
     target = settings.target_frame
-    given = any(settings.target_xyz) or any(settings.target_rpy)
-    if not target or given or target == calibration.frame_id:
+    has_pose = any(settings.target_xyz) or any(settings.target_rpy)
+    if not target or has_pose or target == calibration.frame_id:
         return requested_transfer(target, settings.target_xyz, settings.target_rpy)
     if not calibration.frame_id:
         raise DocumentError(
@@ -350,16 +345,16 @@ def _transfer(
     return Transfer(target, mat_ts, xyz_t)
 
 
-def _prepared(
+def _make_compensation(
     calibration: Calibration,
     settings: CompensatorSettings,
     frames: StaticFrames,
     before: Adopted | None,
 ) -> LiveCompensation:
+    """Return the compensation by a calibration, ready to continue that of `before`."""
     if settings.noise_file:
-        calibration = with_measured_noise(
-            calibration, files.read_noise(files.user_path(settings.noise_file))
-        )
+        noise = files.read_noise(files.user_path(settings.noise_file))
+        calibration = with_measured_noise(calibration, noise)
     transfer = _transfer(calibration, settings, frames)
     compensation = LiveCompensation(
         calibration,
@@ -367,7 +362,7 @@ def _prepared(
         check_frame=settings.check_frame_id,
         with_parameters=settings.parameter_covariance,
         correct_stamps=settings.correct_stamps,
-        watch=_watch(calibration, transfer, settings, before),
+        watch=_stop_watch(calibration, transfer, settings, before),
         readings=calibration.readings,
         gate=UnitGate(calibration.readings, GravityScale(calibration)),
     )
@@ -376,24 +371,27 @@ def _prepared(
     return compensation
 
 
-def _watch(
+def _stop_watch(
     calibration: Calibration,
     transfer: Transfer | None,
     settings: CompensatorSettings,
     before: Adopted | None,
 ) -> StopWatch:
-    """Return the StopWatch: the present one where its inputs are unchanged."""
+    """
+    Return the StopWatch of a calibration.
+
+    That of `before`, with the stops so far, where calibration, options and transfer are the same.
+    """
     gravity, _ = gravity_of_settings(settings.gravity, settings.latitude, settings.height)
     options = HealthOptions(gravity, settings.update_gyro_bias, settings.gyro_bias_time)
-    watch = (
-        None
-        if before is None or before.used.calibration is not calibration
-        else before.compensation.watch
-    )
-    if before is not None and watch is not None and watch.health.options == options:
-        was = before.compensation.transfer
-        if was is transfer or (transfer is not None and transfer.is_close(was)):
-            return watch
+    if before is not None and before.used.calibration is calibration:
+        watch = before.compensation.watch
+        if watch is not None and watch.health.options == options:
+            old_transfer = before.compensation.transfer
+            if old_transfer is transfer or (
+                transfer is not None and transfer.is_close(old_transfer)
+            ):
+                return watch
     return StopWatch(CalibrationHealth(calibration, transfer, options))
 
 
@@ -401,9 +399,10 @@ def _anchor_from_topic(
     calibration: Calibration, settings: CompensatorSettings, before: Adopted | None
 ) -> Calibration:
     """
-    Return the anchor after a calibration from the topic.
+    Return the anchor (see `Adopted.anchor`) after a calibration from the topic.
 
-    Refuses a change that no IMU of the kind needs: a copied decision proves nothing.
+    Raises a DocumentError for a change of the readings, from those of the present calibration or of
+    the anchor, that no IMU of the kind needs: decisions in a document may be copied.
     """
     if settings.anyway:
         return calibration
@@ -411,15 +410,15 @@ def _anchor_from_topic(
     if before is not None:
         references = [before.used.calibration, before.anchor]
     for reference in references:
-        why = implausible_change(calibration, reference)
-        known = RawReadings() if reference is None else reference.readings
+        fault = implausible_change(calibration, reference)
+        units = RawReadings() if reference is None else reference.readings
         # Another unit changes the readings by any factor.
-        if not calibration.readings.has_units_of(known):
-            why = 'it describes readings in other units'
-        if why:
+        if not calibration.readings.has_units_of(units):
+            fault = 'it describes readings in other units'
+        if fault:
             near = 'uncorrected readings' if reference is None else 'the one in use'
             raise DocumentError(
-                f'a calibration from the topic must be near {near}: {why}; if it is right, set'
+                f'a calibration from the topic must be near {near}: {fault}; if it is right, set'
                 ' anyway:=true',
                 key='anyway',
                 code='implausible_change',
@@ -428,10 +427,11 @@ def _anchor_from_topic(
 
 
 def _require_same_frame(calibration: Calibration, before: Adopted | None) -> None:
-    known = '' if before is None else before.compensation.frame_id
-    if known and calibration.frame_id and calibration.frame_id != known:
+    """Raise a DocumentError for a calibration of another sensor than the present one."""
+    present = '' if before is None else before.compensation.frame_id
+    if present and calibration.frame_id and calibration.frame_id != present:
         raise DocumentError(
-            f"a new calibration must be for the same sensor, '{known}', this one is for"
+            f"a new calibration must be for the same sensor, '{present}', this one is for"
             f" '{calibration.frame_id}'; restart the node for another sensor",
             code='other_sensor',
         )

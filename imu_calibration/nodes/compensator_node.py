@@ -28,7 +28,7 @@ from imu_calibration.nodes.adoption import (
     Awaited,
     CompensatorSettings,
     adopt,
-    again,
+    with_settings,
     has_moved,
     may_become_ready,
 )
@@ -77,21 +77,35 @@ class CompensatorNode(Node):
             self, CompensatorSettings, self._change_compensation, hints=HINTS['compensator_node']
         )
         self.adopted: Adopted | None = None
+        """The calibration in force."""
         self._previous: Adopted | None = None
-        self._harmful, self.unready = '', ''
-        self._current: LiveCompensation | None = None
-        self._wanted: LiveCompensation | None = None
+        """The calibration in force before, to return to where the present one increases errors."""
         self._reported: Adopted | None = None
-        self.problem = ''
-        self.refusal = ''
-        self.corrected_already = ''
-        self._heard = ''
+        """The calibration that was logged last."""
+        self._harmful_version = ''
+        """Version of a calibration that increased the error at rest and is refused."""
+        self._newest: LiveCompensation | None = None
+        """Compensation by the calibration in force, set by the second thread."""
+        self._in_use: LiveCompensation | None = None
+        """Compensation of the last message; the first thread replaces it by `_newest`."""
+        self._document = ''
+        """The last calibration document that was received."""
         self.awaited = ''
+        """Transform without which a calibration cannot be adopted yet; '' for none."""
+        self.unready = ''
+        """Why the received calibration has too few data so far; '' otherwise."""
+        self.problem = ''
+        """Why the last calibration was refused; '' after an adoption."""
+        self.refusal = ''
+        """Code of the error of the last refusal; '' after an adoption."""
+        self.corrected_already = ''
+        """Why the input is corrected already, so that no message is published; '' otherwise."""
         announce(
             self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected']
         )
         self._frames = StaticFrames(self, self._guarded(self._on_transforms))
         self.uncorrected = 0
+        """Messages that were not corrected: published unchanged or not at all."""
         self.complaints = Complaints(self.get_logger())
         self.by_wait_set = relay_loop.available() and not self.settings.public_executor
         self._publisher = self.create_publisher(Imu, 'imu/data_corrected', output_qos())
@@ -118,10 +132,11 @@ class CompensatorNode(Node):
         self.diagnostics = CompensatorDiagnostics(self)
         self.create_service(Trigger, '~/reload', self._on_reload)
         self._start()
-        self._timer: Timer | None = None
+        self._refresh_timer: Timer | None = None
         self._set_refresh(self.settings.covariance_rate)
 
     def _start(self) -> None:
+        """Adopt the calibration file, or log for which calibration the node waits."""
         path = self.settings.calibration_path
         if self.settings.calibration_file and not path.exists():
             if not self.settings.wait_for_file:
@@ -130,7 +145,7 @@ class CompensatorNode(Node):
                     ' correct it, or wait for it with wait_for_file:=true',
                     code='calibration_missing',
                 )
-            self._waiting = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
+            self._file_timer = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
             self.get_logger().info(f'waits for the file {path}')
         elif self.settings.calibration_file:
             self._try_file()
@@ -143,13 +158,13 @@ class CompensatorNode(Node):
 
     def _look_for_file(self) -> None:
         if self.settings.calibration_path.exists():
-            self.destroy_timer(self._waiting)
+            self.destroy_timer(self._file_timer)
             self._try_file()
 
     @property
     def compensation(self) -> LiveCompensation | None:
-        """The LiveCompensation in use, or about to be, or None."""
-        return self._wanted
+        """Compensation by the calibration in force, used from the next message on, or None."""
+        return self._newest
 
     def spin(self) -> None:
         """Work until the context ends."""
@@ -160,28 +175,28 @@ class CompensatorNode(Node):
 
     def convert(self, data: bytes, information: dict) -> bytes | None:
         """Return the serialized message to publish, or None."""
-        current = self._current
-        if current is not self._wanted:
-            current = self._take_over()
-        if current is None or self.corrected_already:
+        current = self._in_use
+        if current is not self._newest:
+            current = self._use_newest()
+        if self.corrected_already:
             self.uncorrected += 1
-            return (
-                data
-                if self.settings.passthrough and current is None and not self.corrected_already
-                else None
-            )
+            return None
+        if current is None:
+            self.uncorrected += 1
+            return data if self.settings.passthrough else None
         try:
             return current(data, sent_ns(information))
         except Exception as error:  # an unforeseen message must not end the stream
             current.counts[shortened(f'failed with {type(error).__name__}: {error}', 100)] += 1
             return None
 
-    def _take_over(self):
-        wanted = self._wanted
-        if self._current is not None and wanted is not None:
-            wanted.follow(self._current)
-        self._current = wanted
-        return wanted
+    def _use_newest(self) -> LiveCompensation | None:
+        """Continue the stream with the newest compensation, in the first thread."""
+        newest = self._newest
+        if self._in_use is not None and newest is not None:
+            newest.follow(self._in_use)
+        self._in_use = newest
+        return newest
 
     def _on_imu(self, data: bytes, information: dict) -> None:
         converted = self.convert(data, information)
@@ -193,6 +208,7 @@ class CompensatorNode(Node):
         return guarded(callback, self._failed)
 
     def _failed(self, error: Exception) -> None:
+        """Log an exception of a callback."""
         if self.context.ok():  # false while the node ends and publishing is impossible
             self.complaints.event(
                 'a message could not be used, the node continues unchanged: '
@@ -209,9 +225,9 @@ class CompensatorNode(Node):
                 ' but one'
             )
             return
-        self._heard = message.data
+        self._document = message.data
         if self.settings.takes_topic:
-            self._try(self._topic, self._take_topic)
+            self._try_to_adopt(self._topic, self._take_topic)
         else:
             self.complaints.event(
                 f"a calibration on {self.documents.topic_name} was not adopted: parameter 'adopt'"
@@ -223,9 +239,9 @@ class CompensatorNode(Node):
         self, text: str, source: str, settings: CompensatorSettings, *, from_topic: bool = False
     ) -> None:
         """
-        Put the calibration in a document in force.
+        Put the calibration in a document in force, and log a change that must be reported.
 
-        Raises an ImuCalibrationError and keeps the one there is.
+        Where it raises an ImuCalibrationError the present calibration remains in force.
         """
         adopted = adopt(
             text,
@@ -236,7 +252,7 @@ class CompensatorNode(Node):
             from_topic=from_topic,
         )
         self._put_in_force(adopted)
-        if adopted.says_more_than(self._reported):
+        if adopted.must_be_reported_after(self._reported):
             self._reported = adopted
             self.get_logger().info(adopted.line())
             for line in adopted.caveats:
@@ -244,9 +260,7 @@ class CompensatorNode(Node):
 
     def return_from_harm(self) -> None:
         """
-        Return to the previous calibration where the present one increases the error.
-
-        A stop shows the increase.
+        Return to the previous calibration where the present one increases the error at a stop.
         """
         harmful, previous = self.adopted, self._previous
         watch = None if harmful is None else harmful.compensation.watch
@@ -257,12 +271,13 @@ class CompensatorNode(Node):
             f' used again: {watch.health.state.message}',
             LOG_ERROR,
         )
-        self._harmful = harmful.version
+        self._harmful_version = harmful.version
         self._previous = None
         self.adopted = None
-        self._put_in_force(again(previous, self.settings, self._frames))
+        self._put_in_force(with_settings(previous, self.settings, self._frames))
 
     def _put_in_force(self, adopted: Adopted) -> None:
+        """Correct with a calibration from the next message on, and mark the output with it."""
         if self.adopted is not None and self.adopted.version != adopted.version:
             self._previous = self.adopted
         self.adopted = adopted
@@ -270,11 +285,13 @@ class CompensatorNode(Node):
         self.refusal = ''
         self.awaited = ''
         self.unready = ''
-        self._wanted = adopted.compensation
-        if self.temperature is None and (
+        self._newest = adopted.compensation
+        # For the correction, or to compare with the temperatures of the calibration.
+        uses_temperature = (
             adopted.compensation.needs_temperature
             or adopted.calibration.conditions.get('temperature_range_c')
-        ):
+        )
+        if uses_temperature and self.temperature is None:
             self.temperature = MatchedInput(
                 self,
                 Temperature,
@@ -289,28 +306,32 @@ class CompensatorNode(Node):
 
     @property
     def _topic(self) -> str:
+        """Source of a calibration from the topic, readable."""
         return f'topic {self.documents.topic_name}'
 
     def _take_topic(self, settings: CompensatorSettings) -> None:
-        if version_of(self._heard) == self._harmful:
+        """Adopt the last received document; raises an ImuCalibrationError as `_adopt`."""
+        if version_of(self._document) == self._harmful_version:
             raise DocumentError(
-                f'calibration {self._harmful} increased the error at rest; calibrate again',
+                f'calibration {self._harmful_version} increased the error at rest; calibrate again',
                 code='increased_error',
             )
-        self._adopt(self._heard, self._topic, settings, from_topic=True)
+        self._adopt(self._document, self._topic, settings, from_topic=True)
 
     def _load_file(self, settings: CompensatorSettings) -> None:
+        """Adopt the calibration file; raises an ImuCalibrationError as `_adopt`."""
         path = settings.calibration_path
         self._adopt(files.read_text(path, 'calibration'), f'file {path}', settings)
 
     def _try_file(self) -> str:
-        return self._try("parameter 'calibration_file'", self._load_file)
+        """Adopt the calibration file; return as `_try_to_adopt`."""
+        return self._try_to_adopt("parameter 'calibration_file'", self._load_file)
 
-    def _try(self, source: str, action: Callable[[CompensatorSettings], None]) -> str:
+    def _try_to_adopt(self, source: str, action: Callable[[CompensatorSettings], None]) -> str:
         """
-        Adopt a calibration with the present settings.
+        Adopt a calibration by `action` with the present settings.
 
-        Return the reason of its refusal, '' when it succeeded.
+        Return the reason of its refusal, '' when it was adopted.
         """
         try:
             action(self.settings)
@@ -323,8 +344,9 @@ class CompensatorNode(Node):
         except ImuCalibrationError as error:
             why = error.with_hint(HINTS['compensator_node'])
             self.refusal = error.code
+            # A calibration in progress is not a fault.
             if self.adopted is None and source == self._topic:
-                if may_become_ready(error, self._heard):
+                if may_become_ready(error, self._document):
                     self._wait_until_ready(source, why)
                     return why
         self.unready = ''
@@ -334,10 +356,10 @@ class CompensatorNode(Node):
 
     def _wait_until_ready(self, source: str, why: str) -> None:
         """Report a calibration in progress, whose next version may be applied."""
-        was_ready = not self.unready
+        is_first = not self.unready
         self.unready = f'the calibration from {source} is not ready yet: {why}'
         self.problem = ''
-        if was_ready:
+        if is_first:
             self.get_logger().info(self.unready)
         self.diagnostics.publish_now()
 
@@ -346,15 +368,16 @@ class CompensatorNode(Node):
         if self.awaited:
             self._retry()
         elif self.adopted is not None and has_moved(self.adopted, self.settings, self._frames):
-            self._put_in_force(again(self.adopted, self.settings, self._frames))
+            self._put_in_force(with_settings(self.adopted, self.settings, self._frames))
             self.get_logger().warning(
                 f"the static transform to '{self.settings.target_frame}' has moved: readings"
                 ' follow it'
             )
 
     def _retry(self) -> None:
-        if self.settings.takes_topic and self._heard:
-            self._try(self._topic, self._take_topic)
+        """Adopt the calibration again that a missing transform delayed."""
+        if self.settings.takes_topic and self._document:
+            self._try_to_adopt(self._topic, self._take_topic)
         elif self.settings.calibration_file:
             self._try_file()
 
@@ -365,22 +388,24 @@ class CompensatorNode(Node):
             why = (
                 "parameter 'calibration_file' is empty; start the node with the file to read again"
             )
-        response.success, response.message = (
-            not why,
-            why or (self.adopted.line() if self.adopted else ''),
-        )
+        response.success = not why
+        response.message = why
+        if not why and self.adopted:
+            response.message = self.adopted.line()
         return response
 
     def _change_compensation(self, settings: CompensatorSettings) -> None:
         """Apply changed parameters; on an ImuCalibrationError all remain unchanged."""
         old = self.settings
-        insists = settings.anyway and not self.settings.anyway
-        if settings.calibration_file and insists and not settings.takes_topic:
+        # New consent, or another source, may adopt a calibration that was refused or ignored.
+        consents = settings.anyway and not old.anyway
+        changes_source = settings.takes_topic and not old.takes_topic
+        if settings.calibration_file and consents and not settings.takes_topic:
             self._load_file(settings)
-        elif settings.takes_topic and self._heard and (insists or not old.takes_topic):
+        elif settings.takes_topic and self._document and (consents or changes_source):
             self._take_topic(settings)
         elif self.adopted is not None:
-            self._put_in_force(again(self.adopted, settings, self._frames))
+            self._put_in_force(with_settings(self.adopted, settings, self._frames))
         if settings.covariance_rate != old.covariance_rate:
             self._set_refresh(settings.covariance_rate)
         self.settings = settings
@@ -392,11 +417,12 @@ class CompensatorNode(Node):
             self.compensation.set_temperature(message.temperature)
 
     def _set_refresh(self, rate: float) -> None:
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-        self._timer = (
-            self.create_timer(1.0 / rate, self._guarded(self._refresh)) if rate > 0 else None
-        )
+        """Update the covariances at a rate, Hz; 0: only with a new calibration."""
+        if self._refresh_timer is not None:
+            self.destroy_timer(self._refresh_timer)
+        self._refresh_timer = None
+        if rate > 0:
+            self._refresh_timer = self.create_timer(1.0 / rate, self._guarded(self._refresh))
 
     def _refresh(self) -> None:
         if self.compensation is not None:
@@ -404,15 +430,17 @@ class CompensatorNode(Node):
 
     def look_for_correction(self) -> None:
         """
-        Notice when another compensator publishes the input, and when it no longer does.
+        Set `corrected_already` while another compensator publishes the input.
 
-        A compensator publishes both the topic and its mark; the mark of another node is ignored,
-        because any participant could stop the output with it.
+        A compensator publishes both the topic and its mark; a mark from a node that does not
+        publish the topic is ignored, because any participant could stop the output with it.
         """
         topic = self.imu.topic_name
-        marked = {node_of(each) for each in self.get_publishers_info_by_topic(topic + MARK)}
-        senders = {node_of(each) for each in self.get_publishers_info_by_topic(topic)}
-        compensators = sorted(marked & senders)
+        markers = {
+            node_of(endpoint) for endpoint in self.get_publishers_info_by_topic(topic + MARK)
+        }
+        senders = {node_of(endpoint) for endpoint in self.get_publishers_info_by_topic(topic)}
+        compensators = sorted(markers & senders)
         self.corrected_already = ''
         if compensators:
             self.corrected_already = (

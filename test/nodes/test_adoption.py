@@ -11,7 +11,7 @@ from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.nodes import adoption
-from imu_calibration.nodes.adoption import CompensatorSettings, adopt, again
+from imu_calibration.nodes.adoption import CompensatorSettings, adopt, with_settings
 
 from worlds.compensation_cases import random_calibration
 
@@ -74,7 +74,7 @@ def test_a_refused_sensor_is_not_corrected_and_the_other_one_is():
     assert (
         not whole.used.refused
         and whole.caveats[0] == whole.used.cautions[0]
-        and adopted.says_more_than(whole)
+        and adopted.must_be_reported_after(whole)
     )
     sample = (0, 0.1, 0.2, 0.3, 1.0, 2.0, 9.0)
     corrected, both = (each.compensation.correct(*sample) for each in (adopted, whole))
@@ -83,7 +83,7 @@ def test_a_refused_sensor_is_not_corrected_and_the_other_one_is():
         np.abs(np.subtract(both[3:], sample[4:])).max() > 1e-3
         and np.abs(np.subtract(corrected[:3], sample[1:4])).max() > 1e-4
     )
-    assert again(adopted, SETTINGS, None).used is adopted.used
+    assert with_settings(adopted, SETTINGS, None).used is adopted.used
 
 
 PROVEN = {'accelerometer': HELPS, 'gyroscope': HELPS}
@@ -146,7 +146,7 @@ def test_whatever_a_document_does_becomes_one_line(monkeypatch):
     def fails(*given):
         raise IndexError('list index out of range')
 
-    monkeypatch.setattr(adoption, '_prepared', fails)
+    monkeypatch.setattr(adoption, '_make_compensation', fails)
     with refused(DocumentError, 'not_usable', 'IndexError', 'list index out of range'):
         adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, frames=None)
 
@@ -165,7 +165,7 @@ def test_only_what_changed_by_more_than_its_sd_is_worth_a_line():
         )
         for share in (0.1, 3.0)
     )
-    assert not little.says_more_than(before) and much.says_more_than(before)
+    assert not little.must_be_reported_after(before) and much.must_be_reported_after(before)
 
 
 def near(**bias):
