@@ -20,7 +20,7 @@ from imu_calibration.nodes.diagnostics import (
     DiagnosticsPublisher,
     make_status,
 )
-from imu_calibration.nodes.message_compensation import WITHHELD
+from imu_calibration.nodes.message_compensation import WITHHELD, LiveCompensation
 from imu_calibration.preprocessing.stamping import COUNTED, REGULAR
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')
@@ -58,15 +58,25 @@ class CompensatorDiagnostics:
     """Collects the state of the node; a fault is logged at its beginning and at its end."""
 
     def __init__(self, node: Any):
-        self._node, self._counts = node, {}
-        self._received = 0
-        self._last_change = monotonic()
-        self._last_source = ''
-        self._last_stamps: tuple[Any, int] | None = None
+        self._node = node
+        self._largest_counts: dict[str, int] = {}
+        """Reason why messages are not corrected -> largest count so far."""
+        self._n_received = 0
+        """Messages at the last `collect`."""
+        self._last_arrival = monotonic()
+        """Time of the last `collect` with new messages, s, on the clock of all times here."""
+        self._logged_source = ''
+        """Source of the messages in the last log line about it."""
+        self._logged_stamps: tuple[Any, int] | None = None
+        """Kind of the stamps, and rounded logarithm of their period, in the last log line."""
+        self._stamps_logged_at = -np.inf
+        """Time of that line."""
         self._temperature: float | None = None
+        """Last usable temperature, degrees Celsius."""
         self._temperature_at = monotonic()
-        self._unusable_temperatures = ''
-        self._stamps_at = -np.inf
+        """Time of its reception."""
+        self._temperature_fault = ''
+        """Requirement that a received temperature did not fulfil; '' after its report."""
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
     def publish_now(self) -> None:
@@ -79,14 +89,14 @@ class CompensatorDiagnostics:
 
         Return whether it is usable: finite, and by its magnitude in degrees Celsius.
         """
-        if not np.isfinite(temperature_c) or temperature_c > HOTTEST_C:
-            self._unusable_temperatures = (
-                f'in degrees Celsius, {temperature_c:.1f} is kelvin'
-                if temperature_c > HOTTEST_C
-                else 'finite'
-            )
+        if temperature_c > HOTTEST_C:
+            self._temperature_fault = f'in degrees Celsius, {temperature_c:.1f} is kelvin'
             return False
-        self._temperature, self._temperature_at = temperature_c, monotonic()
+        if not np.isfinite(temperature_c):
+            self._temperature_fault = 'finite'
+            return False
+        self._temperature = temperature_c
+        self._temperature_at = monotonic()
         return True
 
     def collect(self) -> list:
@@ -99,15 +109,13 @@ class CompensatorDiagnostics:
         # Present faults, also for the log; a doubt about stamps is repeated less often.
         unready = self._unready()
         serious, notes = self._lines(compensation, unready)
-        notes += self._stream(compensation) + [
-            line for each in node.inputs for line in each.faults()
-        ]
+        notes += self._silence(compensation)
+        for source in node.inputs:
+            notes += source.faults()
         node.complaints.now('compensation', notes, serious)
-        doubts = (
-            [compensation.slope.doubt]
-            if compensation is not None and compensation.slope.doubt
-            else []
-        )
+        doubts = []
+        if compensation is not None and compensation.slope.doubt:
+            doubts.append(compensation.slope.doubt)
         node.complaints.now('stamps', doubts, patience=REMINDER)
         notes += doubts
         adopted: Adopted | None = node.adopted
@@ -137,46 +145,49 @@ class CompensatorDiagnostics:
             ),
         ]
 
-    def _health(self, compensation, frame_id):
-        """Return a status with the validity of the calibration; log the loss of validity."""
-        if compensation is None:
+    def _health(self, compensation: LiveCompensation | None, frame_id: str) -> list:
+        """Return the status of the calibration's validity at the last stop; log its loss."""
+        if compensation is None or compensation.watch is None:
             return []
         state = compensation.watch.health.state
-        warm = (
-            []
-            if compensation.needs_temperature or self._temperature is None
-            else outside_conditions(compensation.calibration, temperature_c=[self._temperature])
-        )
-        level = max(HEALTH_LEVELS[state.word], WARN if warm else OK)
-        grave = HEALTH_LEVELS[state.word] == ERROR
-        doubts = [state.message] if HEALTH_LEVELS[state.word] == WARN else []
-        faults = [state.message] if grave else []
+        # A calibration that needs temperatures reports this in `_outside_lines`.
+        conditions = []
+        if not compensation.needs_temperature and self._temperature is not None:
+            conditions = outside_conditions(
+                compensation.calibration, temperature_c=[self._temperature]
+            )
+        health_level = HEALTH_LEVELS[state.word]
+        doubts = [state.message] if health_level == WARN else []
+        faults = [state.message] if health_level == ERROR else []
         self._node.complaints.now('health', doubts, faults, replaces=True)
-        self._node.complaints.now('conditions', warm)
+        self._node.complaints.now('conditions', conditions)
         return [
             make_status(
-                level,
+                max(health_level, WARN if conditions else OK),
                 'health',
-                '; '.join([state.message, *warm]),
+                '; '.join([state.message, *conditions]),
                 values={'outcome': state.word, **state.values},
                 hardware_id=frame_id,
             )
         ]
 
-    def _stream(self, compensation):
-        """Return the faults of the message stream, and log its source when it begins."""
+    def _silence(self, compensation: LiveCompensation | None) -> list[str]:
+        """Return a line on a silent stream; log the source and the stamps of a changed one."""
         node = self._node
-        received = self._node.uncorrected + (0 if compensation is None else compensation.received)
-        if received != self._received:
-            self._received, self._last_change = received, monotonic()
+        n_received = node.uncorrected
+        if compensation is not None:
+            n_received += compensation.received
+        if n_received != self._n_received:
+            self._n_received = n_received
+            self._last_arrival = monotonic()
             source = node.imu.source()
-            if source != self._last_source and node.imu.publishers:
-                self._last_source = source
+            if source != self._logged_source and node.imu.publishers:
+                self._logged_source = source
                 node.get_logger().info(f'Imu messages are received on {source}')
         self._tell_stamps(compensation)
-        return [node.imu.silence()] if monotonic() - self._last_change > QUIET else []
+        return [node.imu.silence()] if monotonic() - self._last_arrival > QUIET else []
 
-    def _tell_stamps(self, compensation):
+    def _tell_stamps(self, compensation: LiveCompensation | None) -> None:
         """Log a change of the kind or of the regular rate of the stamps, at most once a minute."""
         line = None if compensation is None else compensation.slope.line
         if line is None:
@@ -185,23 +196,23 @@ class CompensatorDiagnostics:
         if line.word == REGULAR:  # the other lines state no rate
             rate = round(np.log(line.period_ns) / ANOTHER_RATE)
         shown = (line.word, rate)
-        if shown == self._last_stamps:
+        if shown == self._logged_stamps:
             return
-        if line.word == COUNTED or self._last_stamps is not None:
-            if monotonic() - self._stamps_at < REMINDER:
+        if line.word == COUNTED or self._logged_stamps is not None:
+            if monotonic() - self._stamps_logged_at < REMINDER:
                 return  # logged later if it lasts
-            self._stamps_at = monotonic()
+            self._stamps_logged_at = monotonic()
             self._node.get_logger().info(str(line))
-        self._last_stamps = shown
+        self._logged_stamps = shown
 
-    def _uncorrected(self):
-        """Return what happens to messages without a calibration."""
+    def _uncorrected(self) -> str:
+        """Return the treatment of messages without a calibration, readable."""
         if self._node.settings.passthrough:
             return 'messages pass unchanged'
         return 'nothing is published'
 
-    def _unready(self):
-        """Return which calibration is in progress while there is none and no fault; else ''."""
+    def _unready(self) -> str:
+        """Return a text on a calibration in progress; '' with a calibration or a fault."""
         node = self._node
         if node.unready or node.problem or node.awaited or node.adopted is not None:
             return node.unready
@@ -209,48 +220,55 @@ class CompensatorDiagnostics:
             return f'{", ".join(node.documents.names())} has not sent a calibration yet'
         return ''
 
-    def _lines(self, compensation, unready):
+    def _lines(
+        self, compensation: LiveCompensation | None, unready: str
+    ) -> tuple[list[str], list[str]]:
         """Return (faults that prevent correction, notes), one line each."""
         node = self._node
         serious = [node.corrected_already] if node.corrected_already else []
         if node.problem:
-            serious.append(
-                node.problem
-                + (f'; calibration {node.adopted.version} remains in use' if node.adopted else '')
-            )
+            in_use = f'; calibration {node.adopted.version} remains in use' if node.adopted else ''
+            serious.append(node.problem + in_use)
+
         if compensation is None:
             if unready:
                 return serious, []
-            what = self._uncorrected()
-            waiting = (
-                f'waiting for {node.awaited}; {what}'
-                if node.awaited
-                else f'waiting for a calibration, {what}'
-            )
-            return (serious + [waiting], []) if node.problem else (serious, [waiting])
+            waiting = f'waiting for a calibration, {self._uncorrected()}'
+            if node.awaited:
+                waiting = f'waiting for {node.awaited}; {self._uncorrected()}'
+            # After a refusal waiting is a consequence of the fault.
+            if node.problem:
+                return serious + [waiting], []
+            return serious, [waiting]
+
         if compensation.gate is not None and compensation.gate.error is not None:
             serious.append(f'nothing is published: {compensation.gate.error}')
         notes = []
-        for reason, count in self._new_counts(compensation).items():
-            (serious if reason.startswith(SERIOUS) else notes).append(
-                self._line(reason, compensation)
-            )
-        return serious, notes + self._outside(compensation) + self._warmth(compensation)
+        for reason in self._new_reasons(compensation):
+            line = self._line(reason, compensation)
+            if reason.startswith(SERIOUS):
+                serious.append(line)
+            else:
+                notes.append(line)
+        notes += self._outside_lines(compensation)
+        notes += self._temperature_lines(compensation)
+        return serious, notes
 
-    def _new_counts(self, compensation):
+    def _new_reasons(self, compensation: LiveCompensation) -> list[str]:
         """
         Return the reasons whose counts exceed their earlier maximum.
 
         The counts of a new compensation start at zero.
         """
-        counts = dict(compensation.counts)
-        new = {
-            reason: count for reason, count in counts.items() if count > self._counts.get(reason, 0)
-        }
-        self._counts |= new
-        return new
+        reasons = []
+        for reason, count in dict(compensation.counts).items():
+            if count > self._largest_counts.get(reason, 0):
+                self._largest_counts[reason] = count
+                reasons.append(reason)
+        return reasons
 
-    def _line(self, reason, compensation):
+    def _line(self, reason: str, compensation: LiveCompensation) -> str:
+        """Return the line about a reason in `counts`."""
         if reason.startswith('frame_id'):
             return (
                 f"messages carry {reason}, the calibration is for '{compensation.frame_id}': they"
@@ -258,27 +276,28 @@ class CompensatorDiagnostics:
             )
         return TEXT_OF_REASON.get(reason, f'{reason}: these messages are not published')
 
-    def _outside(self, compensation):
-        fastest, compensation.fastest_squared = sqrt(compensation.fastest_squared), 0.0
-        temperature = (
-            None
-            if not compensation.needs_temperature or compensation.warming is None
-            else [compensation.warming + compensation.calibration.model.temperature_ref_c]
-        )
-        return outside_conditions(compensation.calibration, fastest, temperature)
+    def _outside_lines(self, compensation: LiveCompensation) -> list[str]:
+        """Return lines on rates since the last call and temperatures outside the calibration's."""
+        fastest = sqrt(compensation.fastest_squared)
+        compensation.fastest_squared = 0.0
+        temperatures_c = None
+        if compensation.needs_temperature and compensation.warming is not None:
+            reference_c = compensation.calibration.model.temperature_ref_c
+            temperatures_c = [compensation.warming + reference_c]
+        return outside_conditions(compensation.calibration, fastest, temperatures_c)
 
-    def _warmth(self, compensation):
-        """Return the faults of the temperature, when the calibration needs one."""
+    def _temperature_lines(self, compensation: LiveCompensation) -> list[str]:
+        """Return the faults of the received temperatures where the calibration needs them."""
         node = self._node
         if not compensation.needs_temperature or node.temperature is None:
             return []
         lines = []
-        if self._unusable_temperatures:
+        if self._temperature_fault:
             lines.append(
                 f'temperatures on {node.temperature.topic_name} must be'
-                f' {self._unusable_temperatures}: they are ignored; correct the driver'
+                f' {self._temperature_fault}: they are ignored; correct the driver'
             )
-            self._unusable_temperatures = ''
+            self._temperature_fault = ''
         if monotonic() - self._temperature_at > COLD:
             last = (
                 'none received yet'
@@ -288,8 +307,10 @@ class CompensatorDiagnostics:
             lines.append(f'{node.temperature.silence()}; {last}')
         return lines
 
-    def _values(self):
-        node, adopted = self._node, self._node.adopted
+    def _values(self) -> dict[str, Any]:
+        """Return the figures of the status 'compensation' by name."""
+        node = self._node
+        adopted = node.adopted
         values = {
             'calibration': adopted.version if adopted else 'none',
             'source': adopted.source if adopted else '',
@@ -301,7 +322,8 @@ class CompensatorDiagnostics:
         }
         if adopted is None:
             return values
-        calibration, compensation = adopted.calibration, adopted.compensation
+        calibration = adopted.calibration
+        compensation = adopted.compensation
         values |= {
             'decision': decisions_text(calibration.decisions),
             'not corrected': ', '.join(adopted.used.refused) or 'none',
@@ -311,7 +333,8 @@ class CompensatorDiagnostics:
             'corrected': compensation.corrected,
             **compensation.counts,
         }
-        line, derivative = compensation.slope.line, compensation.slope.derivative
+        line = compensation.slope.line
+        derivative = compensation.slope.derivative
         if line is not None:
             values |= {'stamps': str(line), 'period [s]': f'{1e-9 * line.period_ns:.6g}'}
         if derivative is not None:

@@ -28,9 +28,9 @@ from imu_calibration.nodes.adoption import (
     Awaited,
     CompensatorSettings,
     adopt,
-    with_settings,
     has_moved,
     may_become_ready,
+    with_settings,
 )
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.diagnostics import LOG_ERROR, Complaints
