@@ -6,9 +6,11 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -45,23 +47,23 @@ from imu_calibration.references.turntable import live_diagnosis as diagnosis
 class WorkerState:
     """State shown in diagnostics; replaced as one object, so that another thread may read it."""
 
-    groups: list = field(default_factory=list)
-    """GroupState of every effect."""
+    groups: list[GroupState] = field(default_factory=list)
+    """State of the parameters of every effect."""
     streams: StreamState | None = None
-    """How the streams are."""
+    """Received, silent and faulty streams; None before the first block."""
     solution: int = 0
     """Number of the last solution; 0 before the first."""
     verdict: str = ''
     """The more cautious decision; '' before the first solution."""
-    lines: tuple = ()
-    """Reasons why it is not complete, then all statements and next steps."""
+    lines: tuple[str, ...] = ()
+    """Reasons why the calibration is not complete, then all statements and next steps."""
     trouble: str = ''
-    """Why there is no new solution."""
-    faults: tuple = ()
+    """Why the last attempt of a solution failed; '' otherwise."""
+    faults: tuple[str, ...] = ()
     """Present faults, a line each."""
     gathered: int = 0
-    """Windows, or poses by hand."""
-    values: dict = field(default_factory=dict)
+    """Number of windows, or of poses by hand."""
+    values: dict[str, Any] = field(default_factory=dict)
     """Figures by name."""
     session: LiveState | None = None
     """Progress in addition to the parameter groups: the poses of a calibration by hand."""
@@ -112,14 +114,21 @@ class CalibrationGuide:
         self._save_command = save_command
         self._noun = noun
         self._clock = clock
-        self._coming: set[str] = set()
-        self._stamping = ''
-        self._stamping_at = float('-inf')
+        self._received: set[str] = set()
+        """Streams with messages at the last call of `lines`."""
         self._gathered = 0
-        self._verdict = ''
-        self._advice = ''
-        self._advised = float('-inf')
-        self._diagnosed = ''
+        """Windows or poses at the last call."""
+        # The last lines, and when they were returned, s of `clock`.
+        self._logged_stamping = ''
+        """Word of the stamps."""
+        self._stamping_logged_at = float('-inf')
+        self._logged_verdict = ''
+        """Decisions, and whether every parameter is determined."""
+        self._logged_advice = ''
+        """Most useful next motion or action."""
+        self._advised_at = float('-inf')
+        self._logged_diagnosis = ''
+        """Word and effect of the diagnosis."""
 
     def lines(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         """Yield (INFO or WARNING, line) for each change since the last call."""
@@ -132,61 +141,64 @@ class CalibrationGuide:
         yield from self._diagnosis(state)
 
     def _streams(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        coming = (
-            set()
-            if state.streams is None
-            else {name for name in state.streams.coming if name in self._inputs}
-        )
-        for name in sorted(coming - self._coming):
+        """Yield lines on streams that begin, and on another kind of stamps."""
+        received = set()
+        if state.streams is not None:
+            received = {name for name in state.streams.coming if name in self._inputs}
+        for name in sorted(received - self._received):
             yield (
                 LOG_INFO,
                 f'{MESSAGE_TYPES[name]} messages are received on {self._inputs[name].source()}',
             )
-        self._coming = coming
+        self._received = received
         line = None if state.streams is None else state.streams.stamping
-        if line is None or line.word == self._stamping:
+        if line is None or line.word == self._logged_stamping:
             return
-        if line.word == COUNTED or (line.word == REGULAR and self._stamping):
-            if self._clock() - self._stamping_at < REMINDER:
+        # Regular stamps at the start, and irregular ones, have no line.
+        if line.word == COUNTED or (line.word == REGULAR and self._logged_stamping):
+            if self._clock() - self._stamping_logged_at < REMINDER:
                 return  # logged later if it lasts
-            self._stamping_at = self._clock()
+            self._stamping_logged_at = self._clock()
             yield LOG_INFO, f'Imu: {line}'
-        self._stamping = line.word
+        self._logged_stamping = line.word
 
     def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        known = f'{state.judged}, every parameter is determined' if state.complete else state.judged
-        if known == self._verdict:
-            return
-        self._verdict = known
+        """Yield a line on other decisions than in the last one."""
+        verdict = state.judged
         if state.complete:
-            yield LOG_INFO, f'{known}; save it with `{self._save_command}`'
-        elif known:
+            verdict += ', every parameter is determined'
+        if verdict == self._logged_verdict:
+            return
+        self._logged_verdict = verdict
+        if state.complete:
+            yield LOG_INFO, f'{verdict}; save it with `{self._save_command}`'
+        elif verdict:
             yield (
                 LOG_WARN if state.verdict == HARMS else LOG_INFO,
-                '; '.join([known, *state.lines[:2]]),
+                '; '.join([verdict, *state.lines[:2]]),
             )
 
     def _next(self, state: WorkerState) -> Iterator[tuple[str, str]]:
+        """Yield a line on another useful motion, not more often than `MIN_ADVICE_SECONDS`."""
         advice = advice_of(state)
-        if (
-            advice
-            and advice != self._advice
-            and not state.complete
-            and self._clock() - self._advised >= MIN_ADVICE_SECONDS
-        ):
-            self._advice, self._advised = advice, self._clock()
+        if not advice or advice == self._logged_advice or state.complete:
+            return
+        if self._clock() - self._advised_at >= MIN_ADVICE_SECONDS:
+            self._logged_advice = advice
+            self._advised_at = self._clock()
             yield LOG_INFO, f'next: {advice}'
 
     def _diagnosis(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        found = state.diagnosis
-        if found is None or found.word in (diagnosis.WAITING, diagnosis.OFF):
+        """Yield a line on another outcome of the diagnosis."""
+        outcome = state.diagnosis
+        if outcome is None or outcome.word in (diagnosis.WAITING, diagnosis.OFF):
             return
-        what = f'{found.word}:{found.values.get("effect", "")}'
-        if what != self._diagnosed:
-            self._diagnosed = what
+        key = f'{outcome.word}:{outcome.values.get("effect", "")}'
+        if key != self._logged_diagnosis:
+            self._logged_diagnosis = key
             yield (
-                LOG_WARN if found.word == diagnosis.FAILED else LOG_INFO,
-                f'diagnosis: {found.message}',
+                LOG_WARN if outcome.word == diagnosis.FAILED else LOG_INFO,
+                f'diagnosis: {outcome.message}',
             )
 
 
@@ -219,10 +231,10 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
 
     `stream_faults` are lines about its topics.
     """
-    found = []
+    statuses = []
     if state.streams is not None:
         level = max(STATUS_LEVELS[state.streams.word], WARN if stream_faults else OK)
-        found.append(
+        statuses.append(
             make_status(
                 level,
                 'streams',
@@ -234,9 +246,11 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
     if state.trouble:
         parts.append(state.trouble)
     parts += state.faults
-    incomplete = WARN if state.verdict and (state.trouble or not state.complete) else OK
-    level = ERROR if state.faults else max(STATUS_LEVELS[state.verdict], incomplete)
-    found.append(
+    is_incomplete = state.verdict and (state.trouble or not state.complete)
+    level = max(STATUS_LEVELS[state.verdict], WARN if is_incomplete else OK)
+    if state.faults:
+        level = ERROR
+    statuses.append(
         make_status(
             level,
             'calibration',
@@ -245,7 +259,7 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
         )
     )
     if state.session is not None:
-        found.append(
+        statuses.append(
             make_status(
                 STATUS_LEVELS[state.session.word],
                 'poses',
@@ -254,7 +268,7 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
             )
         )
     if state.diagnosis is not None:
-        found.append(
+        statuses.append(
             make_status(
                 STATUS_LEVELS[state.diagnosis.word],
                 'diagnosis',
@@ -262,10 +276,11 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
                 values={'outcome': state.diagnosis.word, **state.diagnosis.values},
             )
         )
-    return found + [_group_status(group) for group in state.groups]
+    return statuses + [_group_status(group) for group in state.groups]
 
 
-def _group_status(group: GroupState):
+def _group_status(group: GroupState) -> DiagnosticStatus:
+    """Return the status of the parameters of one effect."""
     text = {
         'determined': 'determined',
         'weak': 'weak',
@@ -281,11 +296,10 @@ def _group_status(group: GroupState):
         f'tolerance [{group.unit}]': group.tolerance,
         f'predicted after that motion [{group.unit}]': group.predicted_sd,
     }
-    values = {
-        'parameter': group.parameter,
-        'needs': group.needs,
-        **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)},
-    }
+    values = {'parameter': group.parameter, 'needs': group.needs}
+    for name, figure in figures.items():
+        if not math.isnan(figure):
+            values[name] = f'{figure:.3g}'
     # Parameters of the reference do not count: they are shown, and need no action.
     level = STATUS_LEVELS[group.status] if group.counts else OK
     return make_status(level, f'{group.sensor} {group.effect}', text, values=values)
@@ -299,22 +313,29 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     from the present up direction to the next one, a ring of the turn between them; blue points:
     earlier up directions; the arms of the three sensitive points; one line of text.
     """
-    made = [Marker(ns='all', action=Marker.DELETEALL)]
-    made += [
-        _marker('cells', k, Marker.SPHERE, color=(*color, 0.9), scale=(size,) * 3, place=place)
-        for k, (place, color, size) in enumerate(sphere_cells(coverage))
-    ]
+    markers = [Marker(ns='all', action=Marker.DELETEALL)]
+
+    # Cells of the sphere, the up directions so far, and arrows.
+    for k, (place, color, size) in enumerate(sphere_cells(coverage)):
+        scale = (size,) * 3
+        markers.append(
+            _marker('cells', k, Marker.SPHERE, color=(*color, 0.9), scale=scale, place=place)
+        )
     seen, color, diameter = seen_of(coverage)
     if len(seen):
-        made.append(
-            _marker('seen', 0, Marker.SPHERE_LIST, color=color, scale=(diameter,) * 3, points=seen)
+        scale = (diameter,) * 3
+        markers.append(
+            _marker('seen', 0, Marker.SPHERE_LIST, color=color, scale=scale, points=seen)
         )
-    made += [_arrow(*each, number=k) for k, each in enumerate(arrows_of(coverage))]
+    for k, arrow in enumerate(arrows_of(coverage)):
+        markers.append(_arrow(*arrow, number=k))
+
+    # The turn to the next rest: in the sensor frame up turns by the negative angle about the axis.
     step = coverage.next
     if step.axis is not None and coverage.up is not None and step.up is not None:
         across = np.cross(step.axis, coverage.up)
         angles = np.linspace(0, step.angle, 24)[:, None]
-        made.append(
+        markers.append(
             _marker(
                 'turn',
                 0,
@@ -325,7 +346,7 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
             )
         )
     place, color, line = label_of(coverage)
-    made.append(
+    markers.append(
         _marker(
             'text',
             0,
@@ -336,7 +357,7 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
             text=line,
         )
     )
-    return _stamped(made, coverage.frame_id, stamp)
+    return _stamped(markers, coverage.frame_id, stamp)
 
 
 def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> MarkerArray:
@@ -363,20 +384,36 @@ def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> 
     )
 
 
-def _stamped(markers, frame_id, stamp):
+def _stamped(markers: list[Marker], frame_id: str, stamp: Time) -> MarkerArray:
+    """Return markers with the same header."""
     for marker in markers:
         marker.header.frame_id, marker.header.stamp = frame_id or 'imu_link', stamp
     return MarkerArray(markers=markers)
 
 
-def _arrow(name, start, end, color, number=0):
+def _arrow(name: str, start: Any, end: Any, color: Any, number: int = 0) -> Marker:
+    """Return the marker of an arrow between two points, each 3 floats."""
     return _marker(
         name, number, Marker.ARROW, color=color, scale=(0.025, 0.05, 0.07), points=(start, end)
     )
 
 
-def _marker(name, number, kind, *, color, scale, place=(0.0, 0.0, 0.0), points=(), text=''):
-    """Return a marker; the fourth number of a colour is its opacity."""
+def _marker(
+    name: str,
+    number: int,
+    kind: int,
+    *,
+    color: Any,
+    scale: Any,
+    place: Any = (0.0, 0.0, 0.0),
+    points: Any = (),
+    text: str = '',
+) -> Marker:
+    """
+    Return a marker of a shape `kind`; namespace and number identify it.
+
+    Colours are 3 floats and optionally the opacity, places and scales 3 floats.
+    """
     red, green, blue, opacity = map(float, (*color, 1.0)[:4])
     x, y, z = map(float, scale)
     return Marker(
@@ -392,6 +429,7 @@ def _marker(name, number, kind, *, color, scale, place=(0.0, 0.0, 0.0), points=(
     )
 
 
-def _point(place):
+def _point(place: Any) -> Point:
+    """Return 3 floats as a message."""
     x, y, z = map(float, place)
     return Point(x=x, y=y, z=z)

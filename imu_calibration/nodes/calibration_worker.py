@@ -52,10 +52,15 @@ class SessionFiles:
 
     def __init__(self, save_file: str):
         self.given = bool(save_file)
+        """Whether the user has named the file."""
         self.calibration = files.user_path(save_file or DEFAULT_FILE)
+        """Path of the calibration."""
         self.saved_at = time.monotonic()
+        """Time of the last save, s of the steady clock."""
         self.n_saved = 0
-        self._own: set[Path] = set()
+        """Windows or poses in the saved accumulator."""
+        self._written: set[Path] = set()
+        """Files of this session, which are replaced; others at their paths are renamed."""
         for path in (self.calibration, self.accumulator):
             files.remove_leftovers(path)
 
@@ -104,8 +109,8 @@ class SessionFiles:
         return files.put_aside(self.accumulator)
 
     def continue_earlier(self) -> None:
-        """Let the files of the earlier session be those of this one."""
-        self._own = {self.calibration, self.accumulator}
+        """Replace the files of the earlier session at the next save, without renaming them."""
+        self._written = {self.calibration, self.accumulator}
 
     def _write(self, path: Path, content: bytes, *, to_disk: bool = True) -> str:
         """
@@ -114,7 +119,7 @@ class SessionFiles:
         Return a text about the renamed file, '' without one; raises as `files.write_whole`.
         """
         aside = None
-        if path not in self._own and os.path.isfile(path):
+        if path not in self._written and os.path.isfile(path):
             aside = files.put_aside(path)
         try:
             files.write_whole(path, content, to_disk)
@@ -122,11 +127,11 @@ class SessionFiles:
             if aside is not None:
                 os.rename(aside, path)
             raise
-        self._own.add(path)
+        self._written.add(path)
         return '' if aside is None else f' (that of an earlier session is now {aside.name})'
 
     def unsaved(self, live: LiveSession) -> int:
-        """Return how many windows or poses of a session are in no file yet."""
+        """Return the number of windows or poses of a session that are in no file yet."""
         return max(live.n_windows - self.n_saved, 0)
 
     def note_saved(self, n_windows: int) -> None:
@@ -144,39 +149,38 @@ class SessionFiles:
             The calibration; None: only the accumulator is saved.
 
         """
-        wanted: list[tuple[Path, Callable[[], bytes]]] = (
-            [] if text is None else [(self.calibration, text.encode)]
-        )
-        done, failed = [], []
-        for path, make in [*wanted, (self.accumulator, lambda: live.saved(pending=True))]:
+        contents: list[tuple[Path, Callable[[], bytes]]] = []
+        if text is not None:
+            contents.append((self.calibration, text.encode))
+        contents.append((self.accumulator, lambda: live.saved(pending=True)))
+
+        written = []
+        failures = []
+        for path, make_content in contents:
             existed = os.path.exists(path)  # False where the path cannot even be
             try:
-                done.append(f'{path}{self._write(path, make())}')
+                written.append(f'{path}{self._write(path, make_content())}')
             except ImuCalibrationError as error:
-                failed.append(
-                    f'{error};'
-                    f' {"the earlier file is unchanged" if existed else "no earlier file existed"}'
-                )
-        if not failed:
+                earlier = 'the earlier file is unchanged' if existed else 'no earlier file existed'
+                failures.append(f'{error}; {earlier}')
+        if not failures:
             self.note_saved(live.n_windows)
-        lines = [f'not written: {line}' for line in failed]
-        if done:
-            lines.insert(0, f'written: {" and ".join(done)}')
-        return not failed, '; '.join(lines)
+        lines = [f'not written: {line}' for line in failures]
+        if written:
+            lines.insert(0, f'written: {" and ".join(written)}')
+        return not failures, '; '.join(lines)
 
     def autosave(self, live: LiveSession, period: float) -> bool:
         """
-        Save the accumulator when that is due; return whether it was.
+        Save the accumulator if there is unsaved data `period` s after the last save; 0: never.
 
-        Raises an InputError when it cannot be written.
+        Return whether it was saved; raises an InputError when it cannot be written.
         """
         if not period or time.monotonic() - self.saved_at < period or not self.unsaved(live):
             return False
-        # Not again at once when it fails.
-        self.saved_at, n_windows = (
-            time.monotonic(),
-            live.n_windows,
-        )
+        # Before the attempt: one that fails is repeated after the period, not at once.
+        self.saved_at = time.monotonic()
+        n_windows = live.n_windows
         self._write(self.accumulator, live.saved(pending=False), to_disk=False)
         self.note_saved(n_windows)
         return True
@@ -190,16 +194,19 @@ class SessionFiles:
         unsaved = self.unsaved(live)
         if not unsaved:
             return ''
-        ends = f'{unsaved} {noun} were in no file'
+        unsaved_text = f'{unsaved} {noun} were in no file'
         if not self.given:
             return (
-                f"{ends} and are lost: call ~/save, or give parameter 'save_file' and they are kept"
+                f"{unsaved_text} and are lost: call ~/save, or give parameter 'save_file' and they"
+                ' are kept'
             )
         try:
             self._write(self.accumulator, live.saved(pending=True))
         except Exception as error:  # the process ends in any case
-            return f'{ends} and are lost: {shortened(str(error), 300)}'
-        return f'{ends}: they are kept in {self.accumulator}; resume:=true continues with them'
+            return f'{unsaved_text} and are lost: {shortened(str(error), 300)}'
+        return (
+            f'{unsaved_text}: they are kept in {self.accumulator}; resume:=true continues with them'
+        )
 
 
 MESSAGE_CHECK_SECONDS = 0.1
@@ -257,18 +264,31 @@ class CalibrationWorker(threading.Thread):
         self._pacer = SolvePacer(live.settings.solve_share)
         self._watch = StreamWatch(live.needs_joints, live.needs_temperature)
         self._diagnosis = DiagnosisThread(self._diagnosis_period)
-        self._diagnosed = 0
-        self._asked: SimpleQueue[tuple[Callable[[], tuple[bool, str]], Future]] = SimpleQueue()
+        self._n_diagnosed = 0
+        """Windows at the last diagnosis."""
+        self._requests: SimpleQueue[tuple[Callable[[], tuple[bool, str]], Future]] = SimpleQueue()
+        """Requested functions, and futures of their (success, message)."""
         self._wake = threading.Event()
+        """Set to begin the next round of steps at once."""
         self._ending = False
-        self._n_solutions, self._new_windows, self._closed = 0, self.live.n_windows > 0, True
-        self.place.note_saved(self.live.n_windows)
-        self._covered: tuple[int, int, int] | None = None
+        """Whether the thread ends after the present round."""
         self._looked = time.monotonic()
+        """Time of the last reading of messages, s of the steady clock."""
+        self._n_solutions = 0
+        """Number of the last solution."""
+        self._new_windows = self.live.n_windows > 0
+        """Whether data came after the last solution."""
+        self._includes_pending = True
+        """Whether no message was added after the last solution with open windows."""
+        self._covered: tuple[int, int, int] | None = None
+        """State of the last picture of the coverage (see `_cover`)."""
         self._trouble = ''
-        self._faults: dict[str, str] = {}
-        self._faults['place'] = self.place.try_place()
+        """Why the last attempt of a solution failed; '' otherwise."""
+        self.place.note_saved(self.live.n_windows)
+        self._faults: dict[str, str] = {'place': self.place.try_place()}
+        """Step, 'solution' or 'place' -> its present fault, '' without one."""
         self.state = WorkerState(groups=self.live.groups())
+        """State for the diagnostics, which another thread reads."""
 
     @property
     def gathered(self) -> str:
@@ -285,27 +305,26 @@ class CalibrationWorker(threading.Thread):
 
         Return the future of its (success, message).
         """
-        answer: Future = Future()
-        self._asked.put((getattr(self, f'_{what}') if isinstance(what, str) else what, answer))
+        response: Future = Future()
+        action = getattr(self, f'_{what}') if isinstance(what, str) else what
+        self._requests.put((action, response))
         self._wake.set()
-        return answer
+        return response
 
     def end(self, timeout: float = 20.0) -> str:
         """
-        Wait for the end of the present step, save unsaved windows, and return a line about them.
+        Wait for the end of the present step, save unsaved windows or poses.
 
-        '' for no unsaved windows.
+        Return a line about them, '' for none.
         """
         self._ending = True
         self._wake.set()
         self._diagnosis.end()
         if self.is_alive():
             self.join(timeout)
-        return (
-            f'a solution was still being made: {self.gathered} since the last save are lost'
-            if self.is_alive()
-            else self.place.keep(self.live, self.gathered)
-        )
+        if self.is_alive():
+            return f'a solution was still being made: {self.gathered} since the last save are lost'
+        return self.place.keep(self.live, self.gathered)
 
     def run(self) -> None:
         """Run the steps until `end`."""
@@ -329,8 +348,8 @@ class CalibrationWorker(threading.Thread):
                     self._survive(step)
             self._survive(self._take)
         finally:
-            while not self._asked.empty():
-                self._asked.get()[1].set_result((False, 'the node is ending'))
+            while not self._requests.empty():
+                self._requests.get()[1].set_result((False, 'the node is ending'))
 
     def _survive(self, step: Callable[[], None]) -> None:
         """Run one step; its error is reported until it succeeds again."""
@@ -348,6 +367,7 @@ class CalibrationWorker(threading.Thread):
             self._faults[name] = ''
 
     def _take(self) -> None:
+        """Add the received messages to the session, and publish the residuals of new windows."""
         # Silence is measured from the last call: messages that arrived during a solution are
         # processed in the next one.
         self._looked = time.monotonic()
@@ -355,7 +375,7 @@ class CalibrationWorker(threading.Thread):
         self._watch.note(block, self._looked)
         windows: Any = self.live.push(block)  # of the kind that the session itself reads
         if block.imu is not None or block.joints is not None:
-            self._closed = False
+            self._includes_pending = False
         if windows:
             self._new_windows = True
             residuals = self.live.residuals(windows)
@@ -363,8 +383,9 @@ class CalibrationWorker(threading.Thread):
                 self.listeners.residuals(residuals)
 
     def _answer(self) -> None:
-        while not self._asked.empty():
-            action, answer = self._asked.get()
+        """Execute the queued requests."""
+        while not self._requests.empty():
+            action, response = self._requests.get()
             try:
                 result = action()
             except ImuCalibrationError as error:
@@ -372,17 +393,20 @@ class CalibrationWorker(threading.Thread):
             except Exception as error:  # every request gets a result
                 result = False, shortened(f'{type(error).__name__}: {error}', 300)
             self._survive(self._tell)  # the requester reads the diagnostics next
-            answer.set_result(result)
+            response.set_result(result)
 
     def _solve_when_due(self) -> None:
-        idle = not self._closed and self._looked - (self._watch.last_arrival or 0.0) > IDLE
+        """Publish a solution of new data, and of open windows once no message arrives."""
+        silence = self._looked - (self._watch.last_arrival or 0.0)
+        idle = not self._includes_pending and silence > IDLE
         if idle:
-            self._closed, self._new_windows = True, True
+            self._includes_pending = True
+            self._new_windows = True
         if not self._new_windows or not self._pacer.due(time.monotonic()):
             return
         self._new_windows = False
         try:
-            self._publish_solution(pending=self._closed)
+            self._publish_solution(pending=self._includes_pending)
             if idle:
                 self._diagnosis.want()
         except ImuCalibrationError as error:
@@ -392,14 +416,18 @@ class CalibrationWorker(threading.Thread):
             )
 
     def _diagnose_when_due(self) -> None:
+        """Start a diagnosis when it is requested, or due with new windows."""
         n_windows = self.live.n_windows
-        self._diagnosis.ask_when_due(lambda: question_about(self.live), n_windows > self._diagnosed)
+        self._diagnosis.ask_when_due(
+            lambda: question_about(self.live), n_windows > self._n_diagnosed
+        )
         if self._diagnosis.is_running:
-            self._diagnosed = max(n_windows, self._diagnosed)
+            self._n_diagnosed = max(n_windows, self._n_diagnosed)
 
     def _adopt_what_was_found(self) -> None:
+        """Publish a solution of the model that the last diagnosis requires, if it is new."""
         if self._adopt():
-            self._publish_solution(pending=self._closed)
+            self._publish_solution(pending=self._includes_pending)
 
     def _adopt(self) -> bool:
         """Apply the last result of the diagnosis to the model; return whether the model changes."""
@@ -410,7 +438,7 @@ class CalibrationWorker(threading.Thread):
         """
         Publish the solution of all messages with the model that the diagnosis requires.
 
-        The result of `calibrate` for these messages.
+        Return (result, text of its document), equal to those of `calibrate` for these messages.
         """
         published = self._publish_solution(pending=True)
         if not self._diagnosis_period:
@@ -419,6 +447,7 @@ class CalibrationWorker(threading.Thread):
         return self._publish_solution(pending=True) if self._adopt() else published
 
     def _publish_solution(self, pending: bool) -> tuple[CalibrationResult, str]:
+        """Solve, with open windows if `pending`; return (result, text of its document)."""
         start = time.monotonic()
         result = self.live.solve(
             pending, self._provenance | {'mode': 'live', 'solution': self._n_solutions + 1}
@@ -426,7 +455,7 @@ class CalibrationWorker(threading.Thread):
         self._n_solutions += 1
         self._trouble = ''
         self._new_windows = False
-        self._closed = pending
+        self._includes_pending = pending
         self._faults['solution'] = ''
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
@@ -435,64 +464,54 @@ class CalibrationWorker(threading.Thread):
         return result, text
 
     def _solve(self) -> tuple[bool, str]:
+        """Publish a solution on request; return (success, message)."""
         result, _ = self._publish_solution(pending=True)
         self._diagnosis.want()
-        return True, '; '.join(
-            [
-                f'{result.verdict.text} ({self.live.n_windows} {self.gathered})',
-                *summary(result, self.hints),
-            ]
-        )
+        verdict = f'{result.verdict.text} ({self.live.n_windows} {self.gathered})'
+        return True, '; '.join([verdict, *summary(result, self.hints)])
 
     def _diagnose(self) -> tuple[bool, str]:
+        """Publish a solution and request its diagnosis; return (success, message)."""
         if not self._diagnosis_period:
-            return (
-                False,
-                (
-                    "a diagnosis is not available by hand, and not if parameter 'diagnosis_period'"
-                    ' is 0'
-                ),
+            return False, (
+                "a diagnosis is not available by hand, and not if parameter 'diagnosis_period' is 0"
             )
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
-        return (
-            True,
-            (
-                f'diagnosis of {self.live.n_windows} windows started; its result is published on'
-                ' /diagnostics and in the calibration'
-            ),
+        return True, (
+            f'diagnosis of {self.live.n_windows} windows started; its result is published on'
+            ' /diagnostics and in the calibration'
         )
 
     def _save(self) -> tuple[bool, str]:
-        text, what = None, ''
+        """Save the calibration and the accumulator; return (success of both, message)."""
+        text = None
         try:
             result, text = self._settled_solution()
-            what = (
-                f'{result.verdict.text}:'
-                f' {missing(result.calibration) or "every parameter is determined"}'
-            )
+            shortage = missing(result.calibration) or 'every parameter is determined'
+            outcome = f'{result.verdict.text}: {shortage}'
         except ImuCalibrationError as error:
-            what = f'no calibration yet: {error.with_hint(self.hints)}'
+            outcome = f'no calibration yet: {error.with_hint(self.hints)}'
         if text is None and not self.live.n_windows:
-            return False, f'{what}; no file was written'
-        whole, written = self.place.save(self.live, text)
-        self._faults['place'] = '' if whole else written
-        return whole and text is not None, f'{what}; {written}'
+            return False, f'{outcome}; no file was written'
+        is_saved, written = self.place.save(self.live, text)
+        self._faults['place'] = '' if is_saved else written
+        return is_saved and text is not None, f'{outcome}; {written}'
 
     def _reset(self) -> tuple[bool, str]:
-        lost = self.place.unsaved(self.live)
+        """Begin a new session; return (success, message)."""
+        n_lost = self.place.unsaved(self.live)
         self.live = self.make_live()
         self._new_windows = False
-        self._closed = True
-        self._diagnosed = 0
+        self._includes_pending = True
+        self._n_diagnosed = 0
         self.place.note_saved(0)
         self._trouble = ''
         self._diagnosis.forget()
-        return (
-            True,
-            (f'restarted, {lost} unsaved {self.gathered} were deleted; ' if lost else 'restarted; ')
-            + 'the last calibration remains published until the next one',
-        )
+        message = 'restarted; '
+        if n_lost:
+            message = f'restarted, {n_lost} unsaved {self.gathered} were deleted; '
+        return True, message + 'the last calibration remains published until the next one'
 
     def change(
         self, settings: LiveSettings | WindowSettings | LiveByHandSettings
@@ -506,10 +525,12 @@ class CalibrationWorker(threading.Thread):
         return True, ''
 
     def _autosave(self) -> None:
+        """Save the accumulator when that is due."""
         if self.place.autosave(self.live, self.autosave_period):
             self._faults['place'] = ''
 
     def _tell(self) -> None:
+        """Replace `state` by the present one."""
         counts = self.live.counts
         self._watch.note_counts(counts, self._looked)
         result = self.live.result
@@ -535,51 +556,41 @@ class CalibrationWorker(threading.Thread):
         if result is not None:
             values |= parameter_count(result.calibration).figures
         if self.live.needs_linearising:
-            lines = [
-                *lines,
-                (
-                    'an effect is outside the range of its linearisation and the stored windows are'
-                    ' no longer available: calibrate the recording offline'
-                ),
-            ]
-        stale = (
-            self.state.solution != self._n_solutions or self.state.groups == [] or result is None
-        )
-        groups = self.live.groups() if stale else self.state.groups
-        found = self._diagnosis.state
-        diagnosis = self.live.diagnosed(
-            replace(
-                found,
-                values={
-                    **found.values,
-                    'diagnoses': self._diagnosis.n_answers,
-                    'being made': self._diagnosis.is_running,
-                },
+            lines.append(
+                'an effect is outside the range of its linearisation and the stored windows are'
+                ' no longer available: calibrate the recording offline'
             )
-        )
+        # With a solution the groups change only with the next one; computing them is slow.
+        groups = self.state.groups
+        if self.state.solution != self._n_solutions or not groups or result is None:
+            groups = self.live.groups()
+        diagnosis = self._diagnosis.state
+        progress = {
+            'diagnoses': self._diagnosis.n_answers,
+            'being made': self._diagnosis.is_running,
+        }
         self.state = WorkerState(
-            groups,
-            self._watch.state(self._looked, self.live.stamping),
-            self._n_solutions,
-            verdict,
-            tuple(lines),
-            self._trouble,
-            tuple(line for line in self._faults.values() if line),
-            self.live.n_windows,
-            values,
-            self.live.status(self.hints),
-            diagnosis,
-            judged,
-            complete,
+            groups=groups,
+            streams=self._watch.state(self._looked, self.live.stamping),
+            solution=self._n_solutions,
+            verdict=verdict,
+            lines=tuple(lines),
+            trouble=self._trouble,
+            faults=tuple(line for line in self._faults.values() if line),
+            gathered=self.live.n_windows,
+            values=values,
+            session=self.live.status(self.hints),
+            diagnosis=self.live.diagnosed(
+                replace(diagnosis, values={**diagnosis.values, **progress})
+            ),
+            judged=judged,
+            complete=complete,
         )
 
     def _cover(self) -> None:
         """Update the picture of the coverage after a change."""
-        seen = (
-            id(self.live),
-            self.live.n_covered,
-            self._n_solutions,
-        )
-        if seen != self._covered:
-            self._covered = seen
+        # Session, rests and solution, on which the picture depends.
+        present = (id(self.live), self.live.n_covered, self._n_solutions)
+        if present != self._covered:
+            self._covered = present
             self.listeners.coverage(self.live.coverage())

@@ -51,8 +51,8 @@ def test_what_came_while_a_solution_was_made_is_no_silence(station):
     worker._tell()
     found = worker.live.result.calibration.provenance
     assert (found['serial'], found['mode'], found['solution']) == ('A-17', 'live', 1)
-    assert worker.state.streams.silent == () and not worker._closed
+    assert worker.state.streams.silent == () and not worker._includes_pending
     worker._take()  # and now nothing has come
     worker._solve_when_due()
     worker._tell()
-    assert worker.state.streams.silent == ('imu', 'joints') and worker._closed
+    assert worker.state.streams.silent == ('imu', 'joints') and worker._includes_pending
