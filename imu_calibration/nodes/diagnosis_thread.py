@@ -62,9 +62,7 @@ class Listeners:
 
 MAX_DIAGNOSIS_SHARE = 0.2
 """Largest share of the time for diagnoses."""
-
-
-OFF_WHY = "parameter 'diagnosis_period' is 0"
+OFF_REASON = "parameter 'diagnosis_period' is 0"
 
 
 class DiagnosisThread:
@@ -82,24 +80,32 @@ class DiagnosisThread:
         self.period = period
         self._pacer = SolvePacer(MAX_DIAGNOSIS_SHARE)
         self._ending = False
+        """Whether the node ends, and with it a running diagnosis."""
         self._thread: threading.Thread | None = None
-        self._next = time.monotonic() + period
-        self._wanted = False
-        self._urgent = False
-        self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
-        self.n_answers, self._session = 0, 0
-        self._answered: dict | None = (
-            # Numbers of samples of the last question; the question itself keeps all windows in
-            # memory
-            None
-        )
+        """Thread of the last diagnosis."""
+        self._next_at = time.monotonic() + period
+        """Time of the next diagnosis without a request, s of the steady clock."""
+        self._is_requested = False
+        """Whether a diagnosis is requested as soon as `MAX_DIAGNOSIS_SHARE` allows."""
+        self._is_urgent = False
+        """Whether it is requested at once."""
+        self.state = NOT_YET if period else LiveState(OFF, OFF_REASON)
+        """Outcome of the last diagnosis."""
+        self.n_answers = 0
+        """Number of completed diagnoses."""
+        self._session = 0
+        """Number of the session; the result for an earlier one is discarded."""
+        self._diagnosed_samples: dict | None = None
+        """Numbers of samples of the last question, which itself keeps all windows in memory."""
         self._extension: ModelExtension | None = None
+        """Change of the model that the last diagnosis requires; None after `take_extension`."""
 
     def change(self, period: float) -> None:
         """Use another period; 0: no more diagnoses."""
         if bool(period) != bool(self.period):
-            self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
-        self.period, self._next = period, time.monotonic() + period
+            self.state = NOT_YET if period else LiveState(OFF, OFF_REASON)
+        self.period = period
+        self._next_at = time.monotonic() + period
 
     @property
     def is_running(self) -> bool:
@@ -112,14 +118,15 @@ class DiagnosisThread:
 
         At once when it is urgent.
         """
-        self._wanted, self._urgent = bool(self.period), urgent and bool(self.period)
+        self._is_requested = bool(self.period)
+        self._is_urgent = urgent and bool(self.period)
 
     def forget(self) -> None:
         """Discard all results: the session is restarted."""
         self.state = NOT_YET if self.period else self.state
-        self._wanted = False
-        self._urgent = False
-        self._answered = self._extension = None
+        self._is_requested = False
+        self._is_urgent = False
+        self._diagnosed_samples = self._extension = None
         self._session += 1
 
     def ask_when_due(
@@ -131,24 +138,23 @@ class DiagnosisThread:
         It is due when it is requested, or when the period is over and there is news.
         """
         now = time.monotonic()
-        due = self._urgent or (
-            (self._wanted or (bool(self.period) and is_news and now >= self._next))
-            and self._pacer.due(now)
-        )
-        if not due or self.is_running or self._ending:
+        is_periodic = bool(self.period) and is_news and now >= self._next_at
+        is_due = (self._is_requested or is_periodic) and self._pacer.due(now)
+        if not (is_due or self._is_urgent) or self.is_running or self._ending:
             return
         question = make_question()
         if question is None:
             return
-        self._wanted = self._urgent = False
+        self._is_requested = self._is_urgent = False
         self._thread = threading.Thread(
             target=self._answer, args=(question, now, self._session), name='diagnosis', daemon=True
         )
         self._thread.start()
 
-    def _answer(self, question, start, session):
+    def _answer(self, question: DiagnosisQuestion, start: float, session: int) -> None:
+        """Diagnose, in its own thread; the result of another session is discarded."""
         try:
-            with listening(lambda phase, done, total: self._go_on(session, phase)):
+            with listening(lambda phase, done, total: self._check_needed(session, phase)):
                 answer = question.answer()
         except _Ended:
             return
@@ -157,38 +163,40 @@ class DiagnosisThread:
                 LiveState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}')
             )
         if session == self._session:
-            self.state, self._extension = answer.state, answer.extension
-            self._answered, self.n_answers = question.samples, self.n_answers + 1
+            self.state = answer.state
+            self._extension = answer.extension
+            self._diagnosed_samples = question.samples
+            self.n_answers += 1
         del answer
         return_freed_memory()
         end = time.monotonic()
-        self._next = end + self.period
+        self._next_at = end + self.period
         self._pacer.note(start, end)
 
     def take_extension(self) -> ModelExtension | None:
         """Return the change of the model that the last diagnosis requires, once."""
-        extension, self._extension = self._extension, None
+        extension = self._extension
+        self._extension = None
         return extension
 
     def settle(self, question: DiagnosisQuestion | None) -> None:
-        """
-        Run a diagnosis and wait for it.
-
-        One of the same windows that was completed already is not repeated.
-        """
+        """Run a diagnosis and wait for it, unless the last one was of the same samples."""
         self._join()
-        if question is not None and self.period and question.samples != self._answered:
-            self._urgent = True
+        if question is not None and self.period and question.samples != self._diagnosed_samples:
+            self._is_urgent = True
             self.ask_when_due(lambda: question, True)
             self._join()
 
-    def _join(self, timeout=None):
+    def _join(self, timeout: float | None = None) -> None:
+        """Wait for the end of the running diagnosis."""
         if self._thread is not None:
             self._thread.join(timeout)
 
-    def _go_on(self, session, phase):
+    def _check_needed(self, session: int, phase: str) -> None:
         """
-        End a diagnosis that nobody waits for; otherwise return the memory that its last step freed.
+        End the diagnosis of an earlier session, or at the end of the node, by an exception.
+
+        Otherwise return to the system the memory that its last step freed.
         """
         if self._ending or session != self._session:
             raise _Ended
