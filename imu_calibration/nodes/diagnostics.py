@@ -133,9 +133,12 @@ class Complaints:
     """
 
     def __init__(self, logger: Any, clock: Callable[[], float] = time.monotonic):
-        self._logger, self._clock = logger, clock
-        self._said: dict[str, float] = {}
+        self._logger = logger
+        self._clock = clock
+        self._logged_at: dict[str, float] = {}
+        """Kind of a line -> time of the last one, s, the oldest first."""
         self._open: dict[str, str] = {}
+        """Kind of a present fault -> its last line."""
 
     def now(
         self,
@@ -149,17 +152,17 @@ class Complaints:
         """
         Log the present faults of `source` and the end of earlier ones.
 
-        An ended one is repeated after `patience` seconds at least. With `replaces` the lines of the
-        source are states of one fault, which ends when there is no line.
+        A fault that returns after its end is logged `patience` seconds after its last line at the
+        earliest. With `replaces` the lines of the source are states of one fault, which ends when
+        there is no line.
         """
         present = {kind_of(source, line): (LOG_WARN, line) for line in warnings}
         present |= {kind_of(source, line): (LOG_ERROR, line) for line in errors}
-        for kind in [
-            kind for kind in self._open if kind.startswith(source + ':') and kind not in present
-        ]:
-            ended = self._open.pop(kind)
-            if not (replaces and present):
-                say(self._logger, LOG_INFO, f'no longer: {ended}')
+        for kind in list(self._open):
+            if kind.startswith(source + ':') and kind not in present:
+                ended = self._open.pop(kind)
+                if not (replaces and present):
+                    say(self._logger, LOG_INFO, f'no longer: {ended}')
         for kind, (level, line) in present.items():
             if self._due(kind, REMINDER if kind in self._open else patience):
                 say(self._logger, level, line)
@@ -171,13 +174,14 @@ class Complaints:
             say(self._logger, level, line)
 
     def _due(self, kind: str, pause: float) -> bool:
+        """Return whether the last line of a kind is `pause` s ago; record a new one if it is."""
         now = self._clock()
-        if now - self._said.get(kind, float('-inf')) < pause:
+        if now - self._logged_at.get(kind, float('-inf')) < pause:
             return False
-        self._said.pop(kind, None)
-        self._said[kind] = now
-        while len(self._said) > MOST_KINDS:
-            del self._said[next(iter(self._said))]
+        self._logged_at.pop(kind, None)  # so that it becomes the newest entry
+        self._logged_at[kind] = now
+        while len(self._logged_at) > MOST_KINDS:
+            del self._logged_at[next(iter(self._logged_at))]
         return True
 
 

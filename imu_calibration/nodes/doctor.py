@@ -6,8 +6,7 @@ covariances.
 """
 
 import time
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -66,7 +65,7 @@ class StreamFindings:
 
 def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     """
-    Record every Imu topic for some seconds and return the findings by name.
+    Record every Imu topic for some seconds and return the findings of each, in order of name.
 
     Parameters
     ----------
@@ -84,7 +83,7 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     streams = [_Stream(node, name) for name in topics]
     _spin(node, spin_once, 0.2)
     for stream in streams:
-        stream.ask_for_what_is_offered()
+        stream.match_offered_qos()
     for _ in range(RETRIES):
         _spin(node, spin_once, LISTEN_SECONDS)
         if all(stream.count >= ENOUGH_MESSAGES for stream in streams):
@@ -92,39 +91,48 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     return [stream.findings() for stream in streams]
 
 
-def _imu_topics(node):
+def _imu_topics(node: Node) -> list[str]:
     """Return the published topics with Imu messages, or with names of Imu topics."""
-    found = []
+    topics = []
     for name, types in sorted(node.get_topic_names_and_types()):
-        if (
-            (TYPE in types or name.endswith(IMU_TOPIC_ENDINGS))
-            and not name.endswith(NOT_MEASURED)
-            and node.count_publishers(name)
-        ):
-            found.append(name)
-    return found
+        # A name by convention with another type is a fault to report.
+        may_be_imu = TYPE in types or name.endswith(IMU_TOPIC_ENDINGS)
+        if may_be_imu and not name.endswith(NOT_MEASURED) and node.count_publishers(name):
+            topics.append(name)
+    return topics
 
 
-def _spin(node, spin_once, seconds):
+def _spin(node: Node, spin_once: Any, seconds: float) -> None:
+    """Spin a node for some seconds."""
     end = time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0:
-        spin_once(node, timeout_sec=left)
+    while True:
+        remaining = end - time.monotonic()
+        if remaining <= 0:
+            break
+        spin_once(node, timeout_sec=remaining)
 
 
 class _Stream:
-    """One topic that is listened to."""
+    """One subscribed topic, with the messages that were received."""
 
-    def __init__(self, node, topic):
-        self.node, self.topic = node, topic
+    def __init__(self, node: Node, topic: str):
+        self.node = node
+        self.topic = topic
         self._begin()
-        # Otherwise stamps are in simulated time.
         self.by_wall_clock = not node.count_publishers('/clock')
+        """Whether stamps can be compared with the time of reception: not in simulated time."""
         self.input = BatchInput(node, Imu, topic, add=self._add)
 
-    def _begin(self):
-        self.heads, self.gatherer, self.count = ImuHeads(), LiveGatherer(), 0
+    def _begin(self) -> None:
+        """Begin a new recording."""
+        self.heads = ImuHeads()
+        """Frames, covariances and delays of the messages."""
+        self.gatherer = LiveGatherer()
+        """Samples of the messages."""
+        self.count = 0
+        """Number of messages."""
 
-    def ask_for_what_is_offered(self):
+    def match_offered_qos(self) -> None:
         """
         Subscribe with the QoS of the publishers.
 
@@ -133,25 +141,28 @@ class _Stream:
         self.input.look()
         self._begin()
 
-    def _add(self, data, sent_ns):
+    def _add(self, data: bytes, sent_ns: int) -> None:
+        """Record a message."""
         self.heads.add(data, time.time_ns() if self.by_wall_clock else 0)
         self.gatherer.add_imu(data, sent_ns)
         self.count += 1
 
-    def findings(self):
-        """Return the StreamFindings."""
+    def findings(self) -> StreamFindings:
+        """Return the findings of the recorded messages, publishers and subscribers."""
         self.input.look()
         preflight = Preflight(strict=False)
-        deque(BlockCleaner(watchers=[preflight]).all_of([self.gatherer.flush()]), maxlen=0)
-        found = (
+        for _ in BlockCleaner(watchers=[preflight]).all_of([self.gatherer.flush()]):
+            pass  # the preflight reads the blocks on the way
+        findings = (
             *self._publishers(),
             *self._listeners(),
             *check_messages(self.heads.evidence()),
             *preflight.findings,
         )
-        return StreamFindings(self.topic, self.input.source(), found)
+        return StreamFindings(self.topic, self.input.source(), findings)
 
-    def _publishers(self):
+    def _publishers(self) -> Iterator[CheckFinding]:
+        """Yield faults of the publishers: another type, several of them, silence."""
         for other in self.input.others:
             yield CheckFinding(
                 'type',
@@ -175,13 +186,16 @@ class _Stream:
                 ' driver',
             )
 
-    def _listeners(self):
-        wrong = 0
+    def _listeners(self) -> Iterator[CheckFinding]:
+        """Yield subscribers that no publisher can serve, or without one the offered QoS."""
+        n_unserved = 0
         for listener in self.node.get_subscriptions_info_by_topic(self.topic):
             for publisher in self.input.publishers:
-                answer, why = qos_check_compatible(publisher.qos_profile, listener.qos_profile)
-                if answer == QoSCompatibility.ERROR:
-                    wrong += 1
+                compatibility, why = qos_check_compatible(
+                    publisher.qos_profile, listener.qos_profile
+                )
+                if compatibility == QoSCompatibility.ERROR:
+                    n_unserved += 1
                     yield CheckFinding(
                         'qos',
                         REFUSE,
@@ -189,7 +203,7 @@ class _Stream:
                         f' receives nothing from {publisher.node_name}:'
                         f' {why.partition(": ")[2].rstrip(";") or why}',
                     )
-        if self.input.publishers and not wrong:
+        if self.input.publishers and not n_unserved:
             reliable = (
                 'reliable'
                 if self.input.reliable
@@ -225,8 +239,8 @@ class ImuCheck(DoctorCheck):
         for stream in _streams():
             for finding in stream.findings:
                 if finding.severity in kinds:
-                    tell, count = kinds[finding.severity]
-                    tell(f'{stream.topic}: {finding.check.replace("_", " ")}: {finding.text}')
+                    print_line, count = kinds[finding.severity]
+                    print_line(f'{stream.topic}: {finding.check.replace("_", " ")}: {finding.text}')
                     count()
         return result
 

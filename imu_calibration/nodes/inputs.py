@@ -25,7 +25,7 @@ def input_qos(reliable: bool = False, depth: int = QUEUE_DEPTH) -> QoSProfile:
     """
     Return the profile of an input (`inputs.MatchedInput`).
 
-    `reliable` repeats lost messages, best effort accepts any publisher.
+    With `reliable` lost messages are repeated; without it any publisher can connect.
     """
     return QoSProfile(
         depth=depth,
@@ -35,9 +35,7 @@ def input_qos(reliable: bool = False, depth: int = QUEUE_DEPTH) -> QoSProfile:
 
 def output_qos(depth: int = QUEUE_DEPTH) -> QoSProfile:
     """
-    Return the profile of an output.
-
-    That of rclpy, which is reliable, so that every subscriber connects.
+    Return the profile of an output: the default of rclpy is reliable, so that all can subscribe.
     """
     return QoSProfile(depth=depth)
 
@@ -129,8 +127,13 @@ class MatchedInput:
             message_type.__module__.partition('.')[0], message_type.__name__
         )
         self._several_since: float | None = None
+        """Time since which several publishers send, s of the steady clock; None: at most one."""
         self.publishers: list[Any] = []
+        """Publishers of the topic (TopicEndpointInfo) at the last `look`."""
+        self.others: list[Any] = []
+        """Publishers of another type on the topic."""
         self.reliable = True
+        """Whether the subscription requests reliability."""
         self.subscription = self._subscribe()
 
     @property
@@ -139,6 +142,7 @@ class MatchedInput:
         return self.subscription.topic_name
 
     def _subscribe(self) -> Subscription:
+        """Return a new subscription with the present reliability."""
         # With its default callbacks rclpy warns of every publisher that offers less than requested,
         # before we request less.
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -155,23 +159,30 @@ class MatchedInput:
 
     def look(self) -> None:
         """Record the publishers, and subscribe again when they require another reliability."""
-        several = self.mixed
-        known = self.node.get_publishers_info_by_topic(self.topic_name)
-        self.publishers = [found for found in known if found.topic_type == self.type_name]
-        self.others = [found for found in known if found.topic_type != self.type_name]
+        was_mixed = self.mixed
+        self.publishers = []
+        self.others = []
+        for publisher in self.node.get_publishers_info_by_topic(self.topic_name):
+            if publisher.topic_type == self.type_name:
+                self.publishers.append(publisher)
+            else:
+                self.others.append(publisher)
         reliable = self._latched or all(
-            found.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT
-            for found in self.publishers
+            publisher.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT
+            for publisher in self.publishers
         )
-        # The last message of the one that remains.
-        if reliable != self.reliable or (self._latched and several and not self.mixed):
-            before, self.reliable = self.subscription, reliable
+        # A new subscription to a latched topic receives the last message of the publisher that
+        # remains.
+        needs_last_message = self._latched and was_mixed and not self.mixed
+        if reliable != self.reliable or needs_last_message:
+            old_subscription = self.subscription
+            self.reliable = reliable
             self.subscription = self._subscribe()
-            self.node.destroy_subscription(before)
-        self._several_since = (self._several_since or time.monotonic()) if self.mixed else None
-
-    others: list = []
-    """Publishers of another type on the topic."""
+            self.node.destroy_subscription(old_subscription)
+        if not self.mixed:
+            self._several_since = None
+        elif self._several_since is None:
+            self._several_since = time.monotonic()
 
     @property
     def mixed(self) -> bool:
@@ -180,17 +191,15 @@ class MatchedInput:
 
     def names(self) -> list[str]:
         """Return the full names of the nodes that publish."""
-        return [node_of(found) for found in self.publishers]
+        return [node_of(publisher) for publisher in self.publishers]
 
     def faults(self) -> list[str]:
         """Return the faults of the topic, a line each."""
+        if not self.single or self._several_since is None:
+            return []
         names = self.names()
         patience = DEAD_AFTER if len(set(names)) == 1 else SEVERAL_AFTER
-        if (
-            not self.single
-            or self._several_since is None
-            or time.monotonic() - self._several_since < patience
-        ):
+        if time.monotonic() - self._several_since < patience:
             return []
         return [
             f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): their'
@@ -225,17 +234,17 @@ class MatchedInput:
         return f'{what}: {self._elsewhere()}'
 
     def _elsewhere(self) -> str:
-        """Return which other topics of the type a driver publishes."""
-        there = sorted(
+        """Return a text that names other topics of the type, the most similar name first."""
+        topics = sorted(
             name
             for name in self._topics_of_sources()
             if name != self.topic_name and not name.endswith(NOT_RAW)
         )
-        if not there:
+        if not topics:
             return 'no other node publishes that type; see that the driver runs'
-        near = get_close_matches(self.topic_name, there, MAX_NAMED_TOPICS, 0.0)
-        more = f' (or {", ".join(near[1:])})' if near[1:] else ''
-        return f'there is {near[0]}{more}; listen to it with -r {self.topic}:={near[0]}'
+        nearest, *further = get_close_matches(self.topic_name, topics, MAX_NAMED_TOPICS, 0.0)
+        further_text = f' (or {", ".join(further)})' if further else ''
+        return f'there is {nearest}{further_text}; listen to it with -r {self.topic}:={nearest}'
 
     def _topics_of_sources(self) -> set[str]:
         """
@@ -243,7 +252,7 @@ class MatchedInput:
 
         By node: a search by topic applies the remappings of this node to the name of the topic.
         """
-        found: set[str] = set()
+        sources: set[str] = set()
         for name, space in self.node.get_node_names_and_namespaces():
             full_name = f'{space.rstrip("/")}/{name}'
             if full_name == self.node.get_fully_qualified_name():
@@ -258,24 +267,22 @@ class MatchedInput:
                 continue
             for topic, types in topics:
                 if self.type_name in types:
-                    found.add(topic)
-        return found
+                    sources.add(topic)
+        return sources
 
 
 class BatchInput(MatchedInput):
     """
-    An input with a callback that passes on all waiting messages at once.
+    An input whose callback passes on all waiting messages at once.
 
-    This is efficient for thousands of messages per second.
-
-    The public executor calls it for the first one; the following ones are read through the
-    subscription's handle. Where rclpy has no such handle every message has its own call, which is
-    slower with the same result.
+    This is efficient for thousands of messages per second: the public executor calls it for the
+    first message, and the following ones are read through the subscription's handle. Where rclpy
+    has no such handle every message has its own call, which is slower with the same result.
 
     Parameters
     ----------
     add : callable
-        Called with each serialized message (bytes) and when it was sent, ns.
+        Called with each serialized message (bytes) and its time of sending, ns.
 
     """
 
@@ -292,6 +299,7 @@ class BatchInput(MatchedInput):
         super().__init__(node, message_type, topic, callback=self._arrived, **options)
 
     def _arrived(self, message: bytes, information: dict) -> None:
+        """Pass on a message and the ones that wait after it."""
         self._add(message, sent_ns(information))
         if self.drain():
             time.sleep(NAP)
@@ -301,17 +309,16 @@ class BatchInput(MatchedInput):
         take = getattr(getattr(self.subscription, 'handle', None), 'take_message', None)
         if take is None:
             return False
-        while (taken := take(self.message_type, True)) is not None:
-            self._add(taken[0], sent_ns(taken[1]))
-        return True
+        while True:
+            taken = take(self.message_type, True)
+            if taken is None:
+                return True
+            message, information = taken
+            self._add(message, sent_ns(information))
 
 
 def sent_ns(information: dict) -> int:
-    """
-    Return the time of sending of a message, ns.
-
-    The time of reception where the middleware has none.
-    """
+    """Return the time of sending of a message, ns, or of reception if the middleware has none."""
     return information['source_timestamp'] or information['received_timestamp']
 
 
@@ -319,7 +326,7 @@ def watch_inputs(node: Node, inputs: list[MatchedInput]) -> None:
     """Check the publishers of the inputs periodically, by the steady clock."""
 
     def look() -> None:
-        for each in inputs:
-            each.look()
+        for source in inputs:
+            source.look()
 
     every(node, PUBLISHER_CHECK_SECONDS, look)

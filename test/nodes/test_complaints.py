@@ -79,7 +79,7 @@ def test_memory_stays_bounded_whatever_is_wrong(now):
     complaints = Complaints(Heard(), lambda: now[0])
     for number in range(3 * MOST_KINDS):
         complaints.event(f'trouble {chr(65 + number % 26)}{"x" * number}')
-    assert len(complaints._said) <= MOST_KINDS
+    assert len(complaints._logged_at) <= MOST_KINDS
 
 
 def test_figures_that_are_not_known_are_left_out_and_no_status_is_stale():
