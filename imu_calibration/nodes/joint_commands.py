@@ -44,7 +44,9 @@ class TopicCommand:
         self._publisher = node.create_publisher(
             JointTrajectory, 'joint_trajectory', output_qos(COMMAND_DEPTH)
         )
-        self.name = self.topic_name = self._publisher.topic_name
+        self.topic_name = self._publisher.topic_name
+        self.name = self.topic_name
+        """Interface by which the node moves the joints, readable."""
         self.action_name = f'{self.topic_name.rpartition("/")[0]}/follow_joint_trajectory'
         """Action of the same controller, by the convention of ros2_control."""
         self.goals: set[bytes] = set()
@@ -91,9 +93,13 @@ class ActionCommand:
         self._action = action_type
         self._client = client
         self._refused = refused
-        self._handle: Any = None
-        self._number = 0
-        self.name = self.action_name = 'follow_joint_trajectory'
+        self._goal_handle: Any = None
+        """Handle of the accepted goal that is executed; None without one."""
+        self._n_commands = 0
+        """Number of goals and stops; a response to an earlier one is obsolete."""
+        self.action_name = 'follow_joint_trajectory'
+        self.name = self.action_name
+        """Interface by which the node moves the joints, readable."""
         self.topic_name = self._topic.name
         self.goals: set[bytes] = set()
         """Identifiers of the goals of this node."""
@@ -107,13 +113,13 @@ class ActionCommand:
         """Send a trajectory as a goal."""
         from rclpy.serialization import deserialize_message
 
-        self._number += 1
-        number = self._number
+        self._n_commands += 1
+        number = self._n_commands
         goal = self._action.Goal(
             trajectory=deserialize_message(encode_trajectory(points), JointTrajectory)
         )
         self._client.send_goal_async(goal).add_done_callback(
-            self._guarded(lambda future: self._answered(number, future.result()))
+            self._guarded(lambda future: self._on_goal_response(number, future.result()))
         )
 
     def stop(self, joint_names: tuple[str, ...]) -> None:
@@ -122,24 +128,26 @@ class ActionCommand:
 
         The first to arrive stops the joints.
         """
-        self._number += 1  # the result of the goal is not reported any more
-        handle, self._handle = self._handle, None
+        self._n_commands += 1  # the result of the goal is not reported any more
+        handle = self._goal_handle
+        self._goal_handle = None
         self._topic.stop(joint_names)
         if handle is not None:
             handle.cancel_goal_async()
 
-    def _answered(self, number: int, handle: Any) -> None:
+    def _on_goal_response(self, number: int, handle: Any) -> None:
+        """Process the server's response to the goal of command `number`."""
         self.goals.add(bytes(handle.goal_id.uuid))
-        if number != self._number:  # stopped before the server's response
+        if number != self._n_commands:  # stopped before the server's response
             if handle.accepted:
                 handle.cancel_goal_async()
             return
         if not handle.accepted:
             self._refused('it refused the goal')
             return
-        self._handle = handle
+        self._goal_handle = handle
         handle.get_result_async().add_done_callback(
-            self._guarded(lambda future: self._ended(number, future.result().result))
+            self._guarded(lambda future: self._on_result(number, future.result().result))
         )
 
     def _guarded(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -150,10 +158,11 @@ class ActionCommand:
         """
         return guarded(callback, lambda error: self._refused(f'{type(error).__name__}: {error}'))
 
-    def _ended(self, number: int, result: Any) -> None:
-        if number != self._number:
+    def _on_result(self, number: int, result: Any) -> None:
+        """Report the result of the goal of command `number` unless it is a success."""
+        if number != self._n_commands:
             return
-        self._handle = None
+        self._goal_handle = None
         if result.error_code != 0:
             text = getattr(result, 'error_string', '')
             self._refused(
@@ -211,8 +220,10 @@ class OtherDrivers:
     """
 
     def __init__(self, node: Node, command: TopicCommand | ActionCommand):
-        self._node, self._command = node, command
+        self._node = node
+        self._command = command
         self._active: set[bytes] = set()
+        """Goals of all clients that the controller had accepted at its last status."""
         self._status = node.create_subscription(
             GoalStatusArray,
             f'{command.action_name}/_action/status',
@@ -221,23 +232,24 @@ class OtherDrivers:
         )
 
     def _take(self, message: Any) -> None:
+        """Record the active goals of a GoalStatusArray."""
         self._active = {
-            bytes(each.goal_info.goal_id.uuid)
-            for each in message.status_list
-            if each.status in _ACTIVE
+            bytes(goal.goal_info.goal_id.uuid)
+            for goal in message.status_list
+            if goal.status in _ACTIVE
         }
 
     def found(self) -> str:
         """Return a line that names the other driver, '' for none."""
         topic = self._command.topic_name
-        own = self._node.get_fully_qualified_name()
-        names = sorted(map(node_of, self._node.get_publishers_info_by_topic(topic)))
-        if own in names:
-            names.remove(own)
-        if names:
+        publishers = sorted(map(node_of, self._node.get_publishers_info_by_topic(topic)))
+        own_name = self._node.get_fully_qualified_name()
+        if own_name in publishers:
+            publishers.remove(own_name)  # once: a second node may have the same name
+        if publishers:
             return (
-                f'{topic} must have no other publisher, there is {", ".join(names)}; stop it (after'
-                ' a crash its name remains for half a minute)'
+                f'{topic} must have no other publisher, there is {", ".join(publishers)}; stop it'
+                ' (after a crash its name remains for half a minute)'
             )
         # The last status of a controller that has ended is not valid any more.
         if self._active - self._command.goals and self._node.count_publishers(

@@ -62,9 +62,7 @@ def declare_parameters(
     hints: dict[str, str] | None = None,
 ) -> Any:
     """
-    Declare the fields of the settings `group` as parameters and return the settings.
-
-    Every field becomes a parameter of `node`, and the returned settings have the given values.
+    Declare the fields of the settings `group` as parameters of a node; return their given values.
 
     Tuples become arrays. From then on requests to change a parameter are handled: a setting
     declared `live` changes, of any other setting the request is rejected with the reason.
@@ -100,7 +98,7 @@ def declare_parameters(
             ) from error
         values[item.name] = _from_ros(item, value)
     settings = override(group(), values)
-    _watch(node, _Group(settings, take, hints or {}))
+    _add_group(node, _Group(settings, take, hints or {}))
     return settings
 
 
@@ -136,11 +134,14 @@ class _Group:
     """A group of settings that are parameters of a node."""
 
     settings: Any
+    """Present settings, an instance of the settings class."""
     take: Callable[[Any], None] | None
+    """As of `declare_parameters`."""
     hints: dict[str, str]
+    """As for `errors.with_hint`."""
 
 
-def _watch(node: Node, group: _Group) -> None:
+def _add_group(node: Node, group: _Group) -> None:
     """
     Handle requests to change the parameters of a group: one callback per node, for all its groups.
     """
@@ -148,17 +149,18 @@ def _watch(node: Node, group: _Group) -> None:
     if groups is None:
         groups = []
         setattr(node, _GROUPS, groups)
-        node.add_on_set_parameters_callback(partial(_set, groups))
+        node.add_on_set_parameters_callback(partial(_set_parameters, groups))
     groups.append(group)
 
 
-def _set(groups: list[_Group], parameters: list) -> SetParametersResult:
-    new = [group.settings for group in groups]
+def _set_parameters(groups: list[_Group], parameters: list) -> SetParametersResult:
+    """Change the parameters of a request, group by group; reject it at the first error."""
+    new_settings = [group.settings for group in groups]
     hints = {}
     try:
         for parameter in parameters:
-            _change(new, parameter)
-        for group, settings in zip(groups, new, strict=True):
+            _replace_setting(new_settings, parameter)
+        for group, settings in zip(groups, new_settings, strict=True):
             if settings is not group.settings:
                 hints = group.hints
                 if group.take is not None:
@@ -166,27 +168,31 @@ def _set(groups: list[_Group], parameters: list) -> SetParametersResult:
                 group.settings = settings
     except ImuCalibrationError as error:
         return SetParametersResult(successful=False, reason=error.with_hint(hints))
-    except (
-        Exception
-    ) as error:  # the requester receives a response, and the node continues unchanged
+    # The requester receives a response, and the node continues unchanged.
+    except Exception as error:
         return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
     return SetParametersResult(successful=True)
 
 
-def _change(groups: list, parameter: Any) -> None:
-    for place, group in enumerate(groups):
-        item = next((item for item in describe(group) if item.name == parameter.name), None)
+def _replace_setting(all_settings: list, parameter: Any) -> None:
+    """
+    Replace the settings in a list that have a parameter by ones with its new value.
+
+    Raises an InputError where the setting is not live.
+    """
+    for k, settings in enumerate(all_settings):
+        item = next((item for item in describe(settings) if item.name == parameter.name), None)
         if item is None:
             continue
         value = _from_ros(item, parameter.value)
-        if value == getattr(group, item.name):
+        if value == getattr(settings, item.name):
             return
         if not item.live:
             raise InputError(
                 f"parameter '{item.name}' cannot be changed while the node runs: {item.fixed};"
                 f' start the node with -p {item.name}:={parameter.value}'
             )
-        groups[place] = override(group, {item.name: value})
+        all_settings[k] = override(settings, {item.name: value})
 
 
 def unknown_parameters(node: Node) -> list[str]:
@@ -196,24 +202,22 @@ def unknown_parameters(node: Node) -> list[str]:
     for name in sorted(given):
         if node.has_parameter(name) or name.startswith(NOT_OURS):
             continue
-        near = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
-        lines.append(
-            f"parameter '{name}' {UNKNOWN_PARAMETER}"
-            + (
-                f"; did you mean '{near[0]}'?"
-                if near
-                else f"; see 'ros2 param list {node.get_fully_qualified_name()}'"
-            )
-        )
+        remedy = f"see 'ros2 param list {node.get_fully_qualified_name()}'"
+        similar = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
+        if similar:
+            remedy = f"did you mean '{similar[0]}'?"
+        lines.append(f"parameter '{name}' {UNKNOWN_PARAMETER}; {remedy}")
     return lines
 
 
 def _limits(bounds: tuple, largest: float) -> tuple:
+    """Return (low, high) of the bounds of a setting, the largest number where one is None."""
     low, high = bounds
     return -largest if low is None else low, largest if high is None else high
 
 
 def _from_ros(item: Setting, value: Any) -> Any:
+    """Return the value of a parameter as that of a setting: arrays become tuples."""
     return tuple(value) if isinstance(item.default, tuple) else value
 
 
@@ -276,21 +280,18 @@ def settings_of(node: str) -> list[type]:
 
 def meaning(item: Setting) -> str:
     """Return the meaning of a setting, with unit and range."""
-    return (
-        item.text
-        + (f' [{item.unit}]' if item.unit not in ('', '1') else '')
-        + range_text(item.bounds)
-    )
+    unit = f' [{item.unit}]' if item.unit not in ('', '1') else ''
+    return item.text + unit + range_text(item.bounds)
 
 
 def range_text(bounds: tuple) -> str:
-    """Return which values are allowed."""
-    low, high = (
-        bound if bound is None or isinstance(bound, int) else f'{bound:g}' for bound in bounds
-    )
-    if high is not None:
-        return f', {low} to {high}' if low is not None else f', at most {high}'
-    return f', at least {low}' if low is not None else ''
+    """Return the allowed values of a setting as a continuation of a text; '' without bounds."""
+    low, high = (f'{bound:g}' if isinstance(bound, float) else bound for bound in bounds)
+    if low is not None and high is not None:
+        return f', {low} to {high}'
+    if low is not None:
+        return f', at least {low}'
+    return f', at most {high}' if high is not None else ''
 
 
 def value_text(value: object) -> str:
@@ -298,11 +299,10 @@ def value_text(value: object) -> str:
     if isinstance(value, tuple):
         return '[' + ', '.join(map(value_text, value)) + ']'
     text = json.dumps(value)
-    return (
-        text.replace('e', '.0e')
-        if isinstance(value, float) and 'e' in text and '.' not in text
-        else text
-    )
+    # YAML reads 1e-06 as a text, and 1.0e-06 as a number.
+    if isinstance(value, float) and 'e' in text and '.' not in text:
+        return text.replace('e', '.0e')
+    return text
 
 
 HELP_WIDTH = 118
@@ -339,9 +339,9 @@ def every(node: Node, seconds: float, callback: Callable[[], Any]) -> Any:
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-HEARD = 0.1
+SIGNAL_SECONDS = 0.1
 """
-Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context.
+Seconds within which Python's handler of a signal is called; rclpy's is first, and ends the context.
 """
 LOOK_AGAIN = 0.5
 """Interval at which an idle node checks whether its end was requested, s."""
@@ -374,42 +374,46 @@ def run_node(
 
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    own = remove_ros_args(['', *arguments])[1:]
-    if '-h' in own or '--help' in own:
+    not_of_ros = remove_ros_args(['', *arguments])[1:]
+    if '-h' in not_of_ros or '--help' in not_of_ros:
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # the reader of a pipe may close it
         print(help_text(make_node))
         return 0
-    if own:
+    if not_of_ros:
         print(
-            f"error: arguments of the node follow --ros-args, got '{shortened(own[0])}' before it;"
-            ' write --ros-args -p NAME:=VALUE, and see --help',
+            'error: arguments of the node follow --ros-args, got'
+            f" '{shortened(not_of_ros[0])}' before it; write --ros-args -p NAME:=VALUE, and see"
+            ' --help',
             file=sys.stderr,
         )
         return 1
-    # rclpy's handlers, installed by init, end the wait and call these; without them Python would
-    # also raise KeyboardInterrupt in mid-write.
-    asked_to_end = []
+
+    # Signals. rclpy's handlers, installed by init, end the wait and call these; without them Python
+    # would also raise KeyboardInterrupt in mid-write.
+    received_signals: list[int] = []
     node = None
     halts = hasattr(make_node, 'halt')
 
-    def asked(number, _):
-        asked_to_end.append(number)
+    def on_signal(number, _):
+        received_signals.append(number)
         if halts and node is not None:
             node.halt()
         if halts:
             rclpy.try_shutdown()
 
     for number in SIGNALS:
-        signal.signal(number, asked)
+        signal.signal(number, on_signal)
     # Incomplete objects of rclpy at the end of the context are not reported either.
     report = sys.unraisablehook
-    sys.unraisablehook = lambda unraisable: None if asked_to_end else report(unraisable)
+    sys.unraisablehook = lambda unraisable: None if received_signals else report(unraisable)
+
     # A node with a final message needs the context until it is sent.
-    rclpy.init(
-        args=arguments, **({'signal_handler_options': SignalHandlerOptions.NO} if halts else {})
-    )
+    init_options = {}
+    if halts:
+        init_options['signal_handler_options'] = SignalHandlerOptions.NO
+    rclpy.init(args=arguments, **init_options)
     try:
-        if asked_to_end:  # before rclpy's handlers were installed
+        if received_signals:  # before rclpy's handlers were installed
             return 0
         node = make_node()
         for line in unknown_parameters(node):
@@ -417,7 +421,7 @@ def run_node(
         # At a signal rclpy wakes the executor before it ends the context: an executor that checks
         # the context in between waits again.
         every(node, LOOK_AGAIN, lambda: None)
-        if not asked_to_end:  # an executor cannot be made any more
+        if not received_signals:  # an executor cannot be made any more
             (spin or rclpy.spin)(node)
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
@@ -426,8 +430,8 @@ def run_node(
     except Exception as error:
         # A context that ends while something is being made or published fails in many ways; none of
         # them is news.
-        time.sleep(HEARD)
-        if not asked_to_end:
+        time.sleep(SIGNAL_SECONDS)
+        if not received_signals:
             return _failed(
                 f'the node cannot continue: {shortened(f"{type(error).__name__}: {error}", 300)}'
             )
@@ -437,17 +441,19 @@ def run_node(
 
 
 def _failed(line: str) -> int:
+    """Print an error; return the exit code."""
     print(f'error: {line}', file=sys.stderr, flush=True)
     return 1
 
 
 def _end(node: Any) -> None:
-    # `ros2 launch` sends every signal twice, and the second must not interrupt saving
+    """Close and destroy a node, print the outcome, and end the context."""
+    # `ros2 launch` sends every signal twice, and the second must not interrupt saving.
     _ignore_signals()
     if node is not None:
-        last_words = node.close() if hasattr(node, 'close') else ''
-        if last_words:  # a logger would also publish, and complain that it cannot any more
-            print(f'[{node.get_name()}]: {last_words}', file=sys.stderr, flush=True)
+        outcome = node.close() if hasattr(node, 'close') else ''
+        if outcome:  # a logger would also publish, and complain that it cannot any more
+            print(f'[{node.get_name()}]: {outcome}', file=sys.stderr, flush=True)
         node.destroy_node()
     rclpy.try_shutdown()
     _ignore_signals()  # rclpy has restored the earlier handlers
@@ -474,7 +480,6 @@ def guarded(
 
 def announce(node: Node, inputs: Sequence[str], outputs: Sequence[str], *, note: str = '') -> None:
     """Log the full names of topics, given as relative names, and a note."""
-    read, published = (
-        ', '.join(map(node.resolve_topic_name, names)) or 'nothing' for names in (inputs, outputs)
-    )
+    read = ', '.join(map(node.resolve_topic_name, inputs)) or 'nothing'
+    published = ', '.join(map(node.resolve_topic_name, outputs)) or 'nothing'
     node.get_logger().info(f'reads {read}; publishes {published}' + (f'; {note}' if note else ''))
