@@ -165,7 +165,7 @@ CLOCK_CHECK_SECONDS = 0.1
 """Seconds between two checks of the clock."""
 MID_MOTION = 'stopped in mid-motion'
 """Outcome of a node that ended during a motion."""
-ANSWER_PATIENCE = 60.0
+RESPONSE_SECONDS = 60.0
 """Seconds to wait for a solution, and for a diagnosis that has begun."""
 
 
@@ -188,10 +188,10 @@ class PlannerNode(Node):
         self._table = live_reference(self, robot, settings.table_file).table_for(
             "planner_node moves the joints of 'table_file' or 'urdf_file'", 'table_missing'
         )
-        own = settings.tolerances_file
-        tolerances = files.read_tolerances(
-            files.user_path(own) if own else config_file('tolerances.yaml')
-        )
+        tolerances_path = config_file('tolerances.yaml')
+        if settings.tolerances_file:
+            tolerances_path = files.user_path(settings.tolerances_file)
+        tolerances = files.read_tolerances(tolerances_path)
         self._options = CalibrationOptions(
             settings.accelerometer_model or None,
             settings.gyroscope_model or None,
@@ -204,16 +204,24 @@ class PlannerNode(Node):
             ),
         )
         self._lock = threading.RLock()
+        """Guards the driver."""
         self._stamp = 0.0
-        self._status = {}
-        self._newest: str | None = None
+        """Stamp of the last joint state, s."""
+        self._received = threading.Condition()
+        """Guards the three messages of calibration_node below; notified by each new one."""
+        self._diagnosis_values: dict[str, str] = {}
+        """Values of the last status 'diagnosis'."""
+        self._document_text: str | None = None
+        """The last calibration document."""
         self._n_documents = 0
+        """Number of received documents."""
         self._is_halted = False
+        """Whether the end of the node stopped a motion."""
         self._complaints = Complaints(self.get_logger())
-        self._heard = threading.Condition()
         self._names = tuple(self._table.joint_names)
         self.driver = Driver(self._names, limits_of(self._table), driver_settings)
         self._is_placed = False
+        """Whether the ranges of the joints are set, at the first start."""
         self._command = make_command(self, settings.command, self._refused)
         self._others = OtherDrivers(self, self._command)
         self.worker = PlannerWorker(
@@ -231,8 +239,8 @@ class PlannerNode(Node):
             lock=self._lock,
         )
         self.worker.stamp = lambda: self._stamp
-        # All that wait at once: one by one they would wait in line while a plan is made, and the
-        # motion begin where the joints were before.
+        # All waiting joint states at once: one by one they would be delayed while a plan is made,
+        # and the motion would begin at an earlier position of the joints.
         self._joints = BatchInput(
             self, JointState, 'joint_states', add=self._guarded(self._joint_state), single=False
         )
@@ -248,19 +256,20 @@ class PlannerNode(Node):
         self.create_subscription(
             DiagnosticArray, '/diagnostics', self._guarded(self._diagnostic), 100
         )
-        self._calibrator = {
-            what: self.create_client(Trigger, f'{settings.calibration_node}/{what}')
-            for what in ('solve', 'diagnose')
+        self._calibration_clients = {
+            service: self.create_client(Trigger, f'{settings.calibration_node}/{service}')
+            for service in ('solve', 'diagnose')
         }
-        for what, answer in (
+        for service, action in (
             ('start', lambda: self._go(-1)),
             ('next', lambda: self._go(1)),
             ('stop', self._stop),
         ):
-            self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
+            self.create_service(Trigger, f'~/{service}', partial(self._serve, service, action))
         every(self, CLOCK_CHECK_SECONDS, self._guarded(self._tick))
         self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
-        self._driven = None
+        self._driven_marker: MarkerArray | None = None
+        """Picture of the motion that is driven, or was driven last."""
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
         self.get_logger().info(
@@ -294,6 +303,7 @@ class PlannerNode(Node):
             self.driver.change(group)
 
     def _make_campaign(self) -> Campaign:
+        """Return a campaign for the table, from the present calibration if there is one."""
         noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
         planner = make_planner(
             self._table,
@@ -313,6 +323,7 @@ class PlannerNode(Node):
         )
 
     def _make_separator(self, suspect: Suspect, noise: dict) -> Planner:
+        """Return the planner of motions that separate a model error from its collinear effects."""
         calibration = self._latest()
         if calibration is None:
             raise InputError(
@@ -330,19 +341,21 @@ class PlannerNode(Node):
         )
 
     def _send(self, points: TrajectoryPoints) -> None:
+        """Send a trajectory to the controller, and publish its picture."""
         self._command.send(points)
         calibration = self._latest()
-        self._driven = driven_markers(
+        self._driven_marker = driven_markers(
             up_at(self._table, points.position[-1]),
             f'motion {self.driver.motions}: {self.worker.motion.words}',
             frame_id=calibration.frame_id if calibration else '',
             stamp=self.get_clock().now().to_msg(),
         )
-        self._coverage.publish(self._driven)
+        self._coverage.publish(self._driven_marker)
 
     # Received messages.
 
     def _joint_state(self, serialized: bytes, _: int) -> None:
+        """Pass a JointState to the driver, and stop the joints if it requires that."""
         try:
             samples = decode_joints(
                 find_joint_layout(serialized), Packed.join([serialized]), self._names
@@ -366,19 +379,21 @@ class PlannerNode(Node):
             self._stopped()
 
     def _document(self, message: String) -> None:
-        with self._heard:
-            self._newest, self._n_documents = message.data, self._n_documents + 1
-            self._heard.notify_all()
+        with self._received:
+            self._document_text = message.data
+            self._n_documents += 1
+            self._received.notify_all()
 
     def _diagnostic(self, message: DiagnosticArray) -> None:
         wanted = f'{self.settings.calibration_node.lstrip("/")}: diagnosis'
         for status in message.status:
             if status.name.endswith(wanted):
-                with self._heard:
-                    self._status = {pair.key: pair.value for pair in status.values}
-                    self._heard.notify_all()
+                with self._received:
+                    self._diagnosis_values = {pair.key: pair.value for pair in status.values}
+                    self._received.notify_all()
 
     def _tick(self) -> None:
+        """Stop the joints when the driver requires it by the time, as without joint states."""
         with self._lock:
             must_stop = self.driver.tick(time.monotonic())
         if must_stop:
@@ -389,6 +404,7 @@ class PlannerNode(Node):
         return guarded(callback, self._failed)
 
     def _failed(self, error: Exception) -> str:
+        """Stop the joints after an exception; return the line that is logged."""
         if not self.context.ok():  # the node is ending
             return ''
         line = shortened(f'an internal error: {type(error).__name__}: {error}', 200)
@@ -398,12 +414,14 @@ class PlannerNode(Node):
         return line
 
     def _refused(self, why: str) -> None:
+        """Process the refusal of a trajectory by the controller."""
         with self._lock:
             must_stop = self.driver.refused(why)
         if must_stop:
             self._stopped()
 
     def _stopped(self) -> None:
+        """Stop the joints, and log the reason of the driver."""
         self._stop_joints()
         self._say(LOG_ERROR, self.driver.reason)
 
@@ -416,130 +434,138 @@ class PlannerNode(Node):
     # Requests of the worker.
 
     def _latest(self) -> Calibration | None:
-        with self._heard:
-            text = self._newest
+        """Return the last received calibration."""
+        with self._received:
+            text = self._document_text
         return None if text is None else calibration_from_text(text)
 
-    def _ask(self, what: str) -> Trigger.Response | None:
-        """Call a service of the calibration node from the worker's thread."""
-        future = self._calibrator[what].call_async(Trigger.Request())
+    def _ask(self, service: str) -> Trigger.Response | None:
+        """Call a service of calibration_node from the worker's thread; None without a response."""
+        future = self._calibration_clients[service].call_async(Trigger.Request())
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
-        return future.result() if done.wait(ANSWER_PATIENCE) else None
+        return future.result() if done.wait(RESPONSE_SECONDS) else None
 
     def _measure(self) -> Calibration | None:
-        known = self._n_documents
-        answer = self._ask('solve')
-        if answer is None:
+        """Request a solution; return its calibration, None while there is none."""
+        n_before = self._n_documents
+        response = self._ask('solve')
+        if response is None:
             raise InputError(
-                f'calibration must answer ~/solve within {ANSWER_PATIENCE:g} s,'
+                f'calibration must answer ~/solve within {RESPONSE_SECONDS:g} s,'
                 f" '{self.settings.calibration_node}' did not; check that it runs"
             )
-        if not answer.success:
-            self._say(LOG_INFO, f'no calibration yet: {answer.message}')
+        if not response.success:
+            self._say(LOG_INFO, f'no calibration yet: {response.message}')
             return None
-        with self._heard:
-            self._heard.wait_for(lambda: self._n_documents > known, timeout=2.0)
+        with self._received:
+            self._received.wait_for(lambda: self._n_documents > n_before, timeout=2.0)
         return self._latest()
 
     def _diagnose(self) -> list[Suspect] | None:
-        known = self._status.get('diagnoses', '0')
-        answer = self._ask('diagnose')
-        if answer is None or not answer.success:
-            self._say(LOG_INFO, 'no diagnosis: ' + (answer.message if answer else 'no answer'))
+        """Request a diagnosis; return its model errors, None without a result in time."""
+        n_before = self._diagnosis_values.get('diagnoses', '0')
+        response = self._ask('diagnose')
+        if response is None or not response.success:
+            reason = response.message if response else 'no answer'
+            self._say(LOG_INFO, f'no diagnosis: {reason}')
             return None
-        with self._heard:
-            came = self._heard.wait_for(
-                lambda: (
-                    self._status.get('diagnoses', '0') != known
-                    and self._status.get('being made') == 'False'
-                ),
-                timeout=ANSWER_PATIENCE,
-            )
-            values = dict(self._status)
-        return findings_from(values) if came else None
+
+        def is_complete() -> bool:
+            values = self._diagnosis_values
+            has_new = values.get('diagnoses', '0') != n_before
+            return has_new and values.get('being made') == 'False'
+
+        with self._received:
+            is_in_time = self._received.wait_for(is_complete, timeout=RESPONSE_SECONDS)
+            values = dict(self._diagnosis_values)
+        return findings_from(values) if is_in_time else None
 
     # Requests of the user.
 
     def _go(self, motions: int) -> tuple[bool, str]:
+        """
+        Begin so many motions, -1: all that are needed; return (success, message).
+
+        Refuses with the first precondition that is not met.
+        """
         if self.driver.is_driving or self.worker.doing:
-            return (
-                False,
-                (
-                    f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop'
-                    ' stops it'
-                ),
+            return False, (
+                f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop stops it'
             )
         if missing_ranges(self._table):
             return False, range_warnings(self._table)[0]
         if self.driver.position is None:
             return False, self._joints.silence(self.driver.ignored_words().strip(' ()'))
-        trouble = self.driver.stamp_fault(time.monotonic())
-        if trouble:
-            return False, trouble
+        stamp_fault = self.driver.stamp_fault(time.monotonic())
+        if stamp_fault:
+            return False, stamp_fault
         if not self._command.is_heard:
-            return (
-                False,
-                (
-                    f'{self._command.name} has no subscriber: start the controller, or remap'
-                    ' joint_trajectory'
-                ),
+            return False, (
+                f'{self._command.name} has no subscriber: start the controller, or remap'
+                ' joint_trajectory'
             )
-        other = self._others.found()
-        if other:
-            return False, other
-        if not self._calibrator['solve'].service_is_ready():
-            return (
-                False,
-                (
-                    f'service {self._calibrator["solve"].srv_name} does not exist; start'
-                    ' calibration_node, which collects the windows'
-                ),
+        other_driver = self._others.found()
+        if other_driver:
+            return False, other_driver
+        if not self._calibration_clients['solve'].service_is_ready():
+            return False, (
+                f'service {self._calibration_clients["solve"].srv_name} does not exist; start'
+                ' calibration_node, which collects the windows'
             )
+
+        # The position at the first start is the middle of the permitted ranges.
         if not self._is_placed:
             limits = self.driver.limits.wound(self.driver.position, self.settings.max_turns)
-            reach = self.settings.reach_deg
-            self.driver.limits, self._is_placed = (
-                limits.reached(self.driver.position, reach) if reach else limits,
-                True,
-            )
+            if self.settings.reach_deg:
+                limits = limits.reached(self.driver.position, self.settings.reach_deg)
+            self.driver.limits = limits
+            self._is_placed = True
         self.worker.go(motions)
-        what = 'one motion, then it rests'
+        extent = 'one motion, then it rests'
         if motions <= 0:
-            what = (
+            extent = (
                 'plans and moves until every parameter is within its tolerance; the first motion is'
                 ' small, the first large one slow'
             )
-        return True, f'{what}; limits: {self._limit_words()}'
+        return True, f'{extent}; limits: {self._limit_words()}'
 
     def _limit_words(self) -> str:
         return '; '.join(limit_words(self._table, self.driver.limits))
 
     def _stop(self) -> tuple[bool, str]:
+        """Stop at once; return (success, message)."""
         self.worker.halt('stopped by ~/stop')
         return True, 'stopped: no motion before the next ~/start'
 
     def _serve(
-        self, what: str, answer: Any, _: Trigger.Request, response: Trigger.Response
+        self,
+        service: str,
+        action: Callable[[], tuple[bool, str]],
+        _: Trigger.Request,
+        response: Trigger.Response,
     ) -> Trigger.Response:
+        """Respond to a request with (success, message) of `action`, or its error."""
         try:
-            response.success, response.message = answer()
+            response.success, response.message = action()
         except ImuCalibrationError as error:
             response.success, response.message = False, error.with_hint(HINTS['planner_node'])
         except Exception as error:
             response.success, response.message = False, self._failed(error)
-        self._say(LOG_INFO if response.success else LOG_ERROR, f'~/{what}: {response.message}')
+        self._say(LOG_INFO if response.success else LOG_ERROR, f'~/{service}: {response.message}')
         self._diagnostics.publish_now()
         return response
 
     def _say(self, level: str, line: str) -> None:
+        """Log a line unless the node is ending."""
         if self.context.ok():
             say(self.get_logger(), level, line)
 
     def _statuses(self) -> list:
+        """Return the status 'drive' for the diagnostics."""
         # Again, because calibration_node's markers begin with DELETEALL.
-        if self._driven is not None:
-            self._coverage.publish(self._driven)
+        if self._driven_marker is not None:
+            self._coverage.publish(self._driven_marker)
         driver = self.driver
         worker = self.worker
         campaign = self.worker.campaign

@@ -78,39 +78,46 @@ class PlannerWorker(threading.Thread):
         self._peers = peers
         self._lock = lock
         self.campaign: Campaign | None = None
+        """Selects the motions; None before the first request."""
         self.doing = Activity.NONE
+        """Present activity."""
         self.motion: Any = None
         """The motion that is driven, or was driven last."""
         self.seconds = 0.0
         """Expected duration of the present activity, s."""
         self.worst: tuple[str, float] = ('', 0.0)
+        """Parameter furthest outside its tolerance: (name, standard deviation over tolerance)."""
         self.outside = 0
         """Parameters outside their tolerance."""
-        self._wanted = 0
+        self._n_wanted = 0
+        """Requested motions that are not completed; -1: all that are needed, 0: none."""
         self._wake = threading.Event()
+        """Set to check at once instead of after `DRIVER_CHECK_SECONDS`."""
         self._ending = False
-        self._began: float | None = None
+        """Whether the thread ends."""
+        self._began_at: float | None = None
+        """Time of the first motion since the last start, s of `stamp`; None before it."""
         self.stamp: Callable[[], float] = time.monotonic
         """Seconds by which the time limit counts."""
 
     @property
     def elapsed(self) -> float:
         """Seconds since the first motion of the campaign began."""
-        return 0.0 if self._began is None else self.stamp() - self._began
+        return 0.0 if self._began_at is None else self.stamp() - self._began_at
 
     def go(self, motions: int) -> None:
         """Make so many motions from now on; -1: all that are needed."""
         with self._lock:
             if self.driver.state in (DriveState.STOPPED, DriveState.DONE) or motions < 0:
                 self.driver.start()
-            if motions < 0 and self.campaign is not None and self._wanted == 0:
-                self._began = None  # a new start has its own time
-        self._wanted = motions
+            if motions < 0 and self.campaign is not None and self._n_wanted == 0:
+                self._began_at = None  # a new start has its own time
+        self._n_wanted = motions
         self._wake.set()
 
     def halt(self, why: str) -> None:
         """Stop at once."""
-        self._wanted = 0
+        self._n_wanted = 0
         with self._lock:
             self.driver.stop(why)
         self._peers.stop()
@@ -129,7 +136,7 @@ class PlannerWorker(threading.Thread):
         while not self._ending:
             self._wake.wait(DRIVER_CHECK_SECONDS)
             self._wake.clear()
-            if self._wanted and not self.driver.is_driving:
+            if self._n_wanted and not self.driver.is_driving:
                 try:
                     self._next()
                 except ImuCalibrationError as error:
@@ -140,15 +147,17 @@ class PlannerWorker(threading.Thread):
                     )
                 self.doing = Activity.NONE
 
-    def _give_up(self, why):
+    def _give_up(self, why: str) -> None:
+        """Stop the joints and discard the request, and report the reason."""
         if self.driver.state is not DriveState.STOPPED:
             self.halt(why)
-        self._wanted = 0
+        self._n_wanted = 0
         self._peers.say(LOG_ERROR, why)
 
-    def _next(self):
+    def _next(self) -> None:
+        """Measure after the last motion, then plan and begin the next one."""
         if self.driver.state is DriveState.STOPPED:  # because of the joint states
-            self._wanted = 0
+            self._n_wanted = 0
             return
         if self.campaign is None:
             self.doing = Activity.PLANNING
@@ -160,9 +169,9 @@ class PlannerWorker(threading.Thread):
         while decision is not None and decision.diagnose:
             self.doing = Activity.DIAGNOSING
             self._peers.say(LOG_INFO, f'{decision.why}; diagnosing')
-            asked = self.campaign.take_findings(self._peers.diagnose())
-            if asked:
-                self._peers.say(LOG_INFO, asked)
+            report = self.campaign.take_findings(self._peers.diagnose())
+            if report:
+                self._peers.say(LOG_INFO, report)
             calibration = self._peers.latest()
             if calibration is not None:
                 self.campaign.take(calibration)
@@ -170,22 +179,24 @@ class PlannerWorker(threading.Thread):
         if decision is not None:
             self._carry_out(decision)
 
-    def _wait_for_rest(self):
+    def _wait_for_rest(self) -> None:
         """
-        A motion is planned from where the joints rest.
+        Wait until the joints rest, because a motion is planned from their position.
 
-        After a stop they need a while, and a person may turn them.
+        After a stop they need a while, and a person may turn them. Raises an InputError when they
+        move for longer than the settling patience, or their stamps are faulty.
         """
         patience = self.driver.settings.settling_patience
         end = time.monotonic() + patience
-        while self._wanted and not self._ending and not self.driver.rests:
+        while self._n_wanted and not self._ending and not self.driver.rests:
             self.doing = Activity.AWAITING_REST
-            trouble = self.driver.stamp_fault(time.monotonic())
-            if trouble:
-                raise InputError(trouble)
-            # No other driver need be searched for yet.
+            stamp_fault = self.driver.stamp_fault(time.monotonic())
+            if stamp_fault:
+                raise InputError(stamp_fault)
+            # The patience counts from the stop of the controller.
             if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):
-                self.doing, end = Activity.AWAITING_STOP, time.monotonic() + patience
+                self.doing = Activity.AWAITING_STOP
+                end = time.monotonic() + patience
             if time.monotonic() > end:
                 raise InputError(
                     f'the joints must rest before a motion begins, they moved for {patience:g} s;'
@@ -194,36 +205,37 @@ class PlannerWorker(threading.Thread):
             self._wake.wait(DRIVER_CHECK_SECONDS)
             self._wake.clear()
 
-    def _measure(self):
+    def _measure(self) -> None:
+        """Pass the calibration after a motion to the campaign, and count the motion."""
         self.doing = Activity.AWAITING_CALIBRATION
         calibration = self._peers.measure()
         if calibration is not None:
             # A measurement follows a motion, which the campaign has chosen.
             assert self.campaign is not None
             self.campaign.take(calibration)
-        if self._wanted > 0:
-            self._wanted -= 1
-        if not self._wanted:
+        if self._n_wanted > 0:
+            self._n_wanted -= 1
+        if not self._n_wanted:
             with self._lock:
                 if self.driver.state is DriveState.MEASURING:
                     self.driver.wait('rests until the next motion is requested')
 
-    def _decide(self):
-        if not self._wanted or self._ending:
+    def _decide(self) -> Any:
+        """Return the campaign's decision on the next step; None without a request."""
+        if not self._n_wanted or self._ending:
             return None
         self.doing = Activity.PLANNING
         # Motions are wanted only after the campaign is made, at a known position.
         assert self.campaign is not None and self.driver.position is not None
         decision = self.campaign.decide(self.driver.position, self.elapsed)
-        self.worst, self.outside = (
-            self.campaign.worst,
-            sum(excess > 1.0 for excess in self.campaign.planner.excess.values()),
-        )
+        self.worst = self.campaign.worst
+        self.outside = sum(excess > 1.0 for excess in self.campaign.planner.excess.values())
         return decision
 
-    def _carry_out(self, decision):
+    def _carry_out(self, decision: Any) -> None:
+        """Begin the motion of a decision, or end the campaign where it has none."""
         if decision.motion is None:
-            self._wanted = 0
+            self._n_wanted = 0
             with self._lock:
                 self.driver.finish(decision.why)
             self._peers.say(LOG_INFO, f'done after {self.driver.motions} motions: {decision.why}')
@@ -233,15 +245,17 @@ class PlannerWorker(threading.Thread):
         if obstacle:
             raise InputError(obstacle)
         with self._lock:
-            if not self._wanted:  # stopped meanwhile
+            if not self._n_wanted:  # stopped meanwhile
                 return
             points = self.driver.begin(
                 decision.motion.points(self.driver.position),
                 decision.motion.words,
                 time.monotonic(),
             )
-            self.motion, self.seconds = decision.motion, points.duration
-            self._began = self.stamp() if self._began is None else self._began
+            self.motion = decision.motion
+            self.seconds = points.duration
+            if self._began_at is None:
+                self._began_at = self.stamp()
             self._peers.send(points)
         self._peers.say(
             LOG_INFO,
@@ -252,23 +266,24 @@ class PlannerWorker(threading.Thread):
 
 def findings_from(values: dict[str, str]) -> list[Suspect]:
     """
-    Return the model errors in the status 'diagnosis', the strongest first.
+    Return the model errors from the values of calibration_node's status 'diagnosis'.
 
-    They are in the values of this status of calibration_node.
+    The strongest is the first. Their keys are the effect with its collinear mates, and the sizes of
+    each of these effects by parameter.
     """
     if values.get('outcome') != FOUND:
         return []
-    found = []
-    for key, value in values.items():
-        if key.startswith(MATES_KEY):
-            found.append((key.removeprefix(MATES_KEY), value.split()))
     suspects = []
-    for effect, mates in found:
+    for key, value in values.items():
+        if not key.startswith(MATES_KEY):
+            continue
+        effect = key.removeprefix(MATES_KEY)
+        mates = value.split()
         sizes = {}
-        for each in (effect, *mates):
-            prefix = f'{SIZE_KEY}{each}.'
-            for key, value in values.items():
-                if key.startswith(prefix):
-                    sizes[key.removeprefix(prefix)] = float(value)
+        for name in (effect, *mates):
+            prefix = f'{SIZE_KEY}{name}.'
+            for size_key, size in values.items():
+                if size_key.startswith(prefix):
+                    sizes[size_key.removeprefix(prefix)] = float(size)
         suspects.append(Suspect(effect, tuple(mates), sizes))
     return suspects
