@@ -189,7 +189,7 @@ class _Part:
         """Whether the angular acceleration enters the rest in a product or a function."""
         for factors in chain.from_iterable(self.rest):
             product_text = ' '.join(factors)
-            # Longer than the name alone, e.g. 'gx'.
+            # Longer than the name itself, e.g. 'gx'.
             if re.search(r'\bg[xyz]\b', product_text) and len(product_text) > 2:
                 return True
         return False

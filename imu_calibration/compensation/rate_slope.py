@@ -119,7 +119,7 @@ class MotionEvidence:
         precision = np.linalg.inv(rate_cov)
         log_rate_noise = 0.5 * np.linalg.slogdet(rate_cov)[1]  # of the product of the three sds
 
-        # Log likelihood of b = 0. One reading has no slope and excludes nothing about it.
+        # Log likelihood of b = 0. One reading has no slope to test.
         log_zero_slope = 0.0
         log_constant_rate = -np.inf
         if self.n_slopes:

@@ -315,7 +315,7 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     """
     markers = [Marker(ns='all', action=Marker.DELETEALL)]
 
-    # Cells of the sphere, the up directions so far, and arrows.
+    # Cells of the sphere, the earlier up directions, and arrows.
     for k, (place, color, size) in enumerate(sphere_cells(coverage)):
         scale = (size,) * 3
         markers.append(

@@ -120,7 +120,7 @@ class LiveCompensation(SampleCompensation):
         self.received += 1
         message = self._message
 
-        # Read: at once where head and covariances are those of the previous message.
+        # Read: at once where head and covariances equal the previous ones.
         content = message.take(data) if self._cov_revision == self.revision else None
         if content is None:
             if not message.heads(data) and not self._open(data):

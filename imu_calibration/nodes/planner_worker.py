@@ -141,7 +141,7 @@ class PlannerWorker(threading.Thread):
                     self._next()
                 except ImuCalibrationError as error:
                     self._give_up(str(error))
-                except Exception as error:  # no failure may leave the joints without supervision
+                except Exception as error:  # a failure must not end the supervision of the joints
                     self._give_up(
                         f'planning failed: {shortened(f"{type(error).__name__}: {error}", 200)}'
                     )

@@ -30,7 +30,7 @@ class Batch:
     """Messages of a stretch of time, in order."""
 
     time: np.ndarray
-    """When each is due, s since the start, not falling, shape (n,)."""
+    """Times at which the messages are due, s since the start, not falling, shape (n,)."""
     publisher: list
     """Publisher of each message."""
     messages: list
@@ -90,17 +90,22 @@ class Playback(threading.Thread):
         self._batches = batches
         self._pace = pace
         self._awaited = awaited
-        self._end_text, self._ends_node = ended, ends_node
-        self._clock_start_ns, self._next_clock = clock_start_ns, 0.0
-        self._clock = (
-            node.create_publisher(Clock, '/clock', QoSProfile(depth=10))
-            if pace.clock_rate
-            else None
-        )
+        self._end_text = ended
+        self._ends_node = ends_node
+        self._clock_start_ns = clock_start_ns
+        self._clock_due = 0.0
+        """Time of the next message on /clock, s since the start."""
+        self._clock = None
+        if pace.clock_rate:
+            self._clock = node.create_publisher(Clock, '/clock', QoSProfile(depth=10))
         self._ending = threading.Event()
+        """Set to stop publishing."""
         self._n_published = 0
+        """Number of published messages."""
         self._is_over = False
+        """Whether the playback ended by itself, after all messages or by an error."""
         self.failed = False
+        """Whether an error ended it."""
 
     def end(self) -> str:
         """Stop as soon as possible; return the outcome, '' when all messages were published."""
@@ -118,7 +123,8 @@ class Playback(threading.Thread):
             error = raised
         if self._ending.is_set():
             return
-        self._is_over, self.failed = True, error is not None and rclpy.ok()
+        self._is_over = True
+        self.failed = error is not None and rclpy.ok()
         if self.failed:
             self._node.get_logger().error(f'stopped publishing: {type(error).__name__}: {error}')
         elif error is None:
@@ -126,7 +132,8 @@ class Playback(threading.Thread):
         if error is not None or self._ends_node:
             rclpy.try_shutdown()
 
-    def _play(self):
+    def _play(self) -> None:
+        """Publish all batches, and wait until they are received."""
         start = None
         with closing(read_ahead(self._batches)) as batches:
             for batch in batches:
@@ -138,7 +145,8 @@ class Playback(threading.Thread):
                     return
         self._settle()
 
-    def _wait_for_subscribers(self):
+    def _wait_for_subscribers(self) -> None:
+        """Wait until each awaited topic has the requested number of subscribers."""
         while any(
             publisher.get_subscription_count() < self._pace.subscribers
             for publisher in self._awaited
@@ -148,38 +156,38 @@ class Playback(threading.Thread):
         if self._awaited and self._pace.subscribers:
             self._ending.wait(0.3)  # the other side may find us a little later than we find it
 
-    def _publish(self, batch, start):
-        done = 0
-        while done < len(batch.messages) and not self._ending.is_set():
-            upto = len(batch.messages)
-            now = batch.until
+    def _publish(self, batch: Batch, start: float) -> None:
+        """Publish the messages of a batch when they are due; `start` on the steady clock, s."""
+        n_done = 0
+        while n_done < len(batch.messages) and not self._ending.is_set():
             if self._pace.factor:
                 now = (time.monotonic() - start) * self._pace.factor
-                upto = int(np.searchsorted(batch.time, now, side='right'))
-            self._tick(
-                float(batch.time[min(upto, len(batch.time) - 1)]) if not self._pace.factor else now
-            )
+                n_due = int(np.searchsorted(batch.time, now, side='right'))
+                self._publish_clock(now)
+            else:
+                n_due = len(batch.messages)
+                self._publish_clock(float(batch.time[-1]))
             for publisher, message in zip(
-                batch.publisher[done:upto], batch.messages[done:upto], strict=True
+                batch.publisher[n_done:n_due], batch.messages[n_done:n_due], strict=True
             ):
                 publisher.publish(bytes(message))
-            self._n_published += upto - done
-            done = upto
-            if self._pace.factor and done < len(batch.messages):
-                wait = (batch.time[done] - now) / self._pace.factor
+            self._n_published += n_due - n_done
+            n_done = n_due
+            if self._pace.factor and n_done < len(batch.messages):
+                wait = (batch.time[n_done] - now) / self._pace.factor
                 time.sleep(min(max(wait, SHORTEST_SLEEP), 0.05))
 
-    def _tick(self, now):
-        """Publish /clock when it is due."""
-        if self._clock is None or now < self._next_clock:
+    def _publish_clock(self, now: float) -> None:
+        """Publish /clock when it is due; `now` in s since the start."""
+        if self._clock is None or now < self._clock_due:
             return
-        self._next_clock = now + max(self._pace.factor, 1e-3) / self._pace.clock_rate
+        self._clock_due = now + max(self._pace.factor, 1e-3) / self._pace.clock_rate
         stamp_ns = self._clock_start_ns + int(round(now * 1e9))
         message = Clock()
         message.clock.sec, message.clock.nanosec = stamp_ns // 10**9, stamp_ns % 10**9
         self._clock.publish(message)
 
-    def _settle(self):
+    def _settle(self) -> None:
         """
         Wait until reliable subscribers have received all messages.
 

@@ -47,17 +47,17 @@ class OutsideExecutor(CallbackGroup):
 
 
 def available() -> bool:
-    """Return whether this rclpy has the inner parts that `relay` leans on."""
-    wait_set = getattr(_inner, 'WaitSet', None)
-    needed = {
-        wait_set: ('wait', 'clear_entities', 'add_subscription', 'add_guard_condition'),
-        getattr(_inner, 'Subscription', None): ('take_message',),
-        getattr(_inner, 'Publisher', None): ('publish_raw',),
+    """Return whether this rclpy has the inner classes and methods that `relay` uses."""
+    methods_of_classes = {
+        'WaitSet': ('wait', 'clear_entities', 'add_subscription', 'add_guard_condition'),
+        'Subscription': ('take_message',),
+        'Publisher': ('publish_raw',),
     }
-    return all(
-        part is not None and all(hasattr(part, name) for name in names)
-        for part, names in needed.items()
-    )
+    for class_name, methods in methods_of_classes.items():
+        inner_class = getattr(_inner, class_name, None)
+        if not all(hasattr(inner_class, method) for method in methods):
+            return False
+    return True
 
 
 class Subscribed(Protocol):
@@ -86,7 +86,7 @@ def relay(
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    failures = []
+    failures: list[BaseException] = []
     thread = threading.Thread(
         target=_spin, args=(executor, failures, node.context), name='callbacks', daemon=True
     )
@@ -103,7 +103,8 @@ def relay(
         raise failures[0]
 
 
-def _spin(executor, failures, context):
+def _spin(executor: Any, failures: list[BaseException], context: Any) -> None:
+    """Run the other callbacks; an exception is stored and ends the context."""
     try:
         executor.spin()
     except ExternalShutdownException:
@@ -113,7 +114,8 @@ def _spin(executor, failures, context):
         context.try_shutdown()
 
 
-def _drain(context, source, publisher, convert):
+def _drain(context: Any, source: Subscribed, publisher: Publisher, convert: Callable) -> None:
+    """Relay messages until the context ends; a signal ends the wait by the guard condition."""
     guard = SignalHandlerGuardCondition(context)
     try:
         with publisher.handle, guard.handle, context.handle:
@@ -128,11 +130,19 @@ def _drain(context, source, publisher, convert):
         guard.destroy()
 
 
-def _drain_one(context, source, wait_set, guard, publish, convert):
+def _drain_one(
+    context: Any,
+    source: Subscribed,
+    wait_set: Any,
+    guard: Any,
+    publish: Callable[[bytes], None],
+    convert: Callable[[bytes, dict], Any],
+) -> None:
     """Relay the messages of one subscription, until the source has another one."""
     subscription = source.subscription
     with subscription.handle:
-        take, message_type = subscription.handle.take_message, subscription.msg_type
+        take = subscription.handle.take_message
+        message_type = subscription.msg_type
         while context.ok() and source.subscription is subscription:
             wait_set.clear_entities()
             wait_set.add_subscription(subscription.handle)

@@ -32,7 +32,7 @@ TRANSFORM_DEPTH = 100
 
 class StaticFrames:
     """
-    The static transforms that are published; listens from the first question on.
+    The static transforms that are published, received from the first call of `pose` on.
 
     Parameters
     ----------
@@ -43,10 +43,14 @@ class StaticFrames:
     """
 
     def __init__(self, node: Node, changed: Callable[[], None]):
-        self._node, self._changed = node, changed
+        self._node = node
+        self._changed = changed
         self._subscription: Any = None
+        """Subscription of the transforms; None before the first call of `pose`."""
         self.transforms = StaticTransforms()
+        """The received transforms."""
         self.n_unusable = 0
+        """Number of received transforms that are not finite."""
 
     def pose(self, target: str, source: str) -> Any:
         """
@@ -72,19 +76,20 @@ class StaticFrames:
     def take(self, message: Any) -> None:
         """Process a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
-            place, turn = stamped.transform.translation, stamped.transform.rotation
-            usable = self.transforms.add(
-                *(
-                    clean_name(name).lstrip('/')
-                    for name in (stamped.header.frame_id, stamped.child_frame_id)
-                ),
+            place = stamped.transform.translation
+            turn = stamped.transform.rotation
+            is_usable = self.transforms.add(
+                clean_name(stamped.header.frame_id).lstrip('/'),
+                clean_name(stamped.child_frame_id).lstrip('/'),
                 xyz=(place.x, place.y, place.z),
                 quaternion=(turn.x, turn.y, turn.z, turn.w),
             )
-            self.n_unusable += not usable
+            if not is_usable:
+                self.n_unusable += 1
         self._changed()
 
-    def _listen(self):
+    def _listen(self) -> None:
+        """Subscribe to the transforms at the first call."""
         if self._subscription is None:
             try:
                 from tf2_msgs.msg import TFMessage
@@ -103,9 +108,11 @@ URDF_FROM_TOPIC = 'topic'
 """Value of `urdf_file` that selects the topic robot_description."""
 NO_TABLE = ('', 'none')
 """Values of `table_file` that mean: none. Launch arguments cannot be empty."""
-WAIT_SECONDS, WAIT_LOG_SECONDS = 0.1, 5.0
-"""Seconds of one wait; after each the awaited message is logged."""
-Found = TypeVar('Found')
+WAIT_SECONDS = 0.1
+"""Longest wait for a callback, s."""
+WAIT_LOG_SECONDS = 5.0
+"""Interval at which the awaited message is logged, s."""
+Received = TypeVar('Received')
 
 
 @dataclass(frozen=True)
@@ -180,24 +187,24 @@ def chain_of(
         When a file cannot be used, the description is none, or the link is not on it.
 
     """
-    place = _path_of(table_file)
+    table_path = _path_of(table_file)
     if not robot.urdf_file:
-        if place is None:
+        if table_path is None:
             return None
-        return files.read_table(place, gravity=gravity, gravity_sd=gravity_sd)
-    site = {} if place is None else files.read_mapping(place, 'table description')
-    text = (
-        _topic_text(node)
-        if robot.urdf_file == URDF_FROM_TOPIC
-        else files.read_robot_description(files.user_path(robot.urdf_file), robot.allow_xacro)
-    )
-    link = (
-        robot.imu_link
-        or frame_id
-        or clean_name(_message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id)
-    )
+        return files.read_table(table_path, gravity=gravity, gravity_sd=gravity_sd)
+
+    # An arm; the table file describes its site.
+    site = {} if table_path is None else files.read_mapping(table_path, 'table description')
+    if robot.urdf_file == URDF_FROM_TOPIC:
+        text = _description_from_topic(node)
+    else:
+        text = files.read_robot_description(files.user_path(robot.urdf_file), robot.allow_xacro)
+    link = robot.imu_link or frame_id
+    if not link:
+        message = _first_message(node, Imu, 'imu/data_raw', qos_profile_sensor_data)
+        link = clean_name(message.header.frame_id)
     if robot.world_frame:
-        site['up'] = _up(node, robot.world_frame, root_of(text))
+        site['up'] = _up_from_frame(node, robot.world_frame, root_of(text))
     return table_from_urdf(text, link, site, gravity=gravity, gravity_sd=gravity_sd)
 
 
@@ -212,7 +219,7 @@ def live_reference(
 
 
 def stand_path(robot: RobotSettings, table_file: str) -> Path | None:
-    """Return the file of the arm or the table, None without one."""
+    """Return the path of the arm's description, or else of the table's; None without either."""
     return _path_of(robot.urdf_file or table_file)
 
 
@@ -237,19 +244,21 @@ def words_of(robot: RobotSettings, table_file: str) -> str:
     )
 
 
-def _topic_text(node):
-    def is_robot(message):
+def _description_from_topic(node: Node) -> str:
+    """Return the text of the first usable robot description on the topic."""
+
+    def is_robot(message: Any) -> bool:
         try:
             return bool(root_of(message.data))
-        except InputError as error:  # anybody can publish on the topic
+        except InputError as error:  # any participant can publish on the topic
             say(node.get_logger(), LOG_WARN, f'a robot description was ignored: {error}')
             return False
 
-    return _message(node, String, 'robot_description', latched_qos(), is_robot).data
+    return _first_message(node, String, 'robot_description', latched_qos(), is_robot).data
 
 
-def _up(node, world, root):
-    """Return the z axis of a frame in the root of the robot."""
+def _up_from_frame(node: Node, world: str, root: str) -> list[float]:
+    """Return the z axis of the frame `world` in the root frame of the robot."""
     frames = StaticFrames(node, lambda: None)
     _, mat_rw = _waited_for(
         node, lambda: frames.pose(root, world), lambda: frames.waits_for(root, world)
@@ -257,7 +266,7 @@ def _up(node, world, root):
     return (mat_rw @ np.array([0.0, 0.0, 1.0])).tolist()
 
 
-def _message(
+def _first_message(
     node: Node,
     kind: type,
     topic: str,
@@ -265,14 +274,17 @@ def _message(
     usable: Callable[[Any], bool] = lambda message: True,
 ) -> Any:
     """Return the first usable message of a topic."""
-    came: list[Any] = []
-    subscription = node.create_subscription(
-        kind, topic, lambda message: came.extend([message] * usable(message)), qos
-    )
+    usable_messages: list[Any] = []
+
+    def add(message: Any) -> None:
+        if usable(message):
+            usable_messages.append(message)
+
+    subscription = node.create_subscription(kind, topic, add, qos)
     try:
         return _waited_for(
             node,
-            lambda: came[0] if came else None,
+            lambda: usable_messages[0] if usable_messages else None,
             lambda: (
                 f'a message on {node.resolve_topic_name(topic)}'
                 f' ({kind.__module__.split(".")[0]}/{kind.__name__})'
@@ -282,22 +294,25 @@ def _message(
         node.destroy_subscription(subscription)
 
 
-def _waited_for(node: Node, look: Callable[[], Found | None], what: Callable[[], str]) -> Found:
+def _waited_for(node: Node, look: Callable[[], Received | None], what: Callable[[], str]) -> Received:
     """
-    Return the first result of `look` that is not None.
+    Spin a node until `look` returns an object that is not None, and return it.
 
+    Meanwhile `what()`, a description of the object, is logged, the first time after one second.
     Raises an ExternalShutdownException when the context ends before.
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    said = time.monotonic() - WAIT_LOG_SECONDS + 1.0
+    logged_at = time.monotonic() - WAIT_LOG_SECONDS + 1.0
     try:
-        while (found := look()) is None:
+        while True:
+            awaited = look()
+            if awaited is not None:
+                return awaited
             executor.spin_once(timeout_sec=WAIT_SECONDS)
-            if time.monotonic() - said > WAIT_LOG_SECONDS:
+            if time.monotonic() - logged_at > WAIT_LOG_SECONDS:
                 node.get_logger().info(f'waits for {what()}')
-                said = time.monotonic()
-        return found
+                logged_at = time.monotonic()
     finally:
         executor.remove_node(node)
         executor.shutdown()
