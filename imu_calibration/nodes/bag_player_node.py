@@ -2,10 +2,13 @@
 
 import importlib
 import sys
+from collections.abc import Generator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
@@ -78,8 +81,8 @@ class BagPlayerNode(Node):
     def __init__(self) -> None:
         super().__init__('bag_player_node')
         self.settings = declare_parameters(self, PlayerSettings)
-        self._bag = self._open()
-        self._topics = self._choose()
+        self._bag = self._open_bag()
+        self._topics = self._choose_topics()
         announce(
             self,
             [],
@@ -87,7 +90,10 @@ class BagPlayerNode(Node):
             note=f'from the bag {files.user_path(self.settings.bag)}',
         )
         self._players = [self._publisher(name) for name in self._topics]
-        first = next((int(raw.received_ns()[0]) for raw in self._bag.stretches(self._topics)), 0)
+        first_ns = 0
+        for raw in self._bag.stretches(self._topics):
+            first_ns = int(raw.received_ns()[0])
+            break
         pace = Pace(
             self.settings.rate,
             100.0 if self.settings.clock else 0.0,
@@ -96,9 +102,9 @@ class BagPlayerNode(Node):
         self._playback = Playback(
             self,
             self._players,
-            self._batches(first),
+            self._batches(first_ns),
             pace=pace,
-            clock_start_ns=first,
+            clock_start_ns=first_ns,
             awaited=self._players,
             ended='played {} messages',
             ends_node=self.settings.stop_at_end,
@@ -120,7 +126,8 @@ class BagPlayerNode(Node):
         """Whether an error ended the playback."""
         return self._playback.failed
 
-    def _open(self):
+    def _open_bag(self) -> Rosbag2:
+        """Return the recording; raises an InputError where it cannot be read."""
         path = self.settings.bag
         if not path:
             raise InputError(
@@ -135,19 +142,20 @@ class BagPlayerNode(Node):
                 ' check the path'
             ) from error
 
-    def _choose(self):
-        asked = self.settings.topics.split()
-        unknown = [name for name in asked if name not in self._bag.types]
+    def _choose_topics(self) -> list[str]:
+        """Return the requested topics, or all with an installed type; at least one."""
+        requested = self.settings.topics.split()
+        unknown = [name for name in requested if name not in self._bag.types]
         if unknown:
             raise InputError(
                 f'{self.settings.bag} must contain the requested topics, it has no'
                 f' {", ".join(unknown)}; it contains {", ".join(sorted(self._bag.types))}'
             )
         chosen = []
-        for name in asked or sorted(self._bag.types):
+        for name in requested or sorted(self._bag.types):
             if _message_class(self._bag.types[name]) is not None:
                 chosen.append(name)
-            elif asked:
+            elif requested:
                 raise InputError(
                     f'the type {self._bag.types[name]} of {name} must be installed to be played, it'
                     ' is not; omit the topic'
@@ -163,7 +171,8 @@ class BagPlayerNode(Node):
             )
         return chosen
 
-    def _publisher(self, name):
+    def _publisher(self, name: str) -> Publisher:
+        """Return a publisher for a topic of the bag, latched as in the recording."""
         latched = any(
             profile.get('durability') == 'transient_local' for profile in self._bag.qos(name)
         )
@@ -171,15 +180,15 @@ class BagPlayerNode(Node):
         qos = latched_qos() if latched else output_qos(PLAYBACK_DEPTH)
         return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), qos)
 
-    def _batches(self, first_ns):
-        """Yield Batch after Batch, round after round."""
-        offset = 0.0
+    def _batches(self, first_ns: int) -> Generator[Batch, None, None]:
+        """Yield Batch after Batch, round after round; `first_ns` is due at the start."""
+        offset = 0.0  # start of the round, s
         while True:
             until = offset
             for raw in self._bag.stretches(self._topics):
-                due = np.maximum.accumulate(
-                    np.maximum((raw.received_ns() - first_ns) * 1e-9 + offset, until)
-                )
+                # Messages that were recorded out of order are due with the latest one before.
+                recorded = (raw.received_ns() - first_ns) * 1e-9 + offset
+                due = np.maximum.accumulate(np.maximum(recorded, until))
                 until = float(due[-1])
                 yield Batch(due, [self._players[k] for k in raw.topic], raw.packed.views(), until)
             offset = until + PAUSE
@@ -187,9 +196,11 @@ class BagPlayerNode(Node):
                 return
 
 
-def _message_class(message_type):
+def _message_class(message_type: str) -> Any:
     """Return the class of a type such as sensor_msgs/msg/Imu, or None when it is not installed."""
-    package, _, name = message_type.split('/') if message_type.count('/') == 2 else ('', '', '')
+    if message_type.count('/') != 2:
+        return None
+    package, _, name = message_type.split('/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except (ImportError, AttributeError, ValueError):

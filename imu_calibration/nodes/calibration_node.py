@@ -205,14 +205,14 @@ class CalibrationNode(Node):
         self.settings = declare_parameters(
             self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node']
         )
-        self._session = {
+        self._session_settings: dict[type, Any] = {
             LiveSettings: declare_parameters(self, LiveSettings, self._change_session),
             WindowSettings: declare_parameters(self, WindowSettings, self._change_session),
         }
         self._options = calibration_options(
             {name: chosen or None for name, chosen in self._choices().items()}
         )
-        self._session[LiveByHandSettings] = declare_parameters(
+        self._session_settings[LiveByHandSettings] = declare_parameters(
             self, LiveByHandSettings, self._change_place
         )
         robot = declare_parameters(self, RobotSettings)
@@ -222,7 +222,7 @@ class CalibrationNode(Node):
             ['imu/data_raw', *joints, 'imu/temperature'],
             ['imu/calibration', 'imu/residual', 'imu/coverage'],
         )
-        gravity, gravity_sd = self._session[LiveByHandSettings].place
+        gravity, gravity_sd = self._session_settings[LiveByHandSettings].place
         self._reference = live_reference(
             self,
             robot,
@@ -256,10 +256,11 @@ class CalibrationNode(Node):
             hints=HINTS['calibration_node'],
             provenance=self._provenance(robot),
         )
-        for what in ('solve', 'diagnose', 'save', 'reset'):
-            self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
+        for service in ('solve', 'diagnose', 'save', 'reset'):
+            self.create_service(Trigger, f'~/{service}', partial(self._serve, service))
         self._complaints = Complaints(self.get_logger())
         self._started = time.monotonic()
+        """Time of the start, s of the steady clock."""
         self._listen(joints)
         reference = self._reference.live_words(words_of(robot, self.settings.table_file))
         self.get_logger().info(f'calibrates {reference}; ~/save writes {place.calibration}')
@@ -272,16 +273,21 @@ class CalibrationNode(Node):
         self.worker.start()
 
     def _listen(self, joints: list[str]) -> None:
+        """Subscribe to the streams; `joints` has the topic of the joint states, if there is one."""
+        # Message type, topic, receiver.
         topics = {
             'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu),
             'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature),
         }
         for topic in joints:
             topics['joints'] = (JointState, topic, self._gatherer.add_joints)
-        self._inputs = {
-            name: BatchInput(self, kind, topic, add=add, depth=INPUT_DEPTH, single=name != 'joints')
-            for name, (kind, topic, add) in topics.items()
-        }
+        self._inputs: dict[str, BatchInput] = {}
+        for name, (kind, topic, add) in topics.items():
+            # The joints of an arm may have several publishers.
+            single = name != 'joints'
+            self._inputs[name] = BatchInput(
+                self, kind, topic, add=add, depth=INPUT_DEPTH, single=single
+            )
         watch_inputs(self, list(self._inputs.values()))
 
     def close(self) -> str:
@@ -289,59 +295,66 @@ class CalibrationNode(Node):
         return self.worker.end()
 
     def _choices(self) -> dict[str, Any]:
-        """Return the choices that the document names."""
+        """Return the choices that the document names: option -> value or path."""
         settings = self.settings
+        choices = {name: getattr(settings, name) for name in DOCUMENTED}
         paths = {
             'tolerances': settings.tolerances_file,
             'catalogue': settings.effects_file,
             'noise': settings.noise_file,
         }
-        return {name: getattr(settings, name) for name in DOCUMENTED} | {
-            k: files.user_path(path) for k, path in paths.items() if path
-        }
+        for name, path in paths.items():
+            if path:
+                choices[name] = files.user_path(path)
+        return choices
 
     def _provenance(self, robot: RobotSettings) -> dict[str, Any]:
+        """Return options and files for the document."""
         stand = stand_path(robot, self.settings.table_file)
         return provenance_with('calibration_node', (), self._choices(), stand=stand)
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
-        options = replace(self._options, windows=self._session[WindowSettings])
-        live = self._session[LiveSettings]
-        by_hand = self._session[LiveByHandSettings]
+        """Return a new session, or one that continues with the accumulator `saved`."""
+        options = replace(self._options, windows=self._session_settings[WindowSettings])
+        live = self._session_settings[LiveSettings]
+        by_hand = self._session_settings[LiveByHandSettings]
         return self._reference.live(options, live, by_hand, saved=saved)
 
     def _resumed(self, place: SessionFiles) -> LiveSession:
+        """Return the session that continues the saved one, or a new one where that fails."""
         try:
             live = self._make_live(place.earlier())
         except ImuCalibrationError as error:
-            kept = place.put_aside()  # a save would write over it
+            renamed = place.put_aside()  # a save would write over it
             say(
                 self.get_logger(),
                 LOG_ERROR,
                 f'the saved session cannot be continued: {error}; a new one starts, '
-                f'earlier motion is in {kept}',
+                f'earlier motion is in {renamed}',
             )
             return self._make_live()
         place.continue_earlier()
-        self.get_logger().info(
-            f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
-            if live.n_windows
-            else f'no session in {place.accumulator}: a new session starts'
-        )
+        line = f'no session in {place.accumulator}: a new session starts'
+        if live.n_windows:
+            line = f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
+        self.get_logger().info(line)
         return live
 
-    def _serve(self, what: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        answer = self.worker.ask(what)
-        while not wait([answer], 0.005).done:
-            for each in self._inputs.values():
-                each.drain()
+    def _serve(
+        self, service: str, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Execute a request in the worker's thread; receive messages meanwhile."""
+        outcome = self.worker.ask(service)
+        while not wait([outcome], 0.005).done:
+            for source in self._inputs.values():
+                source.drain()
             if not self.worker.is_alive():
                 break
-        response.success, response.message = answer.result() if answer.done() else (False, '')
+        response.success, response.message = outcome.result() if outcome.done() else (False, '')
         level = LOG_INFO
         if not response.success and not self.worker.state.is_gathering:
             level = LOG_ERROR
-        say(self.get_logger(), level, f'~/{what}: {response.message}')
+        say(self.get_logger(), level, f'~/{service}: {response.message}')
         self._diagnostics.publish_now()
         return response
 
@@ -349,14 +362,15 @@ class CalibrationNode(Node):
     # between two steps.
 
     def _change_files(self, group: CalibrationNodeSettings) -> None:
-        self.worker.autosave_period, self.settings = group.autosave_period, group
+        self.worker.autosave_period = group.autosave_period
+        self.settings = group
 
     def _change_place(self, group: LiveByHandSettings) -> None:
-        self._reference.check_place(self._session[LiveByHandSettings].place, group.place)
+        self._reference.check_place(self._session_settings[LiveByHandSettings].place, group.place)
         self._change_session(group)
 
     def _change_session(self, group: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
-        self._session[type(group)] = group
+        self._session_settings[type(group)] = group
         self.worker.ask(lambda: self.worker.change(group))
 
     def _publish_residuals(self, residuals: Any) -> None:
@@ -373,12 +387,12 @@ class CalibrationNode(Node):
     def _statuses(self) -> list:
         """Return the diagnostics, and print changes on the terminal."""
         state = self.worker.state
-        about_topics = [line for each in self._inputs.values() for line in each.faults()]
         streams = state.streams
-        silent = []
-        if streams is not None:
-            for name in streams.silent:
-                silent.append(self._inputs[name].silence(streams.unusable.get(name, '')))
+
+        # Faults of the topics, silent streams, and streams with faulty samples.
+        about_topics = []
+        for source in self._inputs.values():
+            about_topics += source.faults()
         if 'joints' not in self._inputs and self.count_publishers(
             self.resolve_topic_name('joint_states')
         ):
@@ -386,11 +400,13 @@ class CalibrationNode(Node):
                 'joint states are published and not listened to: '
                 "to calibrate on a table or an arm give 'table_file' or 'urdf_file'"
             )
-        trouble = (
-            [state.streams.message]
-            if state.streams is not None and state.streams.word == 'trouble' and not silent
-            else []
-        )
+        silent = []
+        trouble = []
+        if streams is not None:
+            for name in streams.silent:
+                silent.append(self._inputs[name].silence(streams.unusable.get(name, '')))
+            if streams.word == 'trouble' and not silent:
+                trouble.append(streams.message)
         if time.monotonic() - self._started > MAX_SILENCE_SECONDS:
             self._complaints.now('calibration', about_topics + silent, state.faults)
             self._complaints.now('streams', trouble, patience=REMINDER)

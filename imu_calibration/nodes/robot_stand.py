@@ -294,7 +294,9 @@ def _first_message(
         node.destroy_subscription(subscription)
 
 
-def _waited_for(node: Node, look: Callable[[], Received | None], what: Callable[[], str]) -> Received:
+def _waited_for(
+    node: Node, look: Callable[[], Received | None], what: Callable[[], str]
+) -> Received:
     """
     Spin a node until `look` returns an object that is not None, and return it.
 

@@ -10,7 +10,7 @@ without points the table stops). out: imu/data_raw (sensor_msgs/Imu), joint_stat
 import queue
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -22,11 +22,14 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.motion_limits import limits_of
+from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, run_node
@@ -194,7 +197,7 @@ class SimulatorNode(Node):
     def __init__(self) -> None:
         super().__init__('simulator_node')
         self.settings = settings = declare_parameters(self, SimulatorSettings)
-        self._controller = declare_parameters(self, ControllerSettings)
+        self._controller_settings = declare_parameters(self, ControllerSettings)
         kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
         if settings.temperature:
             kinds.append((Temperature, 'imu/temperature'))
@@ -204,17 +207,11 @@ class SimulatorNode(Node):
         announce(self, ['joint_trajectory'], [*topics, '/clock'] if settings.clock else topics)
         self._table, self._motion = self._make_table()
         imu_seed = settings.seed if settings.imu_seed < 0 else settings.imu_seed
-        truth = (
-            files.read_calibration(files.user_path(settings.calibration_file))
-            if settings.calibration_file
-            else None
-        )
-        model, values = true_imu(
-            self._table,
-            (truth.model, truth.values) if truth else None,
-            settings.grade,
-            seed=imu_seed,
-        )
+        given_imu = None
+        if settings.calibration_file:
+            truth = files.read_calibration(files.user_path(settings.calibration_file))
+            given_imu = (truth.model, truth.values)
+        model, values = true_imu(self._table, given_imu, settings.grade, seed=imu_seed)
         start_ns = int(settings.start_time * 1e9) or time.time_ns()
         causes = hidden_causes(
             settings.hide.split('+') if settings.hide else [], imu_seed, settings.hide_size
@@ -229,13 +226,16 @@ class SimulatorNode(Node):
             start_ns=start_ns,
             causes=causes,
         )
-        self._trajectories = queue.Queue()
-        self._driven: dict[str, Any] = {'followed': 0, 'refused': 0, 'why refused': ''}
+        self._trajectories: queue.Queue[JointTrajectory] = queue.Queue()
+        """Received trajectories, which the playback's thread starts between two batches."""
+        self._trajectory_figures: dict[str, Any] = {'followed': 0, 'refused': 0, 'why refused': ''}
+        """Numbers of trajectories, and the reason of the last refusal, for the diagnostics."""
         self._publish_truth(model, values)
         publishers = [
             self.create_publisher(kind, topic, output_qos(PLAYBACK_DEPTH)) for kind, topic in kinds
         ]
-        self._to = dict(zip(topics, publishers, strict=True))
+        self._publisher_of = dict(zip(topics, publishers, strict=True))
+        """Relative name of a topic -> its publisher."""
         pace = Pace(
             settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers
         )
@@ -270,27 +270,26 @@ class SimulatorNode(Node):
         """Whether an error ended the simulation."""
         return self._playback.failed
 
-    def _make_table(self):
+    def _make_table(self) -> tuple[Table, TableController]:
+        """Return the table, and its motion by the profile and received trajectories."""
         settings = self.settings
         robot = declare_parameters(self, RobotSettings)
         table = chain_of(self, robot, settings.table_file, frame_id=settings.frame_id)
         table = table or files.read_table(config_file('table_simulated.yaml'))
-        profile = (
-            None
-            if settings.profile in NO_PROFILE
-            else make_profile(settings.profile, settings.seed, table)
-        )
-        if profile is not None:
+        profile = None
+        if settings.profile not in NO_PROFILE:
+            profile = make_profile(settings.profile, settings.seed, table)
             table = profile.table_moved(table)
         return table, TableController(
             profile,
             tuple(table.joint_names),
             limits=limits_of(table),
-            settings=self._controller,
+            settings=self._controller_settings,
             repeat=settings.repeat,
         )
 
-    def _options(self):
+    def _options(self) -> SimulationOptions:
+        """Return rates, noise and parts of the simulated messages."""
         settings = self.settings
         noise = replace(
             GRADES[settings.grade].noise,
@@ -306,35 +305,42 @@ class SimulatorNode(Node):
             frame_id=settings.frame_id,
         )
 
-    def _publish_truth(self, model, values):
+    def _publish_truth(self, model: SensorModel, values: np.ndarray) -> None:
+        """Publish the true parameters as a calibration document."""
         truth = true_calibration(
             model, values, self.settings.frame_id, simulated={'seed': self.settings.seed}
         )
         self._truth = self.create_publisher(String, '~/truth', latched_qos())
         self._truth.publish(String(data=calibration_to_text(truth)))
 
-    def _batches(self):
+    def _batches(self) -> Generator[Batch, None, None]:
         """Yield Batch after Batch; a received trajectory starts between two of them."""
-        until = 0.0
+        until = 0.0  # s of simulated time
         step = STRETCH_SECONDS * max(self.settings.time_factor, 1.0)
         while until < self._motion.end or not self.settings.stop_at_end:
             while not self._trajectories.empty():
                 self._take_over(until, self._trajectories.get())
-            until = (
-                min(until + step, self._motion.end) if self.settings.stop_at_end else until + step
-            )
+            until += step
+            if self.settings.stop_at_end:
+                until = min(until, self._motion.end)
             yield self._batch(self._simulation.take(until), until)
 
-    def _batch(self, block, until):
-        encode = partial(encode_joints, with_velocity=self.settings.velocity)
+    def _batch(self, block: SampleBlock, until: float) -> Batch:
+        """Return the messages of a block of samples in the order of their stamps."""
+        encode_with_velocity = partial(encode_joints, with_velocity=self.settings.velocity)
+        # Publisher, samples, and function that encodes them.
         parts: list[tuple[Any, Any, Callable]] = [
-            (self._to['imu/data_raw'], block.imu, encode_imu),
-            (self._to['joint_states'], block.joints, encode),
+            (self._publisher_of['imu/data_raw'], block.imu, encode_imu),
+            (self._publisher_of['joint_states'], block.joints, encode_with_velocity),
         ]
-        if 'imu/temperature' in self._to:
-            parts.append((self._to['imu/temperature'], block.temperature, encode_temperature))
-        if 'imu/truth' in self._to:
-            parts.append((self._to['imu/truth'], self._simulation.truth(block), encode_imu))
+        if 'imu/temperature' in self._publisher_of:
+            parts.append(
+                (self._publisher_of['imu/temperature'], block.temperature, encode_temperature)
+            )
+        if 'imu/truth' in self._publisher_of:
+            parts.append(
+                (self._publisher_of['imu/truth'], self._simulation.truth(block), encode_imu)
+            )
         due = np.concatenate(
             [(samples.stamp_ns - self._simulation.start_ns) * 1e-9 for _, samples, _ in parts]
         )
@@ -349,19 +355,25 @@ class SimulatorNode(Node):
             due[order], [publishers[k] for k in order], [messages[k] for k in order], until
         )
 
-    def _take_over(self, now, message):
+    def _take_over(self, now: float, message: JointTrajectory) -> None:
+        """Follow a trajectory from `now` on, s of simulated time, or report its refusal."""
         try:
             self._motion.follow(now, trajectory_from_message(message))
-            self._driven['followed'] += 1
+            self._trajectory_figures['followed'] += 1
         except ImuCalibrationError as error:
-            self._driven['refused'] += 1
-            self._driven['why refused'] = str(error)
+            self._trajectory_figures['refused'] += 1
+            self._trajectory_figures['why refused'] = str(error)
             self.get_logger().warning(f'{error}; the trajectory is not followed')
 
-    def _statuses(self):
-        refused = self._driven['why refused']
-        text = f'the last refused trajectory: {refused}' if refused else 'follows joint_trajectory'
-        return [make_status(WARN if refused else OK, 'table', text, values=dict(self._driven))]
+    def _statuses(self) -> list:
+        """Return the status 'table' for the diagnostics."""
+        level = OK
+        text = 'follows joint_trajectory'
+        reason = self._trajectory_figures['why refused']
+        if reason:
+            level = WARN
+            text = f'the last refused trajectory: {reason}'
+        return [make_status(level, 'table', text, values=dict(self._trajectory_figures))]
 
 
 def main(arguments: list[str] | None = None) -> int:

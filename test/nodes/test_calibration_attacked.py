@@ -254,7 +254,7 @@ def test_parameters_change_while_it_runs_or_say_why_not(bench, tmp_path):
     (line,) = unknown_parameters(node)
     assert "'setling'" in line and "'settling'" in line
     assert node.set_parameters([Parameter('settling', value=2.0)])[0].successful
-    assert node._session[WindowSettings].settling == 2.0
+    assert node._session_settings[WindowSettings].settling == 2.0
     # The place of `~/save` too: a participant must not redirect what it writes.
     for name, value in (
         ('model_as_asked', True),
