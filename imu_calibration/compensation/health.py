@@ -57,7 +57,7 @@ class Stop:
     Mean of specific force and rate over the later half, m/s^2 and rad/s, shape (6,): a slow stop
     settles in the earlier half.
     """
-    others: np.ndarray
+    further_mean: np.ndarray
     """Mean of the further columns over the later half, shape (k,)."""
     shake_sd: np.ndarray
     """Standard deviation of the samples in the blocks of the later half, shape (6,)."""
@@ -90,14 +90,18 @@ class StopDetector:
     def __init__(self, noise_sd: np.ndarray):
         self._noise_sd = np.asarray(noise_sd, float)
         self._most_variance = (MOST_SHAKE + 4 * self._noise_sd) ** 2
-        self._rest: np.ndarray = np.zeros((0, 1))
+        """Largest variance of the samples in a block at rest, shape (6,)."""
+        self._incomplete: np.ndarray = np.zeros((0, 1))
+        """Samples of the block that is not complete yet, as the argument of `push`."""
         self._blocks: list[np.ndarray] = []
         """
-        Start, end, samples, means of the columns, variances of force and rate; shape (3 + 6 + k +
-        6,) each.
+        The last `N_BLOCKS` blocks: start, end, samples, means of the columns, variances of force
+        and rate; shape (3 + 6 + k + 6,) each.
         """
-        self._stand: list[np.ndarray] = []
+        self._still_blocks: list[np.ndarray] = []
+        """All blocks of the present stop, as `_blocks`; empty while the IMU moves."""
         self._stop: Stop | None = None
+        """The stop of these blocks."""
 
     def push(self, rows: np.ndarray) -> Stop | None:
         """
@@ -109,18 +113,19 @@ class StopDetector:
             Time in s, specific force, rate, and columns of which the means are wanted as well.
 
         """
-        rows = np.concatenate([self._rest, rows]) if len(self._rest) else rows
+        rows = np.concatenate([self._incomplete, rows]) if len(self._incomplete) else rows
         while len(rows) and rows[-1, 0] - rows[0, 0] >= HEALTH_BLOCK_SECONDS:
             n = max(int(np.searchsorted(rows[:, 0], rows[0, 0] + HEALTH_BLOCK_SECONDS)), 1)
-            self._take(rows[:n])
+            self._take_block(rows[:n])
             rows = rows[n:]
-        self._rest = rows
+        self._incomplete = rows
         return self._stop
 
-    def _take(self, rows):
-        """Process one block, or restart after a gap."""
+    def _take_block(self, rows: np.ndarray) -> None:
+        """Process the samples of one block, or restart after a gap; rows as of `push`."""
         if self._blocks and rows[0, 0] - self._blocks[-1][1] > HEALTH_BLOCK_SECONDS:
-            self._blocks, self._stand = [], []
+            self._blocks = []
+            self._still_blocks = []
         block = np.concatenate(
             [
                 [rows[0, 0], rows[-1, 0], len(rows)],
@@ -129,54 +134,54 @@ class StopDetector:
             ]
         )
         self._blocks = [*self._blocks[-N_BLOCKS + 1 :], block]
-        if not self._may_be_still(block) or not self._is_still():
-            self._stand = []
-        elif self._stand and block[1] - self._stand[0][0] <= MAX_STOP_SECONDS:
-            self._stand.append(block)
+        if not self._is_calm(block) or not self._do_blocks_agree():
+            self._still_blocks = []
+        elif not self._still_blocks:
+            self._still_blocks = list(self._blocks)  # a stop begins
+        elif block[1] - self._still_blocks[0][0] <= MAX_STOP_SECONDS:
+            self._still_blocks.append(block)
         else:
-            self._stand = [block] if self._stand else list(self._blocks)
-        self._stop = _stop_of(np.array(self._stand)) if self._stand else None
+            self._still_blocks = [block]  # a long rest counts as several
+        self._stop = _stop_from(np.array(self._still_blocks)) if self._still_blocks else None
 
-    def _may_be_still(self, block):
-        """
-        Return whether a block turns and shakes little enough by itself.
+    def _is_calm(self, block: np.ndarray) -> bool:
+        """Return whether rate and variances of a block, by itself, are those of a rest."""
+        rate = block[6:9]
+        if rate @ rate >= MOST_RATE**2:
+            return False
+        variance = block[-6:]
+        return bool((variance <= self._most_variance).all())
 
-        Most blocks of a robot that drives do not.
-        """
-        return block[6:9] @ block[6:9] < MOST_RATE**2 and bool(
-            (block[-6:] <= self._most_variance).all()
-        )
-
-    def _is_still(self):
+    def _do_blocks_agree(self) -> bool:
+        """Return whether the means of the last `N_BLOCKS` blocks are equal within their noise."""
         if len(self._blocks) < N_BLOCKS:
             return False
         blocks = np.array(self._blocks)
+        n_samples = blocks[:, 2]
+        means = blocks[:, 3:9]
         variance = blocks[:, -6:].max(axis=0)
         # Vibration of the robot is noise for the means as well.
-        allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * np.maximum(
-            self._noise_sd, np.sqrt(variance)
-        ) / np.sqrt(blocks[:, 2].min())
-        return bool(
-            (np.ptp(blocks[:, 3:9], axis=0) <= allowed).all()
-            and (variance <= self._most_variance).all()
-        )
+        sample_sd = np.maximum(self._noise_sd, np.sqrt(variance))
+        allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * sample_sd / np.sqrt(n_samples.min())
+        is_change_small = (np.ptp(means, axis=0) <= allowed).all()
+        return bool(is_change_small and (variance <= self._most_variance).all())
 
 
-def _stop_of(stand):
+def _stop_from(blocks: np.ndarray) -> Stop:
     """Return the `Stop` of the blocks of a rest, shape (n, 3 + 6 + k + 6)."""
-    half = len(stand) // 2
-    early, late = (
-        np.average(part[:, 3:], axis=0, weights=part[:, 2])
-        for part in (stand[: half or None], stand[half:])
-    )
+    half = len(blocks) // 2
+    early_blocks = blocks[: half or None]  # one block is both halves
+    late_blocks = blocks[half:]
+    early = np.average(early_blocks[:, 3:], axis=0, weights=early_blocks[:, 2])
+    late = np.average(late_blocks[:, 3:], axis=0, weights=late_blocks[:, 2])
     return Stop(
-        float(stand[0, 0]),
-        float(stand[-1, 1]),
-        int(stand[half:, 2].sum()),
-        late[:6],
-        late[6:-6],
-        np.sqrt(late[-6:]),
-        (late - early)[:6],
+        start=float(blocks[0, 0]),
+        end=float(blocks[-1, 1]),
+        n_samples=int(late_blocks[:, 2].sum()),
+        mean=late[:6],
+        further_mean=late[6:-6],
+        shake_sd=np.sqrt(late[-6:]),
+        change=(late - early)[:6],
     )
 
 
@@ -204,13 +209,19 @@ class GyroBiasUpdate:
     def __init__(self, prior_sd: np.ndarray, time: float):
         prior = np.asarray(prior_sd, float) ** 2
         self._time = time
-        self._stop = float('nan')
+        self._stop_start = float('nan')
+        """Start of the last stop, which identifies it, s."""
         self.n_stops = 0
-        self._now = self._before = _State(np.zeros(3), prior, prior, np.zeros(3))
+        """Number of stops."""
+        self._before = _BiasState(np.zeros(3), prior, prior, np.zeros(3))
+        """Bias before the last stop."""
+        self._latest = self._before
+        """Bias after the last measurement."""
 
     def predict(self, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Return (bias, its variance) at `now`, s; rad/s and its square, each shape (3,)."""
-        return self._now.after(now, self._time)[:2]
+        state = self._latest.after(now, self._time)
+        return state.bias, state.variance
 
     def measure(self, start: float, now: float, *, rate: np.ndarray, variance: np.ndarray) -> None:
         """
@@ -228,40 +239,58 @@ class GyroBiasUpdate:
             Of that mean; the Earth's rate is added here.
 
         """
-        if start != self._stop:
-            self._stop, self._before, self.n_stops = start, self._now, self.n_stops + 1
-        variance = variance + EARTH_RATE**2 / 3  # about axes that are unknown here
-        bias, spread, seen, weight = self._before.after(now, self._time)
-        seen = seen + rate**2
-        weight = weight + 1
-        stationary = np.maximum(self._before.stationary, seen / weight)
-        # It has been as wide before anybody saw it.
-        spread = spread + np.maximum(stationary - self._before.stationary, 0)
-        gain = spread / (spread + variance)
-        self._now = _State(
-            bias + gain * (rate - bias), (1 - gain) * spread, stationary, seen, weight, now
+        if start != self._stop_start:
+            self._stop_start = start
+            self._before = self._latest
+            self.n_stops += 1
+        rate_variance = variance + EARTH_RATE**2 / 3  # about axes that are unknown here
+        predicted = self._before.after(now, self._time)
+
+        # The stationary variance is at least the mean square of the measured rates. The prediction
+        # had a larger one too, before it was measured.
+        square_sum = predicted.square_sum + rate**2
+        weight = predicted.weight + 1
+        stationary = np.maximum(self._before.stationary, square_sum / weight)
+        prior = predicted.variance + np.maximum(stationary - self._before.stationary, 0)
+
+        gain = prior / (prior + rate_variance)
+        self._latest = _BiasState(
+            bias=predicted.bias + gain * (rate - predicted.bias),
+            variance=(1 - gain) * prior,
+            stationary=stationary,
+            square_sum=square_sum,
+            weight=weight,
+            at=now,
         )
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    bias: np.ndarray
-    variance: np.ndarray
-    stationary: np.ndarray
-    """Variance without stops."""
-    seen: np.ndarray
-    """Sum of squares of the updates, with decreasing weight of older stops."""
-    weight: float = 0.0
-    at: float = 0.0
+class _BiasState:
+    """Gauss-Markov process of the residual bias at one time, each array of shape (3,)."""
 
-    def after(self, now, time):
-        """Return (bias, variance, seen, weight) at `now`."""
+    bias: np.ndarray
+    """Estimate, rad/s."""
+    variance: np.ndarray
+    """Variance of its error, (rad/s)^2."""
+    stationary: np.ndarray
+    """Variance without stops, (rad/s)^2."""
+    square_sum: np.ndarray
+    """Weighted sum of the squared rates of the stops, (rad/s)^2."""
+    weight: float = 0.0
+    """Sum of these weights, which decay with the age of a stop; 0: no stop yet."""
+    at: float = 0.0
+    """Time, s."""
+
+    def after(self, now: float, time: float) -> '_BiasState':
+        """Return the state predicted for `now`, with the correlation time, both in s."""
         phi = np.exp(-max(now - self.at, 0.0) / time) if self.weight else 0.0
-        return (
-            phi * self.bias,
-            phi**2 * self.variance + (1 - phi**2) * self.stationary,
-            phi * self.seen,
-            phi * self.weight,
+        return _BiasState(
+            bias=phi * self.bias,
+            variance=phi**2 * self.variance + (1 - phi**2) * self.stationary,
+            stationary=self.stationary,
+            square_sum=phi * self.square_sum,
+            weight=phi * self.weight,
+            at=now,
         )
 
 
@@ -306,6 +335,20 @@ class HealthOptions:
     """Seconds in which an update loses its meaning."""
 
 
+@dataclass(frozen=True, eq=False)
+class _JudgedStop:
+    """A stop with the quantities of its evaluation."""
+
+    stop: Stop
+    """The stop."""
+    mean_variance: np.ndarray
+    """Variance of its mean (force, rate), shape (6,)."""
+    n_stops: int
+    """Number of stops up to this one."""
+    bias_update: tuple[np.ndarray, np.ndarray] | None
+    """Residual bias of the gyroscope and its variance, each shape (3,); None without an update."""
+
+
 class CalibrationHealth:
     """
     Judges stops of a stream of corrected readings.
@@ -324,6 +367,7 @@ class CalibrationHealth:
     ):
         self.options = options
         self.n_stops = 0
+        """Number of stops that were judged."""
 
         # White noise in the axes of the output: variances are rotated with squared cosines. The
         # drift of a bias is as likely in each direction.
@@ -337,6 +381,7 @@ class CalibrationHealth:
         self.noise_sd = np.concatenate(noise_sds)
         of_parameters = Uncertainty(calibration, transfer).at().parameters
         self._known = of_parameters + np.diag(drift_variances)
+        """Covariance of corrected (force, rate) at rest from parameters and drift, shape (6, 6)."""
 
         # Gravity at the place of calibration differs from that here, unless it is given.
         stated = options.gravity or calibration.conditions.get('gravity')
@@ -347,9 +392,10 @@ class CalibrationHealth:
         if options.update:
             bias_sd = np.sqrt(np.diag(self._known)[3:])
             self.update = GyroBiasUpdate(bias_sd, options.bias_time)
-        self._judged: float | None = None
-        self._last: tuple | None = None
-        """Arguments of `_evaluated`; replaced as a whole, so that another thread may read it."""
+        self._judged_start: float | None = None
+        """Start of the last judged stop, which identifies it, s."""
+        self._last: _JudgedStop | None = None
+        """The last judged stop; replaced as one object, so that another thread may read it."""
 
     def judge(self, stop: Stop) -> None:
         """
@@ -358,55 +404,56 @@ class CalibrationHealth:
         Parameters
         ----------
         stop : Stop
-            Of corrected readings without any update; its `others` are the measured specific force
+            Of corrected readings without any update; its `further_mean` are the measured specific force
             and rate.
 
         """
         if stop.seconds < MIN_STOP_SECONDS or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
             return  # too short, or a slow and steady turn
-        if self._judged != stop.start:
-            self._judged, self.n_stops = stop.start, self.n_stops + 1
+        if self._judged_start != stop.start:
+            self._judged_start = stop.start
+            self.n_stops += 1
         # A mean with a trend is not rest: motion that decays is an error of the mean of about its
         # change.
-        of_mean = (
-            np.maximum(stop.shake_sd, self.noise_sd) ** 2 / stop.n_samples + (2 * stop.change) ** 2
-        )
+        sample_sd = np.maximum(stop.shake_sd, self.noise_sd)
+        mean_variance = sample_sd**2 / stop.n_samples + (2 * stop.change) ** 2
+        bias_update = None
         if self.update is not None:
-            self.update.measure(stop.start, stop.end, rate=stop.mean[3:], variance=of_mean[3:])
-        self._last = (
-            stop,
-            of_mean,
-            self.n_stops,
-            None if self.update is None else self.update.predict(stop.end),
-        )
+            rate_variance = mean_variance[3:]
+            self.update.measure(stop.start, stop.end, rate=stop.mean[3:], variance=rate_variance)
+            bias_update = self.update.predict(stop.end)
+        self._last = _JudgedStop(stop, mean_variance, self.n_stops, bias_update)
 
     @property
     def state(self) -> LiveState:
         """Result of the last stop, computed on request."""
-        return (
-            LiveState(WAITING, 'no stop of two seconds yet')
-            if self._last is None
-            else self._evaluated(*self._last)
-        )
+        if self._last is None:
+            return LiveState(WAITING, 'no stop of two seconds yet')
+        return self._evaluated(self._last)
 
-    def _evaluated(self, stop, of_mean, n_stops, bias_update):
+    def _evaluated(self, judged: _JudgedStop) -> LiveState:
         """
-        Return the state after a stop.
+        Return the state after a stop, from the errors of rate and gravity at rest.
 
-        From the variance of its mean, (6,), and the corrected bias with its variance, or None.
+        They are counted in standard deviations, beyond the Earth's rate and the local differences
+        of gravity::
+
+            rate_off  = max(|w| - Earth's rate, 0) / sd(w)             each axis
+            force_off = max(||f| - g| - local differences, 0) / sd(|f|)
         """
-        # Rate and gravity at rest, in standard deviations beyond the Earth's rate and the local
-        # differences of gravity.
-        total = self._known + np.diag(of_mean)
-        along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
-        rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])
-        gravity_sd = float(np.sqrt(along @ total[:3, :3] @ along))
+        stop = judged.stop
+        bias_update = judged.bias_update
+        covariance = self._known + np.diag(judged.mean_variance)
         rate = stop.mean[3:]
-        length = float(np.linalg.norm(stop.mean[:3]))
-        force_off = max(abs(length - self._gravity) - self._place * self._gravity, 0) / gravity_sd
+        rate_off = np.maximum(np.abs(rate) - EARTH_RATE, 0) / np.sqrt(np.diag(covariance)[3:])
         axis = int(np.argmax(rate_off))
+        length = float(np.linalg.norm(stop.mean[:3]))
+        vertical = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
+        gravity_sd = float(np.sqrt(vertical @ covariance[:3, :3] @ vertical))
+        gravity_error = abs(length - self._gravity)
+        force_off = max(gravity_error - self._place * self._gravity, 0) / gravity_sd
         values = {
-            'stops': n_stops,
+            'stops': judged.n_stops,
             'seconds of the last stop': f'{stop.seconds:.1f}',
             'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate),
             'rate at rest [sd]': f'{rate_off.max():.1f}',
@@ -414,9 +461,8 @@ class CalibrationHealth:
             'gravity expected [m/s^2]': f'{self._gravity:.4f}',
             'gravity off [sd]': f'{force_off:.1f}',
         }
-        measured_length, measured_rate = (
-            float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6))
-        )
+        measured_length = float(np.linalg.norm(stop.further_mean[:3]))
+        measured_rate = float(np.linalg.norm(stop.further_mean[3:6]))
 
         # Readings in another unit have no other state.
         unit = unit_of_rest(measured_length)
@@ -455,12 +501,12 @@ class CalibrationHealth:
                 f'the calibration holds: at the last stop rate and gravity were off by {off}',
                 values,
             )
-        harms = (rate_off[axis] > LIMIT and np.linalg.norm(rate) > WORSE * measured_rate) or (
-            force_off > LIMIT
-            and abs(length - self._gravity)
-            > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd
-        )
-        if harms:
+
+        # The same errors without the calibration.
+        rate_is_worse = np.linalg.norm(rate) > WORSE * measured_rate
+        measured_error = abs(measured_length - self._gravity)
+        force_is_worse = gravity_error > WORSE * measured_error + LIMIT * gravity_sd
+        if (rate_off[axis] > LIMIT and rate_is_worse) or (force_off > LIMIT and force_is_worse):
             return LiveState(
                 HARMS,
                 '; '.join(lines)
@@ -499,9 +545,14 @@ class StopWatch:
     def __init__(self, health: CalibrationHealth):
         self.health = health
         self._detector = StopDetector(health.noise_sd)
-        self._waiting: list[SIX] = []
-        self._first_ns = self._look = 0
-        self._offset: tuple[float, float, float] | None = None
+        self._samples: list[SIX] = []
+        """Samples since the last evaluation: ns since `_first_ns`, corrected, measured."""
+        self._first_ns = 0
+        """Stamp of the first sample; 0 before it."""
+        self._next_ns = 0
+        """Time of the next evaluation, ns since `_first_ns`."""
+        self._bias: tuple[float, float, float] | None = None
+        """Bias of the corrected rate at the last evaluation, rad/s; None without an update."""
 
     def follow(self, stamp_ns: int, measured: SIX, corrected: SIX) -> SIX:
         """
@@ -509,38 +560,41 @@ class StopWatch:
 
         Return the corrected one minus the bias update.
         """
-        since = stamp_ns - self._first_ns
-        self._waiting.append((since, *corrected, *measured))
-        if since >= self._look or since < 0:
-            self._take(stamp_ns)
-        if self._offset is None:
+        since_ns = stamp_ns - self._first_ns
+        self._samples.append((since_ns, *corrected, *measured))
+        if since_ns >= self._next_ns or since_ns < 0:
+            self._evaluate(stamp_ns)
+        if self._bias is None:
             return corrected
-        bx, by, bz = self._offset
+        bx, by, bz = self._bias
         return (corrected[0] - bx, corrected[1] - by, corrected[2] - bz, *corrected[3:])
 
     @property
     def rate_cov(self) -> np.ndarray:
-        """Covariance of the correction of the rate, shape (3, 3)."""
-        if self._offset is None or self.health.update is None:
+        """Covariance of the bias update that is subtracted from the rate, shape (3, 3)."""
+        if self._bias is None or self.health.update is None:
             return np.zeros((3, 3))
-        return np.diag(self.health.update.predict(self._look * 1e-9)[1])
+        _, variance = self.health.update.predict(self._next_ns * 1e-9)
+        return np.diag(variance)
 
-    def _take(self, stamp_ns):
+    def _evaluate(self, stamp_ns: int) -> None:
+        """Judge the stop at the end of the stored samples, or start again without them."""
         if stamp_ns < self._first_ns or not self._first_ns:  # the beginning, or a clock set back
-            self._first_ns, self._look, self._waiting, self._detector = (
-                stamp_ns,
-                0,
-                [],
-                StopDetector(self.health.noise_sd),
-            )
+            self._first_ns = stamp_ns
+            self._next_ns = 0
+            self._samples = []
+            self._detector = StopDetector(self.health.noise_sd)
             return
-        samples = np.array(self._waiting)
-        since = int(samples[-1, 0])
-        self._waiting, self._look = [], since + round(1e9 * HEALTH_BLOCK_SECONDS)
+        samples = np.array(self._samples)
+        since_ns = int(samples[-1, 0])
+        self._samples = []
+        self._next_ns = since_ns + round(1e9 * HEALTH_BLOCK_SECONDS)
         rows = samples[:, AS_STOPS]
         rows[:, 0] *= 1e-9
         stop = self._detector.push(rows)
         if stop is not None:
             self.health.judge(stop)
         if self.health.update is not None and self.health.update.n_stops:
-            self._offset = tuple(self.health.update.predict(since * 1e-9)[0].tolist())
+            bias, _ = self.health.update.predict(since_ns * 1e-9)
+            bx, by, bz = bias.tolist()
+            self._bias = (bx, by, bz)
