@@ -50,9 +50,7 @@ def choose_derivative(
     period: float, rate_sd: float, arm: float, *, force_sd: float
 ) -> CausalDerivative:
     """
-    Return the shortest window with little enough noise through the arm.
-
-    The noise of the window, through the arm, is below a third of the accelerometer's noise.
+    Return the shortest derivative whose noise times the arm is at most ``force_sd / 3``.
 
     Parameters
     ----------
@@ -68,11 +66,11 @@ def choose_derivative(
     longest = max(2, int(2 * MAX_DERIVATIVE_DELAY / period) + 1)
     if not (rate_sd > 0 and force_sd > 0):
         return CausalDerivative((longest + 2) // 2, period)
-    candidates = [CausalDerivative(taps, period) for taps in range(2, longest + 1)]
-    return next(
-        (each for each in candidates if each.noise_sd(rate_sd) * arm <= force_sd / 3),
-        candidates[-1],
-    )
+    for taps in range(2, longest):
+        derivative = CausalDerivative(taps, period)
+        if derivative.noise_sd(rate_sd) * arm <= force_sd / 3:
+            return derivative
+    return CausalDerivative(longest, period)
 
 
 RESET_NS = 1_000_000_000
@@ -110,27 +108,37 @@ class StampedDerivative:
     """
 
     def __init__(self, derivative: CausalDerivative):
-        self.taps, self.period = derivative.taps, derivative.period
+        self.taps = derivative.taps
+        self.period = derivative.period
         self._period_ns = derivative.period * 1e9
-        self._least = max(2, (self.taps + 1) // 2)
-        self._scale = [
-            0.0,
-            0.0,
-            *(12.0 / (n * (n * n - 1.0)) / self.period for n in range(2, self.taps + 1)),
-        ]
+        self._min_samples = max(2, (self.taps + 1) // 2)
+        """Samples from which the derivative is not zero."""
+        self._scale = [0.0, 0.0]
+        """
+        ``1 / (Sxx period)`` of n samples at index n, with ``Sxx = n (n^2 - 1) / 12`` of the numbers
+        of the samples, 1/s.
+        """
+        for n in range(2, self.taps + 1):
+            self._scale.append(12.0 / (n * (n * n - 1.0)) / self.period)
         self._restart()
         self._newest: int | None = None
+        """Stamp of the newest sample, ns."""
         self.alpha: tuple = NO_SLOPE
+        """Derivative after the newest sample, per second."""
 
-    def _restart(self):
-        self._window = deque()
+    def _restart(self) -> None:
+        """Empty the window."""
+        self._window: deque[tuple[float, float, float]] = deque()
+        """Samples of the window, the oldest first."""
         self._sums = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        self._age = 0
+        """``S = sum v_k`` and ``P = sum k v_k`` per axis, k from the oldest sample."""
+        self._sum_age = 0
+        """Samples since the sums were recomputed."""
 
     @property
     def n_used(self) -> int:
-        """Number of samples in the derivative of now; 0 while there are too few of them."""
-        return len(self._window) if len(self._window) >= self._least else 0
+        """Number of samples in the present derivative; 0 while there are too few of them."""
+        return len(self._window) if len(self._window) >= self._min_samples else 0
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return the derivative (x, y, z) after one more sample, per second."""
@@ -144,11 +152,11 @@ class StampedDerivative:
                     or (step > MAX_REGULAR_STEP and abs(step - round(step)) <= WHOLE_GAP_SHARE)
                     or step > MAX_LATE_STEP
                 ):
-                    self._hole(step, x, y, z)
+                    self._bridge_gap(step, x, y, z)
         self._newest = stamp_ns
         self._add(x, y, z)
         n = len(self._window)
-        if n < self._least:
+        if n < self._min_samples:
             self.alpha = NO_SLOPE
         else:
             sx, sy, sz, px, py, pz = self._sums
@@ -161,8 +169,8 @@ class StampedDerivative:
             )
         return self.alpha
 
-    def _add(self, x, y, z):
-        """Slide the window: S = sum of v_k, P = sum of k v_k, k from the oldest."""
+    def _add(self, x: float, y: float, z: float) -> None:
+        """Add a sample v_n to the window: S += v_n, P += n v_n; of a full one drop the oldest."""
         window = self._window
         sx, sy, sz, px, py, pz = self._sums
         n = len(window)
@@ -172,28 +180,32 @@ class StampedDerivative:
             sy = sy - oy
             sz = sz - oz
             n = n - 1
+            # The number k of each remaining sample falls by one.
             px = px - sx
             py = py - sy
             pz = pz - sz
         window.append((x, y, z))
         self._sums = (sx + x, sy + y, sz + z, px + n * x, py + n * y, pz + n * z)
-        self._age += 1
-        if self._age >= MAX_SUM_AGE:
-            self._refresh()
+        self._sum_age += 1
+        if self._sum_age >= MAX_SUM_AGE:
+            self._recompute_sums()
 
-    def _refresh(self):
+    def _recompute_sums(self) -> None:
+        """Compute S and P from the window."""
         values = np.array(self._window).reshape(-1, 3)
         self._sums = (*values.sum(axis=0).tolist(), *(np.arange(len(values)) @ values).tolist())
-        self._age = 0
+        self._sum_age = 0
 
-    def _hole(self, step, x, y, z):
-        missing = round(step) - 1
-        if not self._window or step < 0 or missing >= self.taps:
+    def _bridge_gap(self, step: float, x: float, y: float, z: float) -> None:
+        """Interpolate the missing samples before (x, y, z), `step` periods after the newest one."""
+        n_missing = round(step) - 1
+        # After a clock that was set back, or a gap of a window, the past is of no use.
+        if not self._window or step < 0 or n_missing >= self.taps:
             self._restart()
             return
         ox, oy, oz = self._window[-1]
-        for k in range(1, missing + 1):
-            part = k / (missing + 1)
+        for k in range(1, n_missing + 1):
+            part = k / (n_missing + 1)
             self._add(ox + part * (x - ox), oy + part * (y - oy), oz + part * (z - oz))
 
     def rebase(self, stamp_ns: int) -> None:
@@ -202,7 +214,7 @@ class StampedDerivative:
 
     def seed(self, other: 'StampedDerivative') -> None:
         """
-        Copy the past of another derivative of the same stream, within the length of this window.
+        Add the window of another derivative of the same stream, within the length of this window.
         """
         self._newest = other._newest
         for x, y, z in list(other._window)[-self.taps :]:
@@ -228,28 +240,27 @@ class StampedDerivative:
             full = np.empty(len(values), bool)
         out = np.empty(values.shape)
         steps = np.diff(stamp_ns) / self._period_ns
-        bounds = np.concatenate(
-            [
-                [0],
-                1 + np.flatnonzero((steps <= MIN_REGULAR_STEP) | (steps > MAX_REGULAR_STEP)),
-                [len(values)],
-            ]
-        )
-        for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist()):
+        is_irregular = (steps <= MIN_REGULAR_STEP) | (steps > MAX_REGULAR_STEP)
+        starts = [0, *(1 + np.flatnonzero(is_irregular)).tolist()]
+        ends = [*starts[1:], len(values)]
+        for start, end in zip(starts, ends):
             for k in range(start, end):
+                # From here on the window contains regular samples of this stretch only.
                 if k == start + self.taps + 1 and self._newest == stamp_ns[k - 1]:
-                    self._regular(stamp_ns, values, k, end, out)
+                    self._push_regular(stamp_ns, values, k, end, out)
                     full[k:end] = True
                     break
                 out[k] = self.push(int(stamp_ns[k]), *values[k].tolist())
                 full[k] = self.n_used == self.taps
         return out
 
-    def _regular(self, stamp_ns, values, start, end, out):
+    def _push_regular(
+        self, stamp_ns: np.ndarray, values: np.ndarray, start: int, end: int, out: np.ndarray
+    ) -> None:
         """
-        Fill out[start:end].
+        Fill out[start:end] with the derivatives at regular samples, by a convolution.
 
-        Where every step is regular and the window is full of samples of this very stretch.
+        Requires regular steps also between the samples of the window before `start`.
         """
         taps = self.taps
         index = (taps - 1) / 2 - np.arange(taps)
@@ -257,9 +268,10 @@ class StampedDerivative:
         out[start:end] = np.stack(
             [np.convolve(axis, index * self._scale[taps], 'valid') for axis in stretch.T], axis=1
         )
-        self._newest, self.alpha = int(stamp_ns[end - 1]), tuple(out[end - 1].tolist())
+        self._newest = int(stamp_ns[end - 1])
+        self.alpha = tuple(out[end - 1].tolist())
         self._window = deque(map(tuple, values[end - taps : end].tolist()))
-        self._refresh()
+        self._recompute_sums()
 
 
 class TimedDerivative:
@@ -283,11 +295,16 @@ class TimedDerivative:
     """
 
     def __init__(self, derivative: CausalDerivative):
-        self.taps, self.period = derivative.taps, derivative.period
-        self._enough = self.taps * (self.taps**2 - 1) / 12 * self.period**2 * 1e18
+        self.taps = derivative.taps
+        self.period = derivative.period
+        self._full_spread = self.taps * (self.taps**2 - 1) / 12 * self.period**2 * 1e18
+        """Sxx of `derivative` at equal steps, ns^2."""
         self._stamps: deque[int] = deque()
+        """Stamps of the window, ns, the oldest first."""
         self._values: deque[tuple] = deque()
+        """Samples at these stamps."""
         self.alpha: tuple = NO_SLOPE
+        """Derivative after the newest sample, per second."""
         self.n_used = 0
         """
         Number of samples of the derivative at equal steps with that noise; 0 without a derivative.
@@ -304,36 +321,38 @@ class TimedDerivative:
                 self._values.clear()
         self._stamps.append(stamp_ns)
         self._values.append((x, y, z))
-        past = np.array([stamp_ns - other for other in reversed(self._stamps)], float)
-        spread = np.cumsum(past**2) - np.cumsum(past) ** 2 / np.arange(1, len(past) + 1)
-        n = min(int(np.searchsorted(spread, self._enough)) + 1, len(past))
-        for _ in range(len(past) - n):
+
+        # The shortest window with the Sxx of a full one: Sxx of the newest 1, 2, ... samples.
+        age_ns = np.array([stamp_ns - earlier_ns for earlier_ns in reversed(self._stamps)], float)
+        spreads = np.cumsum(age_ns**2) - np.cumsum(age_ns) ** 2 / np.arange(1, len(age_ns) + 1)
+        n = min(int(np.searchsorted(spreads, self._full_spread)) + 1, len(age_ns))
+        spread = spreads[n - 1]
+        for _ in range(len(age_ns) - n):
             self._stamps.popleft()
             self._values.popleft()
-        if 8 * spread[n - 1] < self._enough:
-            self.alpha, self.n_used = NO_SLOPE, 0
-        else:
-            # Sxx of n equal steps is about n^3 / 12.
-            share = min(float(spread[n - 1]) / self._enough, 1.0)
-            self.n_used = min(max(round(self.taps * share ** (1 / 3)), 2), self.taps)
-            values = np.array(self._values)[::-1]
-            self.alpha = tuple(
-                (-1e9 * (past[:n] - past[:n].mean()) @ values / spread[n - 1]).tolist()
-            )
+
+        # Sxx of n equal steps is about n^3 / 12: half a window has an eighth.
+        if 8 * spread < self._full_spread:
+            self.alpha = NO_SLOPE
+            self.n_used = 0
+            return self.alpha
+        share = min(float(spread) / self._full_spread, 1.0)
+        self.n_used = min(max(round(self.taps * share ** (1 / 3)), 2), self.taps)
+        values = np.array(self._values)[::-1]
+        age_ns = age_ns[:n]
+        self.alpha = tuple((-1e9 * (age_ns - age_ns.mean()) @ values / spread).tolist())
         return self.alpha
 
     def seed(self, other: 'TimedDerivative') -> None:
         """Copy the past of another derivative of the same stream."""
-        self._stamps, self._values, self.alpha = (
-            other._stamps.copy(),
-            other._values.copy(),
-            other.alpha,
-        )
+        self._stamps = other._stamps.copy()
+        self._values = other._values.copy()
+        self.alpha = other.alpha
         self.n_used = min(other.n_used, self.taps)
 
 
 def typical_period(stamp_ns: Sequence[float] | np.ndarray) -> float | None:
-    """Return the median of the steps ahead between stamps, s; None without one."""
+    """Return the median of the positive steps between stamps, s; None without one."""
     steps = np.diff(np.asarray(stamp_ns, np.int64))
     steps = steps[steps > 0]
     return float(np.median(steps)) * 1e-9 if len(steps) else None

@@ -404,8 +404,8 @@ class CalibrationHealth:
         Parameters
         ----------
         stop : Stop
-            Of corrected readings without any update; its `further_mean` are the measured specific force
-            and rate.
+            Of corrected readings without any update; its `further_mean` is that of the measured
+            specific force and rate.
 
         """
         if stop.seconds < MIN_STOP_SECONDS or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
