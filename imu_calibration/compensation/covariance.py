@@ -39,7 +39,7 @@ def is_known(covariance: np.ndarray) -> bool:
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
     """
-    How corrected force and rate follow their inputs at one sample.
+    Derivatives of corrected force and rate by their inputs at one sample, with covariances.
 
     The derivative of the rate is formed from the same readings as the rate, so their noise is
     correlated: the newest reading enters both.
@@ -78,17 +78,19 @@ class Sensitivity:
         force, rate and derivative, w the newest weight, v the earlier ones, and E the covariance of
         the derivative's error (its delay); plus the parameters' share.
         """
-        results = []
         error_cov = self.slope_error.covariance(rate_cov)
-        for k in (0, 3):
-            by_force, by_rate, by_derivative = (self.gain[k : k + 3, j : j + 3] for j in (0, 3, 6))
-            now = by_rate + self.newest * by_derivative
-            total = by_force @ force_cov @ by_force.T + now @ rate_cov @ now.T
+        results = []
+        for k in (0, 3):  # force, rate
+            by_force = self.gain[k : k + 3, 0:3]
+            by_rate = self.gain[k : k + 3, 3:6]
+            by_derivative = self.gain[k : k + 3, 6:9]
+            by_newest = by_rate + self.newest * by_derivative
+            total = by_force @ force_cov @ by_force.T + by_newest @ rate_cov @ by_newest.T
             total = total + by_derivative @ (self.earlier * rate_cov + error_cov) @ by_derivative.T
-            results.append(
-                total + self.parameters[k : k + 3, k : k + 3] if with_parameters else total
-            )
-        return tuple(results)
+            if with_parameters:
+                total = total + self.parameters[k : k + 3, k : k + 3]
+            results.append(total)
+        return results[0], results[1]
 
 
 class Uncertainty:
@@ -103,39 +105,48 @@ class Uncertainty:
     """
 
     def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None):
+        self._calibration = calibration
         self._model, self._values = invertible_values(calibration)
         self._kernel = make_kernel(calibration, transfer)
-        self._inside = make_kernel(calibration)
+        """Correction of a sample to the target point and frame."""
+        self._sensor_kernel = make_kernel(calibration)
+        """Correction of a sample in the frame of the sensor."""
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
-        index = np.concatenate(
-            [
-                np.arange(len(calibration.values))[calibration.model.slices[e.key]]
-                for e in self._model.effects
-            ]
+
+        parameters = np.arange(len(calibration.values))
+        slices = calibration.model.slices
+        inverted = np.concatenate(
+            [parameters[slices[effect.key]] for effect in self._model.effects]
         )
-        self._covariance = calibration.covariance[np.ix_(index, index)]
-        # Complex steps give d(coefficients) / d(parameters), shape (n_params, n_columns, 3).
+        self._covariance = calibration.covariance[np.ix_(inverted, inverted)]
+        """Covariance of the parameters that the correction uses."""
         self._slopes = []
+        """d(coefficients) / d(parameters) of each sensor, shape (n_params, n_columns, 3)."""
         for sensor in SENSORS:
             slopes = []
-            for step in 1e-30j * np.eye(len(self._values)):
+            for step in 1e-30j * np.eye(len(self._values)):  # complex steps
                 moved = coefficients_at_point(self._model, sensor, self._values + step)
                 slopes.append(moved.imag / 1e-30)
             self._slopes.append(np.stack(slopes))
-        self._calibration = calibration
         self.use(None)
 
     def use(self, derivative: CausalDerivative | None, period: float | None = None) -> None:
         """
-        Use the angular acceleration of another CausalDerivative, or of none.
+        Use the weights of a CausalDerivative, or none, and the noise of samples `period` apart.
 
-        The noise of samples `period` s apart is used as well.
+        The period is in s; None: that of the calibration.
         """
-        self.noise = tuple(
-            np.diag(self._calibration.noise(sensor, period)[0] ** 2) for sensor in SENSORS
-        )
+        noise = []
+        for sensor in SENSORS:
+            sample_sd, _ = self._calibration.noise(sensor, period)
+            noise.append(np.diag(sample_sd**2))
+        self.noise = tuple(noise)
+        """Covariances of a sample of (force, rate) by the calibration, each shape (3, 3)."""
         weights = np.zeros(1) if derivative is None else derivative.weights
-        self._newest, self._earlier = float(weights[0]), float((weights[1:] ** 2).sum())
+        self._newest = float(weights[0])
+        """As in `Sensitivity`, 1/s."""
+        self._earlier = float((weights[1:] ** 2).sum())
+        """As in `Sensitivity`, 1/s^2."""
 
     def at(
         self,
@@ -166,33 +177,46 @@ class Uncertainty:
 
         """
         sample = np.concatenate([force, rate, derivative])
-        beside = (warming, branch, *vibration)
-        gain = np.stack(
-            [self._slope(sample, step, beside) for step in np.diag(DIFFERENCE_STEPS)], axis=1
-        )
-        true = self._inside(*sample.tolist(), *beside)
-        jacobian = gain[:, :6] @ self._parameter_slopes(
-            np.array(true), self._inverse_rate @ sample[6:], beside
-        )
+        conditions = (warming, branch, *vibration)
+        slopes = [self._slope(sample, step, conditions) for step in np.diag(DIFFERENCE_STEPS)]
+        gain = np.stack(slopes, axis=1)
+
+        # d(corrected) / d(parameters) is that of the measured sample, up to its sign, which a
+        # covariance does not show.
+        true = np.array(self._sensor_kernel(*sample.tolist(), *conditions))
+        alpha = self._inverse_rate @ sample[6:]
+        jacobian = gain[:, :6] @ self._parameter_slopes(true, alpha, conditions)
         sensitivity = Sensitivity(
-            gain,
-            jacobian @ self._covariance @ jacobian.T,
-            self._newest,
-            self._earlier,
-            SlopeError(),
+            gain=gain,
+            parameters=jacobian @ self._covariance @ jacobian.T,
+            newest=self._newest,
+            earlier=self._earlier,
+            slope_error=SlopeError(),
         )
         return sensitivity.with_slope_error(slope_error or SlopeError())
 
-    def _slope(self, sample, step, beside):
-        above = self._kernel(*(sample + step).tolist(), *beside)
-        below = self._kernel(*(sample - step).tolist(), *beside)
+    def _slope(
+        self, sample: np.ndarray, step: np.ndarray, conditions: tuple[float, ...]
+    ) -> np.ndarray:
+        """
+        Return the central difference of the corrected (force, rate) by one input, shape (6,).
+
+        Sample and step are in (force, rate, derivative), shape (9,); the step has one element that
+        is not zero. `conditions` are temperature, thermal branch and vibration.
+        """
+        above = self._kernel(*(sample + step).tolist(), *conditions)
+        below = self._kernel(*(sample - step).tolist(), *conditions)
         return (np.array(above) - below) / (2 * step.sum())
 
-    def _parameter_slopes(self, true, alpha, beside):
+    def _parameter_slopes(
+        self, true: np.ndarray, alpha: np.ndarray, conditions: tuple[float, ...]
+    ) -> np.ndarray:
         """
-        Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params).
+        Return d(measured force, rate) / d(parameters), shape (6, n_params).
+
+        At the true force and rate, shape (6,), with the angular acceleration, shape (3,).
         """
-        temperature = np.full(1, self._model.temperature_ref_c + beside[0])
+        temperature = np.full(1, self._model.temperature_ref_c + conditions[0])
         ref = Reference(
             np.zeros(1),
             np.eye(3)[None],
@@ -201,10 +225,11 @@ class Uncertainty:
             alpha[None],
             0.0,
             temperature,
-            np.full(1, beside[1]),
-            np.array([beside[2:]]),
+            np.full(1, conditions[1]),
+            np.array([conditions[2:]]),
         )
-        rows = [columns_at_point(self._model, sensor, ref)[0] for sensor in SENSORS]
-        return np.concatenate(
-            [np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)]
-        )
+        sensor_slopes = []
+        for sensor, slopes in zip(SENSORS, self._slopes):
+            columns = columns_at_point(self._model, sensor, ref)[0]
+            sensor_slopes.append(np.einsum('c,pci->ip', columns, slopes))
+        return np.concatenate(sensor_slopes)
