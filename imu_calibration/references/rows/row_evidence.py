@@ -3,7 +3,7 @@ Evidence from few rows of any reference: poses and turns by hand, blocks of a po
 
 Rows are few, so that this evidence differs from that of windows. The variances of the rows are
 estimated from the same rows: a loss is ``n log(mean square)``, and a test an F test. The rows
-without a fold are whitened anew, since they are correlated with it by the bias. And for halves the
+without a fold are whitened again, since they are correlated with it by the bias. And for halves the
 noise is estimated again.
 """
 
@@ -14,7 +14,7 @@ from itertools import chain
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
-from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
+from imu_calibration.estimation.noise_likelihood import NoiseLikelihood, NoiseShape
 from imu_calibration.estimation.rows import Rows, flat, normal_of_rows, weights_of
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.estimation.sensor_noise import BiasProcess
@@ -28,7 +28,7 @@ SCATTER_RATIOS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 BIASES = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Candidate bias processes, in units of offset and noise together."""
 BIAS_TIMES = (100.0, 300.0)
-"""Its correlation times, s."""
+"""Candidate correlation times of a bias process, s."""
 FEWEST_SPARE_ROWS = 3
 """Fewest degrees of freedom of a test."""
 DEPENDENT = 1e-9
@@ -72,18 +72,23 @@ class RowEvidence(Evidence):
     ):
         # Smooth effects are included: the noise is not estimated from what they explain.
         self._weighted = []
+        """The blocks with the variance and the bias process that are estimated for each."""
         for block in blocks:
-            acting = chain.from_iterable(smooth.get(block.sensor, ()))
-            self._weighted.append(_with_noise(block, [*baseline, *acting]))
+            of_smooth = chain.from_iterable(smooth.get(block.sensor, ()))
+            self._weighted.append(_with_noise(block, [*baseline, *of_smooth]))
         self.groups = np.unique(np.concatenate([block.group for block in blocks]))
         """Numbers of the groups of rows, shape (n_groups,)."""
         n_folds = len(self.groups) if len(self.groups) <= ONE_BY_ONE else GROUP_FOLDS
         folds = [np.searchsorted(self.groups, block.group) % n_folds for block in blocks]
         self._white = [flat(block.white()) for block in self._weighted]
-        self._acting = [np.any(white != 0, axis=0) for white in self._white]
-        """Of each block, the columns that are not zero."""
+        """Independent rows of unit variance ``[columns | residual]`` of each block."""
+        self._is_in_block = [np.any(white != 0, axis=0) for white in self._white]
+        """Whether each column of a block has an element that is not zero, shape (q + 1,)."""
         self._sums: dict[tuple[int, tuple[int, ...]], float] = {}
+        """(Number of a block, choice) -> its sum of squares: one choice meets many larger ones."""
         self._bases: dict[tuple[int, ...], np.ndarray] = {}
+        """Choice -> orthonormal basis of its white columns."""
+        total = np.sum([white.T @ white for white in self._white], axis=0)
         without = []
         for number in range(n_folds):
             kept = [block.select(fold != number) for block, fold in zip(self._weighted, folds)]
@@ -91,7 +96,7 @@ class RowEvidence(Evidence):
         super().__init__(
             blocks,
             folds,
-            total=normal_of_rows(self._weighted, len(prior_sd)),
+            total=total,
             without=np.array(without),
             prior_sd=prior_sd,
             prior_mean=np.zeros(len(prior_sd)),
@@ -102,39 +107,44 @@ class RowEvidence(Evidence):
     ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
         """Return the fits of parameters to both halves of the groups of rows, and to all."""
         first, second = np.array_split(self.groups, 2)
-        none = self.groups[:0]
+        no_groups = self.groups[:0]
         fits = []
-        for out in (second, first, none):
-            # The effects are no noise: their parameters are part of the baseline.
-            blocks = without_groups(self.blocks, out)
+        for left_out in (second, first, no_groups):
+            # The noise is estimated with the effects in the model, as part of the baseline.
+            blocks = without_groups(self.blocks, left_out)
             fits.append(RowEvidence(blocks, self.prior_sd, {}, baseline=used).fit(used))
         return fits[0], fits[1], fits[2]
 
+    def weights(self, used: Sequence[int]) -> np.ndarray:
+        """Return the weights of `Rows.residuals_at` at the fit to all rows, shape (q + 1,)."""
+        return weights_of(used, self.fit(used)[0], len(self.prior_sd))
+
     def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
         """Return the residuals of each block under the fit to all rows, shape (m, n_axes)."""
-        weights = weights_of(used, self.fit(used)[0], len(self.prior_sd))
+        weights = self.weights(used)
         return [block.residuals_at(weights) for block in self.blocks]
 
     def against_noise(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
-        Return sensor -> squares of the same in units of noise and usual bias drift, of each block.
+        Return sensor -> squares of the held-out residuals summed over a block, (n_blocks, 1).
 
-        Shape (n_blocks, 1).
+        The residuals are in units of the known noise with the usual drift of a bias.
         """
-        found: dict[str, list[list[float]]] = {}
+        squares: dict[str, list[list[float]]] = {}
         for block, residual in zip(self.blocks, self.heldout_residuals(used)):
-            found.setdefault(block.sensor, []).append([np.sum(residual**2 / block.floor)])
-        return {sensor: np.array(squares) for sensor, squares in found.items()}
+            squares.setdefault(block.sensor, []).append([np.sum(residual**2 / block.floor)])
+        return {sensor: np.array(of_blocks) for sensor, of_blocks in squares.items()}
 
     @property
     def numbers(self) -> dict[str, np.ndarray]:
-        """Sensor -> number of the squares of each block."""
-        found: dict[str, list[int]] = {}
+        """Sensor -> number of residuals of each block, shape (n_blocks,)."""
+        numbers: dict[str, list[int]] = {}
         for block in self.blocks:
-            found.setdefault(block.sensor, []).append(block.variance.size)
-        return {sensor: np.array(sizes) for sensor, sizes in found.items()}
+            numbers.setdefault(block.sensor, []).append(block.variance.size)
+        return {sensor: np.array(of_blocks) for sensor, of_blocks in numbers.items()}
 
     def _heldout(self, used: Sequence[int]) -> float:
+        """Return ``sum n log(mean(residual^2 / variance))`` of the held-out rows of all blocks."""
         loss = 0.0
         for residual, block in zip(self.heldout_residuals(used), self._weighted):
             of_processes = sum(process.sd**2 for process in block.processes)
@@ -143,47 +153,57 @@ class RowEvidence(Evidence):
         return float(loss)
 
     def _loss(self, used: Sequence[int]) -> float:
+        """Return ``sum n log(mean(white residual^2))`` of all blocks at the fit to all rows."""
         loss = 0.0
         for white in self._white:
-            loss += len(white) * np.log(np.mean(self._left(white, used) ** 2))
+            loss += len(white) * np.log(np.mean(self._white_residual(white, used) ** 2))
         return float(loss)
 
-    def _left(self, white: np.ndarray, used: Sequence[int]) -> np.ndarray:
+    def _white_residual(self, white: np.ndarray, used: Sequence[int]) -> np.ndarray:
+        """Return the residual of white rows at the fit to all rows, shape (m,)."""
         return white[:, -1] - white[:, list(used)] @ self.fit(used)[0]
 
-    def _squares_left(self, number: int, used: Sequence[int]) -> float:
-        """Return the sum of squares that a choice leaves in a block: it meets many larger ones."""
+    def _white_squares(self, number: int, used: Sequence[int]) -> float:
+        """Return the sum of squares of the white residual of a block at the fit to all rows."""
         key = (number, tuple(used))
         if key not in self._sums:
-            self._sums[key] = np.sum(self._left(self._white[number], used) ** 2)
+            self._sums[key] = np.sum(self._white_residual(self._white[number], used) ** 2)
         return self._sums[key]
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """
-        Return the p-value of `larger` against `smaller`.
+        Return the p-value of `larger` against `smaller` (F test).
 
-        F test on the blocks that contain the new columns.
+        On the blocks with the added columns, with the sums of squares S, the rank r of the added
+        columns and n rows of which p columns of `larger` are not zero::
+
+            F = (S_smaller - S_larger) / r / (S_larger / (n - p))
+
         """
         added = [k for k in larger if k not in set(smaller)]
-        of_smaller = of_larger = 0.0
+        squares_of_smaller = 0.0
+        squares_of_larger = 0.0
         n_rows = 0
         in_use = np.zeros(len(larger), bool)
-        for number, acting in enumerate(self._acting):
-            if np.any(acting[added]):
-                of_smaller += self._squares_left(number, smaller)
-                of_larger += self._squares_left(number, larger)
+        for number, is_in_block in enumerate(self._is_in_block):
+            if np.any(is_in_block[added]):
+                squares_of_smaller += self._white_squares(number, smaller)
+                squares_of_larger += self._white_squares(number, larger)
                 n_rows += len(self._white[number])
-                in_use |= acting[list(larger)]
+                in_use |= is_in_block[list(larger)]
         rank = max(self.rank(added, smaller), 1)
-        spare = n_rows - int(in_use.sum())
-        if spare < FEWEST_SPARE_ROWS or of_larger <= 0:
+        dof = n_rows - int(in_use.sum())
+        if dof < FEWEST_SPARE_ROWS or squares_of_larger <= 0:
             return 1.0
-        fall = max(of_smaller - of_larger, 0.0)
-        return float(f_sf(fall / rank / (of_larger / spare), rank, spare))
+        fall = max(squares_of_smaller - squares_of_larger, 0.0)
+        return float(f_sf(fall / rank / (squares_of_larger / dof), rank, dof))
 
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
         """
-        Return how many combinations of the added columns are not collinear with the smaller choice.
+        Return the number of combinations of the added columns that `smaller` does not imitate.
+
+        With the orthonormal bases N of the added columns and K of `smaller`, the singular values of
+        ``N - K K'N`` are the sines of the angles between the two spaces.
         """
         known = self._basis_of(tuple(smaller))
         new = orthonormal_basis(np.concatenate(self._white)[:, list(added)], MIN_COLUMN_DIFFERENCE)
@@ -193,7 +213,7 @@ class RowEvidence(Evidence):
         return int(np.sum(sines > MIN_COLUMN_SINE))
 
     def _basis_of(self, used: tuple[int, ...]) -> np.ndarray:
-        """Return a basis of the columns of a choice, which is met with many larger choices."""
+        """Return an orthonormal basis of the white columns of a choice, shape (rows, rank)."""
         if used not in self._bases:
             white = np.concatenate(self._white)
             self._bases[used] = orthonormal_basis(white[:, list(used)], DEPENDENT)
@@ -208,23 +228,30 @@ def without_groups(blocks: Sequence[Rows], groups: np.ndarray) -> list[Rows]:
 
 def _with_noise(block: Rows, used: Sequence[int]) -> Rows:
     """
-    Return the rows with their estimated noise.
+    Return the rows with the likeliest of the candidate noises, with the parameters `used` fitted.
 
-    Scatter between rows, and a bias process where the bias drifts.
+    Independent scatter of the rows, and a bias process where the bias drifts.
     """
-    count, axes, width = block.equations.shape
+    n_rows, n_axes, _ = block.equations.shape
     basis = orthonormal_basis(flat(block.equations)[:, used], DEPENDENT)
-    columns = basis.reshape(count, axes, -1)
+    columns = basis.reshape(n_rows, n_axes, -1)
     of_choice = np.concatenate([columns, block.equations[:, :, -1:]], axis=2)
     likelihood = NoiseLikelihood(replace(block, equations=of_choice))
+
+    # (ratio of the bias process to offset and noise, its correlation time)
     biases = [(0.0, BIAS_TIMES[0])]
     if block.drift is not None:
-        for share in BIASES[1:]:
-            biases += [(share, time) for time in BIAS_TIMES]
+        for ratio in BIASES[1:]:
+            biases += [(ratio, time) for time in BIAS_TIMES]
     shapes = []
     for offset in SCATTER_RATIOS:
-        shapes += [(offset, share * max(offset, 1.0), time) for share, time in biases]
-    offset, bias, time = min(shapes, key=likelihood.loss)
+        for ratio, time in biases:
+            shapes.append(NoiseShape(offset, ratio * max(offset, 1.0), time))
+    likeliest = min(shapes, key=likelihood.loss)
+
     unit = likelihood.typical
-    processes = (BiasProcess(bias * unit, time),) if bias else ()
-    return replace(block, variance=block.variance + (offset * unit) ** 2, processes=processes)
+    processes: tuple[BiasProcess, ...] = ()
+    if likeliest.bias:
+        processes = (BiasProcess(likeliest.bias * unit, likeliest.time),)
+    variance = block.variance + (likeliest.offset * unit) ** 2
+    return replace(block, variance=variance, processes=processes)

@@ -19,7 +19,21 @@ OUTER = 12
 
 
 class RowProblem:
-    """Rows of a recording or of a part of it, their evidence, and the search."""
+    """
+    Rows of a recording or of a part of it, their evidence, and the search.
+
+    Parameters
+    ----------
+    blocks : sequence of Rows
+        Poses, turns or other rows, with the columns of all parameters.
+    prior_sd : array, shape (q,)
+        Prior standard deviations of the parameters.
+    questions : sequence of Question
+        Candidate effects.
+    baseline : sequence of int
+        Parameters of the model under diagnosis.
+
+    """
 
     def __init__(
         self,
@@ -31,7 +45,8 @@ class RowProblem:
     ):
         untimed = [question for question in questions if not question.effect.time_constant]
         smooth = smooth_parameters(untimed)
-        self.blocks, self.questions = blocks, questions
+        self.blocks = blocks
+        self.questions = questions
         self.evidence = RowEvidence(blocks, prior_sd, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)
         self.explained = Explained(
@@ -53,22 +68,28 @@ class RowProblem:
         sensor: str,
     ) -> Gain:
         """
-        Return the Gain of one choice over another on rows held out from both fit and choice.
+        Return the Gain of the choice `after` over `before` on held-out rows of a sensor.
+
+        Of each choice only the effects count that are found again without the held-out groups, at
+        values that are fitted without them.
         """
         block = self.clearest(before, after, sensor)
-        pair = [np.full(block.variance.shape, np.nan) for _ in range(2)]
-        for part in held_out:
-            rows = np.isin(block.group, part.groups)
-            for residual, choice in zip(pair, (before, after)):
-                values = part.problem.search.values(part.named_in(choice))
-                residual[rows] = block.select(rows).residuals_at(np.append(-values, 1.0))
-        return gain_of_groups(block, pair)
+        residuals = []
+        for choice in (before, after):
+            residual = np.full(block.variance.shape, np.nan)
+            for part in held_out:
+                rows = np.isin(block.group, part.groups)
+                used = part.problem.search.indices(part.named_in(choice))
+                weights = part.problem.evidence.weights(used)
+                residual[rows] = block.select(rows).residuals_at(weights)
+            residuals.append(residual)
+        return gain_of_groups(block, residuals)
 
     def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Rows:
         """
-        Return the rows of a sensor in which one choice improves most over another.
+        Return the block of a sensor in which `after` improves most over `before`.
 
-        The improvement is by cross-validation of the fit.
+        That is the least ratio of the sums of squares of the cross-validated residuals.
         """
         residuals_before = self.evidence.heldout_residuals(self.search.indices(before))
         residuals_after = self.evidence.heldout_residuals(self.search.indices(after))
@@ -131,58 +152,62 @@ class RowTests(EffectTests):
 
     def preferred(self, named: Sequence[Question]) -> Sequence[Question]:
         """
-        Return the effects, or others of any size where an excess remains that these reduce.
+        Return the effects, or those of a search that allows any size, if less excess remains.
 
-        Sizes beyond the range of known instruments are tested only for the remaining excess.
+        Sizes beyond the range of known instruments are tested only where an excess remains. The
+        problem has that search from then on.
         """
         explained = self.explained
         if not explained.rest(named):
             return named
-        wide = self.problem.search.asking_any_size()
-        others = pruned(wide.run(), explained.share)
-        if not explained.rest(others) < explained.rest(named):
+        search_of_any_size = self.problem.search.asking_any_size()
+        of_any_size = pruned(search_of_any_size.run(), explained.share)
+        if not explained.rest(of_any_size) < explained.rest(named):
             return named
-        self.problem.search = wide
-        return others
+        self.problem.search = search_of_any_size
+        return of_any_size
 
     def least_predicting(self, kept: list[Question]) -> int | None:
-        """Return the last finding that does not improve the prediction of held-out rows."""
+        """
+        Return the place of the last finding that does not improve the prediction; None: all do.
+
+        Each finding is compared with the ones before it, on rows held out from fit and choice.
+        """
         if not self.held_out:
             self.held_out = _held_out(self.problem)
-        poor = None
+        not_improving = None
         for place, question in enumerate(kept):
             gain = self.problem.gain(
                 self.held_out, kept[:place], kept[: place + 1], sensor=question.sensor
             )
             if not gain.ci95[0] > 0:
-                poor = place
-        return poor
+                not_improving = place
+        return not_improving
 
 
 def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
     """Return the complete search, repeated without each part of the groups in turn."""
     groups = problem.evidence.groups
-    times = min(OUTER, len(groups))
-    found = []
-    for number in reported('repeating the search', range(times), times):
-        out = groups[number::times]
-        smaller = problem.without(out)
+    n_parts = min(OUTER, len(groups))
+    choices = []
+    for number in reported('repeating the search', range(n_parts), n_parts):
+        left_out = groups[number::n_parts]
+        smaller = problem.without(left_out)
         named = RowTests(smaller, smaller.explained).explaining(smaller.search.run())
-        found.append(ChoiceWithout(out, named, smaller))
-    return found
+        choices.append(ChoiceWithout(left_out, named, smaller))
+    return choices
 
 
-def gain_of_groups(block: Rows, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
+def gain_of_groups(block: Rows, residuals: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
     """
-    Return the Gain from residuals of each row of a block before and after.
+    Return the Gain from the residuals of a block before and after, each of shape (m, n_axes).
 
-    Shape (m, n), resampled by group.
+    Its interval is by resampling the groups of rows.
     """
-    place = np.unique(block.group, return_inverse=True)[1]
-    numbers = np.bincount(place) * block.variance.shape[1]
-    return gain_of(
-        block.sensor,
-        block.name,
-        [(np.bincount(place, (residuals**2).sum(axis=1)), numbers) for residuals in pair],
-        of=of,
-    )
+    group_of_row = np.unique(block.group, return_inverse=True)[1]
+    numbers = np.bincount(group_of_row) * block.variance.shape[1]
+    pair = []
+    for residual in residuals:
+        squares = np.bincount(group_of_row, (residual**2).sum(axis=1))
+        pair.append((squares, numbers))
+    return gain_of(block.sensor, block.name, pair, of=of)
