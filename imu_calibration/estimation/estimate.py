@@ -3,7 +3,7 @@ Estimate from the rows of any reference, in four steps.
 
 What differs is how a reference finds its values. On a table all rows are one triangular factor,
 and the noise is estimated between the solutions. For few rows it is estimated in each step,
-beside nuisances that belong to single rows.
+together with nuisances that belong to single rows.
 """
 
 from collections.abc import Mapping
@@ -25,14 +25,15 @@ class WeightedRows(Protocol):
         """
         Columns of the parameters, shape (m, n).
 
-        Without nuisances, and with rows of the prior where it counts.
+        The nuisances are eliminated; rows of the prior are included where the prior counts.
         """
 
-    def scatter_term(self, own: np.ndarray) -> np.ndarray:
+    def scatter_term(self, covariance: np.ndarray) -> np.ndarray:
         """
-        Return the part of the covariance of free parameters that is no noise of samples.
+        Return the part of the covariance of the free parameters by bias processes and offsets.
 
-        Both have the shape (n, n), and are zero for the other parameters.
+        The other part is by noise of the samples. Argument and result have the shape (n, n), and
+        zeros for parameters that are not free.
         """
 
 
@@ -60,7 +61,11 @@ class EstimateProblem(Protocol[StateT]):
         """Return the rows at a state."""
 
     def not_believed(self, state: StateT, free: np.ndarray, sd: np.ndarray) -> Mapping[int, float]:
-        """Return the values of the free parameters that are no more than misfit, by number."""
+        """
+        Return number -> value of the free parameters (mask) that misfit alone can cause.
+
+        `sd`: standard deviations of the parameters, shape (n,).
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +75,7 @@ class JointEstimate(Generic[StateT]):
     state: StateT
     """Parameters, noise and nuisances."""
     rows: WeightedRows
-    """The rows there."""
+    """The rows at this state."""
     terms: dict[str, np.ndarray]
     """Covariance of the parameters as named terms, each of shape (n, n)."""
     held: np.ndarray
@@ -78,7 +83,7 @@ class JointEstimate(Generic[StateT]):
     free: np.ndarray
     """True where a parameter was estimated, shape (n,)."""
     not_believed: dict[int, float]
-    """Values of parameters that were held because only misfit gives them, by number."""
+    """Number -> value of the parameters that were held because misfit alone can cause the value."""
 
 
 def estimate(problem: EstimateProblem[StateT], state: StateT) -> JointEstimate[StateT]:
@@ -92,18 +97,20 @@ def estimate(problem: EstimateProblem[StateT], state: StateT) -> JointEstimate[S
         Where the first step begins.
 
     """
-    # 1. Values and noise, alternately; 2. which parameters do the data determine?
+    # 1. Values and noise, alternately.
     state = problem.fitted(state)
+    # 2. The parameters that the data do not determine.
     held = problem.undetermined(state)
 
-    # 3. Values with the other parameters at their prior, until all are more than misfit.
+    # 3. Values with the held parameters at their prior. Values that misfit alone can cause are held
+    #    too, until none is left.
     not_believed: dict[int, float] = {}
     while True:
         free = problem.asked & ~held
         state = problem.holding(state, held)
         rows = problem.weighted(state)
-        own, of_held = covariance_with_held(rows.design, free, held, prior_sd=problem.prior_sd)
-        misfit = problem.not_believed(state, free, np.sqrt(np.diag(own + of_held)))
+        of_free, of_held = covariance_with_held(rows.design, free, held, prior_sd=problem.prior_sd)
+        misfit = problem.not_believed(state, free, np.sqrt(np.diag(of_free + of_held)))
         if not misfit:
             break
         not_believed.update(misfit)
@@ -111,5 +118,5 @@ def estimate(problem: EstimateProblem[StateT], state: StateT) -> JointEstimate[S
         held[list(misfit)] = True
 
     # 4. The covariance as a sum of named terms.
-    terms = terms_of_fit(own, rows.scatter_term(own), of_held)
+    terms = terms_of_fit(of_free, rows.scatter_term(of_free), of_held)
     return JointEstimate(state, rows, terms, held, free, not_believed)

@@ -14,7 +14,8 @@ def weak_alone(data: np.ndarray, prior_sd: np.ndarray) -> np.ndarray:
     """
     Return a mask of the parameters that are undetermined even if all other ones were known.
 
-    `data`: weighted design without priors, shape (m, n).
+    Then the standard deviation of parameter i would be ``1 / |data_i|``, with its column of the
+    weighted design without priors `data`, shape (m, n).
     """
     return HELD_SHARE * prior_sd * np.linalg.norm(data, axis=0) < 1
 
@@ -28,10 +29,11 @@ def undetermined_parameters(
     tie: float = 1.0,
 ) -> np.ndarray:
     """
-    Return a mask of the parameters whose standard deviation exceeds a share of the prior's.
+    Return a mask of the parameters whose standard deviation exceeds `HELD_SHARE` of the prior's.
 
-    One at a time, the one with the largest share, given the ones fixed before: of parameters of
-    which only the sum is observable, one stays free.
+    The parameter with the largest ratio of standard deviation to prior is fixed, then the ratios of
+    the other ones are computed again: of parameters of which only the sum is observable, one
+    remains free.
 
     Parameters
     ----------
@@ -41,16 +43,19 @@ def undetermined_parameters(
     free, held : array of bool, shape (n,)
         Parameters under test, and those of them that are fixed in any case.
     tie : float
-        Part of the largest share from which a parameter is as weak: the first of these is fixed,
-        below 1 independent of rounding.
+        Parameters with at least this part of the largest ratio count as equally weak, and the first
+        of them is fixed: below 1 the choice does not depend on rounding.
 
     """
     held = held.copy()
-    while np.any(estimated := free & ~held):
-        share = np.zeros(len(prior_sd))
+    while True:
+        estimated = free & ~held
+        if not estimated.any():
+            return held
+        ratio = np.zeros(len(prior_sd))
         variances = np.diag(inverse_gram(rows[:, estimated]))
-        share[estimated] = np.sqrt(variances) / prior_sd[estimated]
-        if not np.any(share > HELD_SHARE):
-            break
-        held[np.argmax(share >= tie * share.max())] = True
-    return held
+        ratio[estimated] = np.sqrt(variances) / prior_sd[estimated]
+        if not np.any(ratio > HELD_SHARE):
+            return held
+        is_weakest = ratio >= tie * ratio.max()
+        held[np.argmax(is_weakest)] = True

@@ -59,23 +59,21 @@ class ModelError:
 
 def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelError, set[str]]:
     """
-    Return (ModelError, sensors with significant scatter).
-
-    Both are from the shifts between parts of a recording.
+    Return (ModelError, sensors with significant scatter) from shifts of the parameters.
 
     Parameters
     ----------
     waves : CosineScores
+        Shifts along slow cosines over the recording.
     model : SensorModel
-        Its parameters; a group are those of one effect.
+        The parameters of one of its effects are a group.
 
     """
     size = len(model.param_names)
-    misfits = set()
+    scattering = set()
     factor = np.ones(size)
-    more = np.zeros(size)
+    drift_variance = np.zeros(size)
     for sensor in {effect.sensor for effect in model.effects}:
-        # Groups are the parameters of one effect that the recording informs about.
         groups = []
         for effect in model.effects:
             group = waves.group(model.slices[effect.key])
@@ -83,17 +81,17 @@ def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelErr
                 groups.append(group)
         if not groups:
             continue
-        # The tests of the groups together decide; then each has its own variance.
+        # One test of all groups of a sensor; if it is significant, each group has its own variance.
         drifts = [waves.drift(group) for group in groups]
         if _fisher([chance for chance, _ in drifts]) < CHANCE:
             for group, (_, variance) in zip(groups, drifts, strict=True):
-                more[waves.places[group]] = variance
+                drift_variance[waves.places[group]] = variance
         scatters = [waves.scatter(group) for group in groups]
         if _fisher([chance for chance, _ in scatters]) < CHANCE:
-            misfits.add(sensor)
+            scattering.add(sensor)
             for group, (_, ratio) in zip(groups, scatters, strict=True):
                 factor[waves.places[group]] = np.sqrt(ratio)
-    return ModelError(factor, more, np.zeros(size)), misfits
+    return ModelError(factor, drift_variance, np.zeros(size)), scattering
 
 
 def _fisher(p_values: Sequence[float]) -> float:
@@ -110,9 +108,27 @@ def waves_of_blocks(
     shared: np.ndarray | None = None,
 ) -> 'CosineScores':
     """
-    Return the shifts along slow cosines of parts with their own information and gradient.
+    Return the shifts of the free parameters along slow cosines of the block number.
 
-    `shared`: products of their fitted nuisances with the design, shape (k, n_nuisances, n_params).
+    With the information N_b and the gradient g_b of block b, the covariance C = (sum N_b + R'R)^-1
+    and the weights w_kb of cosine k::
+
+        shift_k = C sum_b w_kb g_b
+        cov(shift_k) = C (sum_b w_kb^2 N_b - M_k C M_k) C,   M_k = sum_b w_kb N_b
+
+    Fitted nuisances reduce the middle term by ``L_k' L_k``, ``L_k = sum_b w_kb shared_b``.
+
+    Parameters
+    ----------
+    information : array, shape (n_blocks, n_params, n_params)
+    gradient : array, shape (n_blocks, n_params)
+    prior_root : array, shape (m, n_params)
+        Square root R of the information of the prior.
+    free : array of bool, shape (n_params,)
+        Parameters that were estimated.
+    shared : array, shape (n_blocks, n_nuisances, n_params), optional
+        Products of an orthonormal basis of the nuisances with the design, of each block.
+
     """
     information = information[:, free][:, :, free]
     gradient = gradient[:, free]
@@ -120,9 +136,9 @@ def waves_of_blocks(
         information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free]
     )
     # Weights of the blocks in each cosine, the slowest first.
-    count = len(information)
-    number = np.arange(1, min(MOST_WAVES, count - 1) + 1)
-    weights = np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(count) + 0.5) / count)
+    n_blocks = len(information)
+    number = np.arange(1, min(MOST_WAVES, n_blocks - 1) + 1)
+    weights = np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(n_blocks) + 0.5) / n_blocks)
     mixed = np.einsum('kc,cij->kij', weights, information)
     squared = np.einsum('kc,cij->kij', weights**2, information)
     expected = squared - mixed @ covariance @ mixed
@@ -130,71 +146,64 @@ def waves_of_blocks(
         along = np.einsum('kc,cdi->kdi', weights, shared[:, :, free])
         expected -= along.transpose(0, 2, 1) @ along
     expected = covariance @ expected @ covariance
-    return CosineScores(
-        np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance=covariance
-    )
+    return CosineScores(np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance)
 
 
+@dataclass(frozen=True, eq=False)
 class CosineScores:
-    """
-    Shifts of the parameters along slow cosines over a recording, with their covariance under noise.
+    """Shifts of the m free parameters along k slow cosines over a recording."""
 
-    Parameters
-    ----------
-    places : array of int, shape (m,)
-        Parameters that were estimated.
-    moved : array, shape (k, m)
-        Shift along each cosine.
-    expected : array, shape (k, m, m)
-        Its covariance under noise.
-    covariance : array, shape (m, m)
-        Of the estimate, under noise.
+    places: np.ndarray
+    """Numbers of the free parameters among all, shape (m,)."""
+    shifts: np.ndarray
+    """Shift along each cosine, the slowest first, shape (k, m)."""
+    expected: np.ndarray
+    """Covariance of each shift under noise, shape (k, m, m)."""
+    covariance: np.ndarray
+    """Covariance of the estimate under noise, shape (m, m)."""
 
-    """
-
-    def __init__(
-        self, places: np.ndarray, moved: np.ndarray, expected: np.ndarray, *, covariance: np.ndarray
-    ):
-        self.places = places
-        self.moved = moved
-        self.expected = expected
-        self.walk = 1 / (np.pi * np.arange(1, len(moved) + 1)) ** 2
+    @property
+    def walk(self) -> np.ndarray:
         """
-        Variance of each cosine of a random walk that has unit variance after the whole recording.
+        Variance of each cosine of a random walk with unit variance after the recording, shape (k,).
         """
-        self._seen = np.all(
-            np.einsum('kii->ki', expected) > LEAST_SHARE_OF_DATA * np.diag(covariance), axis=0
-        )
+        return 1 / (np.pi * np.arange(1, len(self.shifts) + 1)) ** 2
 
     def group(self, part: slice) -> np.ndarray:
         """
-        Return the indices of one effect with information from the recording.
+        Return the indices among the free parameters of one effect, whose parameters are `part`.
 
-        The indices are among the free parameters.
+        Without parameters of which the recording contains almost no information.
         """
-        return np.flatnonzero((self.places >= part.start) & (self.places < part.stop) & self._seen)
+        least = LEAST_SHARE_OF_DATA * np.diag(self.covariance)
+        informed = np.all(np.einsum('kii->ki', self.expected) > least, axis=0)
+        return np.flatnonzero((self.places >= part.start) & (self.places < part.stop) & informed)
 
     def drift(self, group: np.ndarray) -> tuple[float, np.ndarray]:
         """
-        Return (p-value of a slow change, variance to add for it) of parameters.
+        Return (p-value of a slow change, variance to add for it) of n parameters, shape (n,).
 
-        The parameters are independent random walks, and the variance has shape (n,).
-
-        One common variance, or a larger one for a parameter with a significant walk. The means of
-        two recordings of equal length differ by two thirds of the variance that the walk reaches in
-        one recording, a third from each.
+        The parameters are independent random walks of one common variance; a parameter with a
+        significant walk has a larger variance. The means of two recordings of equal length differ
+        by two thirds of the variance that the walk reaches in one recording, a third from each.
         """
-        p_value, common = self._walked(group)
+        p_value, common = self._walk_test(group)
         variances = []
         for parameter in group:
-            chance, own = self._walked(np.array([parameter]))
-            significant = chance < CHANCE / len(group)
-            variances.append(max(common, own) if significant else common)
+            p_value_alone, variance = self._walk_test(np.array([parameter]))
+            significant = p_value_alone < CHANCE / len(group)
+            variances.append(max(common, variance) if significant else common)
         return p_value, np.array(variances)
 
-    def _walked(self, group: np.ndarray) -> tuple[float, float]:
+    def _walk_test(self, group: np.ndarray) -> tuple[float, float]:
         """
-        Return (p-value, variance to add) by the score test of the variance of a walk.
+        Return (p-value, variance to add) by the score test of the variance v of a random walk.
+
+        The shift m_k along the slow cosine k has the covariance ``S_k + v w_k I``, with S_k from
+        noise and w_k of the unit walk::
+
+            score = sum w_k |S_k^-1 m_k|^2
+            E(score) = mean + v spread,   mean = sum w_k tr(S_k^-1),   spread = sum w_k^2 tr(S_k^-2)
 
         Fast variation that is not white, such as the ripple of a motor, is part of the noise and
         makes the slow cosines smaller than expected: where the faster ones scatter less than
@@ -202,32 +211,40 @@ class CosineScores:
         """
         inverse = self._inverse(group)
         walk = self.walk[:SLOW_WAVES]
-        moved = self.moved[:, group]
-        fast = np.einsum('ki,kij,kj->k', moved, inverse, moved)[SLOW_WAVES:]
+        shifts = self.shifts[:, group]
+        fast = np.einsum('ki,kij,kj->k', shifts, inverse, shifts)[SLOW_WAVES:]
         fast_dof = fast.size * len(group)
         inverse = inverse[:SLOW_WAVES]
-        moved = moved[:SLOW_WAVES]
-        score = walk @ (np.einsum('kij,kj->ki', inverse, moved) ** 2).sum(axis=1)
+        shifts = shifts[:SLOW_WAVES]
+        score = walk @ (np.einsum('kij,kj->ki', inverse, shifts) ** 2).sum(axis=1)
         mean = walk @ np.einsum('kii->k', inverse)
         spread = walk**2 @ np.einsum('kij,kij->k', inverse, inverse)
+        # The variance of the score under noise is 2 spread: score / mean dof is like chi-square.
         dof = mean**2 / spread
         if fast.sum() < fast_dof:
             mean = mean * fast.sum() / fast_dof
             p_value = f_sf(score / mean, dof, fast_dof)
         else:
             p_value = chi2_sf(score / mean * dof, dof)
+        # A third of the variance of the walk, see `drift`.
         return float(p_value), max(score - mean, 0.0) / spread / 3 * float(dof_factor(dof))
 
     def scatter(self, group: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return (p-value of the scatter, factor on the variance of each parameter) of a group."""
-        moved = self.moved[:, group]
-        ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size
-        single = (moved**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)
-        p_value = float(chi2_sf(ratio * moved.size, moved.size))
+        """
+        Return (p-value of the scatter, factor on the variance of each parameter) of n parameters.
+
+        The factor follows from the mean of two variance ratios, that of the parameter and that of
+        the group: ``sum_k m_k' S_k^-1 m_k / (k n)`` with the shifts m and their covariance S.
+        """
+        shifts = self.shifts[:, group]
+        inverse = self._inverse(group)
+        ratio = np.einsum('ki,kij,kj->k', shifts, inverse, shifts).sum() / shifts.size
+        single = (shifts**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)
+        p_value = float(chi2_sf(ratio * shifts.size, shifts.size))
         excess = np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
         return p_value, 1.0 + COMMON_ERROR_FACTOR * excess
 
     def _inverse(self, group: np.ndarray) -> np.ndarray:
-        """Return the inverse of the expected covariance of a group, shape (k, n, n)."""
+        """Return the inverse of the covariance of each shift of n parameters, shape (k, n, n)."""
         expected = self.expected[:, group][:, :, group]
         return np.array([inverse_normal(of_wave) for of_wave in expected])

@@ -60,8 +60,10 @@ class NoiseLikelihood:
         """Whether the windows are enough for the estimate of a bias process."""
         self._rows = rows
         self._common = common
-        self._whitened: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
-        self._profiles: dict[tuple, float] = {}
+        self._reduced: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
+        """(shape of the noise, variance ratio of sessions) -> result of `_eliminated`."""
+        self._losses: dict[tuple, float] = {}
+        """(the same, choice of parameters or None for all) -> result of `loss`."""
         self._choices = [tuple(choice) for choice in choices]
 
     def loss(
@@ -74,37 +76,56 @@ class NoiseLikelihood:
         """
         Return minus twice the restricted log likelihood with the parameters `used`.
 
-        The parameters are counted after the common ones and are all parameters by default.
+        Parameters
+        ----------
+        shape : sequence of float
+            Offset, bias and time of a `NoiseShape`.
+        used : sequence of int, optional
+            Parameters, counted after the common ones; default: all.
+        session : float
+            Standard deviation of an offset of each recording, in units of the typical noise.
+
         """
         key = (*map(float, shape), float(session))
         choice = None if used is None else tuple(used)
-        if (key, choice) not in self._profiles:
-            logs, normal = self._eliminated(key)
+        if (key, choice) not in self._losses:
+            log_determinant, normal = self._eliminated(key)
             if choice is None:
-                self._profiles[key, choice] = logs + profile(normal)
+                self._losses[key, choice] = log_determinant + profile(normal)
             elif choice not in self._choices:
-                self._profiles[key, choice] = logs + profile(_chosen(normal, [choice])[0])
+                self._losses[key, choice] = log_determinant + profile(_chosen(normal, [choice])[0])
             else:
-                alike = [each for each in self._choices if len(each) == len(choice)]
-                for each, value in zip(alike, profile_each(_chosen(normal, alike)), strict=True):
-                    self._profiles[key, each] = logs + float(value)
-        return self._profiles[key, choice]
+                # All choices of this size together: later calls ask for them at the same shape.
+                same_size = [each for each in self._choices if len(each) == len(choice)]
+                profiles = profile_each(_chosen(normal, same_size))
+                for each, value in zip(same_size, profiles, strict=True):
+                    self._losses[key, each] = log_determinant + float(value)
+        return self._losses[key, choice]
 
     def _eliminated(self, key: tuple[float, ...]) -> tuple[float, np.ndarray]:
-        """Return (log determinants, normal equations without the common parameters), kept."""
-        if key not in self._whitened:
+        """
+        Return ``log|V| + log|A|`` and the normal matrix after the common parameters are eliminated.
+
+        V is the covariance of the errors, A the block of the common parameters. The key is (offset,
+        bias, time, sd of the offset of each recording) in units of the typical noise.
+        """
+        if key not in self._reduced:
             units = (self.typical, self.typical, 1.0, self.typical)
-            offset, bias, time, step = np.multiply(key, units)
+            offset, bias, time, session_sd = np.multiply(key, units)
             processes = self.processes(bias, time)
             rows = self._with_errors(self._rows, offset, processes)
-            logs, normal = whitened(replace(rows, session_variance=step**2))
+            of_errors, normal = whitened(replace(rows, session_variance=session_sd**2))
             of_common, normal = eliminate(normal, self._common)
-            self._whitened[key] = logs + of_common, normal
-        return self._whitened[key]
+            self._reduced[key] = of_errors + of_common, normal
+        return self._reduced[key]
 
     @staticmethod
     def _with_errors(rows: Rows, offset: float, processes: tuple[BiasProcess, ...]) -> Rows:
-        """Return rows with the variance of offsets, and of means about the processes, added."""
+        """
+        Return rows with bias processes, and with the variance of offsets added.
+
+        Added is also the variance of the mean of a process about its value in the middle.
+        """
         durations = np.zeros(len(rows)) if rows.duration is None else rows.duration
         about_middles = means_beside_middles(processes, durations)[:, None]
         variance = rows.variance + about_middles + offset**2
@@ -119,34 +140,39 @@ class NoiseLikelihood:
         """
         Return the likelihood of the noise of one axis, the other axes fixed at the shape.
 
-        In units of the axis' own typical noise.
+        Its shapes are in units of the typical noise of the axis.
         """
-        # The other axes are the information on the parameters, with which this axis begins.
+        # The other axes enter as known products: information on the parameters.
         offset = shape.offset * self.typical
         bias = shape.bias * self.typical
         processes = self.processes(bias, shape.time)
-        others = self._rows.of_axes(np.arange(self._rows.variance.shape[1]) != axis)
-        _, normal = whitened(self._with_errors(others, offset, processes))
-        own = replace(self._rows.of_axes(np.array([axis])), products=normal)
-        return NoiseLikelihood(own, common=self._common)
+        other_axes = self._rows.of_axes(np.arange(self._rows.variance.shape[1]) != axis)
+        _, normal = whitened(self._with_errors(other_axes, offset, processes))
+        rows_of_axis = replace(self._rows.of_axes(np.array([axis])), products=normal)
+        return NoiseLikelihood(rows_of_axis, common=self._common)
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
         """
-        Return the known processes and one more (or the flicker processes) of a given sd.
+        Return the known processes and one more of a standard deviation and correlation time, s.
 
-        The further one is omitted if its standard deviation is zero.
+        Flicker (`FLICKER_MARK`) is a process at each of `FLICKER_TIMES`, with that standard
+        deviation together. Without a standard deviation only the known ones are returned.
         """
         if sd <= 0:
             return self.known
         times = FLICKER_TIMES if time == FLICKER_MARK else (time,)
-        share = sd / float(np.sqrt(len(times)))
-        return (*self.known, *(BiasProcess(share, each) for each in times))
+        sd_of_each = sd / float(np.sqrt(len(times)))
+        return (*self.known, *(BiasProcess(sd_of_each, each) for each in times))
 
 
 def _chosen(normal: np.ndarray, choices: Sequence[tuple[int, ...]]) -> np.ndarray:
-    """Return the normal equations of each choice of the same size, shape (k, m + 1, m + 1)."""
-    at = np.array([[*choice, len(normal) - 1] for choice in choices])
-    return normal[at[:, :, None], at[:, None, :]]
+    """
+    Return the normal matrix of each of k choices of m parameters, shape (k, m + 1, m + 1).
+
+    The last row and column are those of the residual.
+    """
+    places = np.array([[*choice, len(normal) - 1] for choice in choices])
+    return normal[places[:, :, None], places[:, None, :]]
 
 
 def whitened(rows: Rows) -> tuple[float, np.ndarray]:
@@ -183,15 +209,15 @@ def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
 
 def profile(normal: np.ndarray) -> float:
     """Return ``y'y - b' A^-1 b + log|A|`` of the normal matrix ``[[A, b], [b', y'y]]``."""
-    logs, left = eliminate(normal, len(normal) - 1)
-    return logs + float(left[0, 0])
+    log_determinant, squares = eliminate(normal, len(normal) - 1)
+    return log_determinant + float(squares[0, 0])
 
 
 def profile_each(normal: np.ndarray) -> np.ndarray:
     """
-    Return the `profile` of several small normal matrices, shape (k, m + 1, m + 1).
+    Return the `profile` of k normal matrices, shape (k, m + 1, m + 1), as an array (k,).
 
-    Of few parameters each, the calls for one after the other would take most of the time.
+    With few parameters the calls for one matrix after the other would take most of the time.
     """
     information = normal[:, :-1, :-1]
     right = normal[:, :-1, -1]

@@ -19,14 +19,16 @@ class Outliers:
 
 def find_outliers(p_values: Mapping[int, float], *, n_tests: int, most: int) -> Outliers:
     """
-    Return the outliers among windows or poses, at most some.
+    Return the outliers among windows or poses, the least p-value first.
 
     Parameters
     ----------
     p_values : dict
-        Number -> p-value of the tests with the largest residuals.
-    n_tests, most : int
-        Number of tests that might have been made, and of outliers at most.
+        Number of a window or pose -> p-value of its test; those with the largest residuals.
+    n_tests : int
+        Number of windows or poses that might have been tested.
+    most : int
+        Largest number of outliers.
 
     """
     corrected = sorted((p_value * n_tests, number) for number, p_value in p_values.items())

@@ -70,6 +70,6 @@ def fixed_parameters(model: SensorModel) -> np.ndarray:
     """
     Return a mask of parameters that least squares does not estimate.
 
-    Saturation is censoring, not a column.
+    They have no column: saturation censors the output.
     """
     return model.mask(lambda effect: effect.coefficients is None and effect.warp is None)

@@ -105,11 +105,11 @@ class Rows(AlignedArrays):
         """Indices of the rows of each recording, in order of time."""
         if self.session is None:
             return [np.arange(len(self))]
-        found = []
+        sessions = []
         for number in np.unique(self.session):
-            own = np.flatnonzero(self.session == number)
-            found.append(own[np.argsort(self.times[own], kind='stable')])
-        return found
+            indices = np.flatnonzero(self.session == number)
+            sessions.append(indices[np.argsort(self.times[indices], kind='stable')])
+        return sessions
 
     def of_parameters(self, kept: np.ndarray) -> 'Rows':
         """Return the rows with the columns of the nuisances and of some parameters (mask)."""
@@ -168,23 +168,23 @@ class Rows(AlignedArrays):
 
     def residuals_at(self, weights: np.ndarray) -> np.ndarray:
         """
-        Return what parameters leave of the residual, shape (m, n_axes).
+        Return ``residual - columns @ parameters`` of each equation, shape (m, n_axes).
 
         Parameters
         ----------
         weights : array, shape (n_parameters + 1,) or (m, n_parameters + 1)
-            Minus the parameters, then 1; the same for all rows, or of each row.
+            Minus the parameters, then 1 (`weights_of`); the same for all rows, or of each row.
 
         """
-        own = weights if self.places is None else weights[..., self.places]
-        return (self.equations @ own[..., None])[..., 0]
+        of_columns = weights if self.places is None else weights[..., self.places]
+        return (self.equations @ of_columns[..., None])[..., 0]
 
 
 def weights_of(used: Sequence[int], values: np.ndarray, size: int) -> np.ndarray:
     """
-    Return the weights of `Rows.residuals_at` for values of some of the parameters.
+    Return ``[-parameters, 1]``, the weights of `Rows.residuals_at`, shape (size + 1,).
 
-    The others are zero, and the shape is (size + 1,).
+    The parameters `used` have the `values`, all other ones are zero.
     """
     weights = np.zeros(size + 1)
     weights[list(used)] = -values
@@ -198,8 +198,8 @@ def normal_of_rows(
     """
     Return the normal matrix of rows over `size` parameters and the residual.
 
-    Shape (size + 1, size + 1), the rows weighted by their errors. Of the rows `select` (mask) after
-    all are made independent; of all where not given.
+    Shape (size + 1, size + 1). All rows are made independent and of unit variance; with `select`
+    (mask) only some of the independent rows are summed.
     """
     total = np.zeros((size + 1, size + 1))
     for block in blocks:
@@ -209,5 +209,5 @@ def normal_of_rows(
 
 
 def flat(equations: np.ndarray) -> np.ndarray:
-    """Return the equations of all axes one after the other, shape (m n_axes, n)."""
+    """Return equations (m, n_axes, n) as rows of one matrix, shape (m n_axes, n)."""
     return equations.reshape(-1, equations.shape[2])

@@ -40,30 +40,30 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
     """
     Return the triangular factor of `rows`, shape (n, n).
 
-    Rows that begin in the same columns are reflected together.
+    Rows that begin in the same band of `BAND_COLUMNS` columns are reflected together.
 
     With the elements near a diagonal, and dense columns last, the cost is proportional to the
     number of rows.
     """
     width = rows.shape[1]
-    band = np.argmax(rows != 0, axis=1) // BAND_COLUMNS
+    first_band = np.argmax(rows != 0, axis=1) // BAND_COLUMNS
     factor = np.zeros((width, width))
     carried = rows[:0]
-    for number in range(-(-width // BAND_COLUMNS)):
+    for band in range(-(-width // BAND_COLUMNS)):
         # The rows that begin in this band, and the remainder of the rows before it.
-        own = np.concatenate([carried, rows[band == number]])
-        used = np.flatnonzero(own.any(axis=0))
+        stacked = np.concatenate([carried, rows[first_band == band]])
+        used = np.flatnonzero(stacked.any(axis=0))
         if not len(used):
             # no row has an element in this band
             carried = rows[:0]
             continue
-        part = triangular(own[:, used])
+        part = triangular(stacked[:, used])
         reflected = np.zeros((len(part), width))
         reflected[:, used] = part
-        # The columns of this band are done; the rows below them are carried on.
-        done = min(int(np.searchsorted(used, (number + 1) * BAND_COLUMNS)), len(part))
-        factor[used[:done]] = reflected[:done]
-        carried = reflected[done:]
+        # The rows of the columns up to this band are final; the rows below them are carried on.
+        n_final = min(int(np.searchsorted(used, (band + 1) * BAND_COLUMNS)), len(part))
+        factor[used[:n_final]] = reflected[:n_final]
+        carried = reflected[n_final:]
     return factor
 
 
@@ -123,7 +123,7 @@ def inverse_normal(information: np.ndarray) -> np.ndarray:
 
 def solve_scaled(information: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
-    Return the solutions of several systems, (k, n, n) and (k, n).
+    Return the solutions (k, n) of k systems ``information @ x = right``, (k, n, n) and (k, n).
 
     Each information matrix is scaled to a unit diagonal first.
     """
@@ -137,9 +137,11 @@ def solve_normal(
     normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, prior_mean: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (values, covariance) of the parameters `used` at the minimum.
+    Return (values, covariance) of the parameters `used` of least cost with their prior.
 
-    They minimise the quadratic form of a normal matrix plus a prior.
+    With the normal matrix ``[[A, b], [b', y'y]]`` and the information W of the prior m::
+
+        covariance = (A + W)^-1,   values = covariance (b + W m)
 
     Parameters
     ----------
@@ -158,7 +160,9 @@ def solve_normal(
 
 def quadratic(normal: np.ndarray, used: Sequence[int] | np.ndarray, values: np.ndarray) -> float:
     """
-    Return the residual sum of squares of `values` of the parameters `used` under a normal matrix.
+    Return ``y'y - 2 x'b + x'A x`` of the normal matrix ``[[A, b], [b', y'y]]``.
+
+    That is the residual sum of squares at the `values` x of the parameters `used`.
     """
     used = np.asarray(used)
     return float(
@@ -172,9 +176,11 @@ def covariance_with_held(
     rows: np.ndarray, free: np.ndarray, held: np.ndarray, *, prior_sd: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (covariance of the free parameters, covariance due to the fixed ones).
+    Return (covariance of the free parameters, covariance due to the fixed ones), each (n, n).
 
-    The fixed ones are at their prior. Both have shape (n, n), and their sum is the total.
+    With the design A and the influence ``G = -(A_free' A_free)^-1 A_free' A_fixed`` of the fixed
+    parameters on the free ones (one on themselves) the terms are ``(A_free' A_free)^-1`` and
+    ``G diag(prior_sd^2) G'``. Their sum is the total.
 
     Parameters
     ----------
@@ -189,9 +195,9 @@ def covariance_with_held(
     influence[held] = np.eye(int(held.sum()))
     if held.any() and free.any():
         influence[free] = -scaled_lstsq(rows[:, free], rows[:, held])
-    own = np.zeros((len(prior_sd),) * 2)
-    own[np.ix_(free, free)] = inverse_gram(rows[:, free])
-    return own, influence @ np.diag(prior_sd[held] ** 2) @ influence.T
+    of_free = np.zeros((len(prior_sd),) * 2)
+    of_free[np.ix_(free, free)] = inverse_gram(rows[:, free])
+    return of_free, influence @ np.diag(prior_sd[held] ** 2) @ influence.T
 
 
 def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
@@ -204,5 +210,5 @@ def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
     columns = columns[:, size > 0] / size[size > 0]
     if not columns.shape[1]:
         return columns
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > least * singular[0]]
+    directions, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return directions[:, singular > least * singular[0]]

@@ -36,16 +36,13 @@ class BiasProcess:
         """
         Return the standard deviation about the mean over a duration, s.
 
-        The part visible in a session.
-
+        It is the part of the process that a recording of this duration shows. The variance is
         ``sd^2 (1 - 2 r (1 - r (1 - exp(-1 / r))))`` with r the correlation time over the duration.
         """
         ratio = self.time / duration
-        return (
-            self.sd * float(np.sqrt(1 + 2 * ratio * (ratio * -np.expm1(-1 / ratio) - 1)))
-            if ratio > 1e-6
-            else self.sd
-        )
+        if ratio <= 1e-6:
+            return self.sd
+        return self.sd * float(np.sqrt(1 + 2 * ratio * (ratio * -np.expm1(-1 / ratio) - 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +85,11 @@ def means_beside_middles(
     processes: Sequence[BiasProcess], durations: np.ndarray | float
 ) -> np.ndarray:
     """
-    Return the relative variance of the mean of a bias process over windows.
+    Return the variance of (mean over a window minus value in its middle) of bias processes.
 
-    The windows have these lengths (s). The variance is relative to the value of the process in
-    their middles.
-
-    For a random walk with ``2 sd^2 / time`` per second it is ``sd^2 T / (6 time)``. It decreases in
-    windows longer than the correlation time, where the value in the middle overstates the variance
-    of the mean.
+    `durations`: lengths of the windows, s. For a random walk with ``2 sd^2 / time`` per second it
+    is ``sd^2 T / (6 time)``. It decreases in windows longer than the correlation time, where the
+    value in the middle overstates the variance of the mean.
     """
     total = np.zeros(np.shape(durations))
     for process in processes:

@@ -82,7 +82,7 @@ def remedy(
     of_misfit: Collection[str] = (),
 ) -> str:
     """
-    Return how a parameter gets within its tolerance if more data do not help; '' if they do.
+    Return the remedy with which a parameter gets within its tolerance; '' if more data suffice.
 
     More data reduce noise, bias processes and the uncertainty of held parameters. Where these are
     within the tolerance, ``sum of their variances <= (excess tolerance)^2``, the largest of the
@@ -103,15 +103,17 @@ def remedy(
 
     """
     variances = {name: float(term[index, index]) for name, term in terms.items()}
-    fixed = {names: sum(variances.get(name, 0.0) for name in names) for names in REMEDIES}
-    fixed[MODEL_ERROR, DRIFT, REJECTED] += sum(variances.get(name, 0.0) for name in of_misfit)
-    reducible = sum(variances.values()) - sum(fixed.values())
+    irreducible = {}  # variance of the terms of each remedy
+    for names in REMEDIES:
+        irreducible[names] = sum(variances.get(name, 0.0) for name in names)
+    irreducible[MODEL_ERROR, DRIFT, REJECTED] += sum(variances.get(name, 0.0) for name in of_misfit)
+    reducible = sum(variances.values()) - sum(irreducible.values())
     if reducible > (excess * tolerance) ** 2:
         return ''
     if reducible > tolerance**2:
         return EXCESS_REMEDY
-    largest = max(fixed, key=lambda names: fixed[names])
-    return REMEDIES[largest] if fixed[largest] > 0 else ''
+    largest = max(irreducible, key=lambda names: irreducible[names])
+    return REMEDIES[largest] if irreducible[largest] > 0 else ''
 
 
 def total(terms: Terms) -> np.ndarray:
@@ -137,13 +139,25 @@ def common_scale(model: SensorModel, values: np.ndarray) -> np.ndarray:
 
 
 def terms_of_fit(
-    own: np.ndarray, of_bias: np.ndarray, of_held: np.ndarray
+    of_free: np.ndarray, of_bias: np.ndarray, of_held: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the terms of a covariance: `own` of the free parameters contains `of_bias`."""
-    return {SAMPLE_NOISE: own - of_bias, BIAS_PROCESS: of_bias, HELD_PRIORS: of_held}
+    """
+    Return the terms of the covariance of a fit, each of shape (n, n).
+
+    Parameters
+    ----------
+    of_free : array
+        Covariance of the free parameters by all errors of the data.
+    of_bias : array
+        Its part from bias processes and offsets.
+    of_held : array
+        Covariance due to the priors of the held parameters.
+
+    """
+    return {SAMPLE_NOISE: of_free - of_bias, BIAS_PROCESS: of_bias, HELD_PRIORS: of_held}
 
 
-def bounded_by_prior(terms: Terms, held: np.ndarray, prior_sd: np.ndarray) -> dict:
+def bounded_by_prior(terms: Terms, held: np.ndarray, prior_sd: np.ndarray) -> dict[str, np.ndarray]:
     """
     Return the terms with no more than the variance of the prior for held parameters.
 
@@ -180,10 +194,9 @@ def replace_weak(
     limit: np.ndarray | float = 1.0,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     """
-    Return (values, terms, mask) with weak values replaced by their prior.
+    Return (values, terms, mask of the replaced parameters), weak values replaced by their prior.
 
-    The mask is that of the replaced parameters. Values are replaced where that lowers the expected
-    error.
+    Values are replaced where that lowers the expected error.
 
     A value v with prior p and standard deviation s of the fit is replaced where ``(v - p)^2 <
     s^2``. The parameter with the smallest ratio is replaced first; all parameters correlated with
@@ -214,7 +227,11 @@ def replace_weak(
     replaced = np.zeros(len(values), bool)
     smallest = 1e-12 * np.diag(posterior)
     candidates = [k for k in weak if np.isfinite(prior[k])]
-    while candidates := [k for k in candidates if posterior[k, k] > smallest[k]]:
+    while True:
+        # Without parameters that the ones fixed before determine.
+        candidates = [k for k in candidates if posterior[k, k] > smallest[k]]
+        if not candidates:
+            break
         ratio = [(moved[k] - prior[k]) ** 2 / posterior[k, k] / limits[k] for k in candidates]
         least = int(np.argmin(ratio))
         if ratio[least] >= 1.0:
@@ -227,7 +244,8 @@ def replace_weak(
     moved[replaced] = prior[replaced]
     if not replaced.any():
         return values, dict(terms), replaced
-    return moved, with_term(terms, HELD_PRIORS, np.outer(moved - values, moved - values)), replaced
+    terms = with_term(terms, HELD_PRIORS, np.outer(moved - values, moved - values))
+    return moved, terms, replaced
 
 
 class Status(StrEnum):
@@ -274,10 +292,17 @@ def statuses(
         Largest standard deviation of a determined parameter, SI.
 
     """
-    return tuple(
-        HELD if h else FIXED if s == 0 else DETERMINED if s <= t else WEAK
-        for h, s, t in zip(held, sd, tolerances, strict=True)
-    )
+    found = []
+    for is_held, deviation, tolerance in zip(held, sd, tolerances, strict=True):
+        status = WEAK
+        if is_held:
+            status = HELD
+        elif deviation == 0:
+            status = FIXED
+        elif deviation <= tolerance:
+            status = DETERMINED
+        found.append(status)
+    return tuple(found)
 
 
 def reasons_held(
@@ -288,19 +313,28 @@ def reasons_held(
     tested: Collection[str] = (),
 ) -> dict[str, str]:
     """
-    Return held parameter -> the reason.
+    Return held parameter -> the reason (`WEAK_DATA`, `LIKELIHOOD_RATIO` or `REPLACEMENT`).
 
-    `replaced` by its prior, for those `tested` by likelihood ratio, or too weak data.
+    Parameters
+    ----------
+    held : iterable of bool, shape (n_params,)
+    names : iterable of str
+        Names of all parameters.
+    replaced : collection of str
+        Held parameters whose estimate was replaced by the prior.
+    tested : collection of str
+        Parameters that are replaced by a likelihood-ratio test.
+
     """
-    found = {}
-    for name, flag in zip(names, held, strict=True):
-        if not flag:
+    reasons = {}
+    for name, is_held in zip(names, held, strict=True):
+        if not is_held:
             continue
         if name not in replaced:
-            found[name] = WEAK_DATA
+            reasons[name] = WEAK_DATA
         else:
-            found[name] = LIKELIHOOD_RATIO if name in tested else REPLACEMENT
-    return found
+            reasons[name] = LIKELIHOOD_RATIO if name in tested else REPLACEMENT
+    return reasons
 
 
 def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarray:
@@ -450,11 +484,9 @@ AnySolution = TypeVar('AnySolution', bound=Solution)
 
 def with_weak_replaced(solution: AnySolution, tolerances: np.ndarray) -> AnySolution:
     """
-    Return the solution with weak values replaced by their prior.
+    Return the solution with weak values that compensation applies replaced by their prior.
 
-    Values that compensation applies are replaced where that lowers the expected error.
-
-    See `replace_weak`. A replaced parameter is held.
+    They are replaced where that lowers the expected error (`replace_weak`), and are then held.
     """
     applied = solution.model.mask(lambda effect: effect.compensation == 'exact')
     # Errors of placements count for what is printed, but do not draw the estimate to its prior.

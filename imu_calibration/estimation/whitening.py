@@ -10,13 +10,12 @@ from imu_calibration.estimation.sensor_noise import BiasProcess
 
 class Whitening:
     """
-    Multiplication with the inverse Cholesky factor of the covariance of window means.
+    Multiplication with an inverse root W of the covariance of window means, ``W V W' = I``.
 
-    By the innovations of a Kalman filter.
-
-    The covariance is ``diag(variance) + sum_j sd_j^2 exp(-|dt| / time_j)`` within a session, the
-    sum over any number of bias processes, each a state of the filter. An offset of each session is
-    then removed with ``(I + s^2 u u')^(-1/2)``, u the whitened ones.
+    Within a session ``V = diag(variance) + sum_j sd_j^2 exp(-|dt| / time_j) + s^2 1 1'``, the sum
+    over any number of bias processes. Their part is whitened by the innovations of a Kalman filter,
+    in which each process is a state; the offset of the session with variance s^2 then by
+    ``(I + s^2 u u')^(-1/2)``, with the vector u of ones after the filter.
 
     Parameters
     ----------
@@ -41,19 +40,23 @@ class Whitening:
         processes: Sequence[BiasProcess] = (),
         session_variance: float = 0.0,
     ):
-        self._variance, self._sessions = variance, sessions
+        self._variance = variance
+        self._sessions = sessions
         self._session_variance = session_variance
         self._filter: _Filter | None = None
+        """Filter over the rows of all axes in one chain; None without bias processes."""
         self._ones: np.ndarray | None = None
+        """Ones after the filter, shape (n, n_axes); None without an offset of sessions."""
         processes = [process for process in processes if process.sd > 0]
         if processes:
             self._order = np.concatenate(sessions)
-            # Each session begins a new series.
+            """Indices of the rows in the chain of one axis: sessions, each in order of time."""
+            # An infinite step before the first row of each session begins a new series.
             steps = np.full(len(self._order), np.inf)
             start = 0
             for index in sessions:
-                own_times = times[index]
-                steps[start + 1 : start + len(index)] = own_times[1:] - own_times[:-1]
+                times_of_session = times[index]
+                steps[start + 1 : start + len(index)] = np.diff(times_of_session)
                 start += len(index)
             self._filter = _Filter(
                 self._chained(variance[:, :, None])[:, 0],
@@ -69,52 +72,63 @@ class Whitening:
 
     def adjoint(self, white: np.ndarray) -> np.ndarray:
         """
-        Return ``W' white``, shape (n, n_axes, q), of rows whitened by W, which it overwrites.
+        Return ``W' white``, shape (n, n_axes, q); it overwrites `white`.
 
-        ``V^-1 values`` with V the covariance.
+        Of whitened values, ``white = W values``, that is ``V^-1 values``.
         """
         return self._filtered(self._with_session_offsets(white), adjoint=True)
 
     @property
     def log_determinant(self) -> float:
         """Logarithm of the determinant of the covariance, all axes together."""
-        logs = np.log(self._variance if self._filter is None else self._filter.total).sum()
+        of_rows = self._variance if self._filter is None else self._filter.total
+        log_determinant = np.log(of_rows).sum()
         if self._ones is not None:
-            logs += sum(
-                np.log1p(self._session_variance * (self._ones[index] ** 2).sum(axis=0)).sum()
-                for index in self._sessions
-            )
-        return float(logs)
+            # log det(I + s^2 u u') of each session
+            of_offsets = 0.0
+            for index in self._sessions:
+                squares = (self._ones[index] ** 2).sum(axis=0)
+                of_offsets += np.log1p(self._session_variance * squares).sum()
+            log_determinant += of_offsets
+        return float(log_determinant)
 
     def _chained(self, values: np.ndarray) -> np.ndarray:
         """
-        Return the rows of all axes and sessions one after the other, each session in order of time.
+        Return values (n, n_axes, q) as one chain of rows, shape (n_axes n, q).
 
-        Shape (n_axes n, q).
+        The axes are one after the other; of each axis the sessions, each in order of time.
         """
         return values[self._order].transpose(1, 0, 2).reshape(-1, values.shape[2])
 
     def _filtered(self, values: np.ndarray, *, adjoint: bool = False) -> np.ndarray:
-        """Return rows divided by their noise, bias processes included, without session offsets."""
+        """
+        Return values whitened by the noise of the rows and the bias processes, (n, n_axes, q).
+
+        With `adjoint` they are multiplied by the transposed operator.
+        """
         if self._filter is None:
             return values / np.sqrt(self._variance)[:, :, None]
-        chained = self._chained(values)
-        found = self._filter.adjoint(chained) if adjoint else self._filter.forward(chained)
+        chain = self._chained(values)
+        chain = self._filter.adjoint(chain) if adjoint else self._filter.forward(chain)
+        # Back from the chain to the order of the rows.
         white = np.empty_like(values)
-        white[self._order] = found.reshape(values.shape[1], -1, values.shape[2]).transpose(1, 0, 2)
+        white[self._order] = chain.reshape(values.shape[1], -1, values.shape[2]).transpose(1, 0, 2)
         return white
 
     def _with_session_offsets(self, white: np.ndarray) -> np.ndarray:
-        """Multiply with ``(I + s^2 u u')^(-1/2)`` in each session, in place."""
+        """
+        Multiply with ``(I + s^2 u u')^(-1/2)`` in each session, in place.
+
+        It is ``I - (1 - 1 / sqrt(1 + s^2 u'u)) / (u'u) u u'``.
+        """
         if self._ones is None:
             return white
         for index in self._sessions:
             ones = self._ones[index]
             square = (ones**2).sum(axis=0)
             shrink = (1 - 1 / np.sqrt(1 + self._session_variance * square)) / square
-            white[index] -= (shrink * ones)[:, :, None] * np.einsum(
-                'ka,kaq->aq', ones, white[index]
-            )
+            along = np.einsum('ka,kaq->aq', ones, white[index])
+            white[index] -= (shrink * ones)[:, :, None] * along
         return white
 
 
@@ -129,7 +143,13 @@ class _Filter:
     """
     Innovations over their standard deviations of one chain of rows, in place.
 
-    An infinite step begins a new series.
+    With the decay d_j = exp(-dt / time_j) of process j from row to row, the Kalman gain g_j and the
+    variance S of the innovation e of a row y, the predicted states s follow::
+
+        e_k = y_k - sum_j s_jk,   s_k = F_k s_(k-1) + d_k g_(k-1) y_(k-1)
+        F_k = diag(d_k) (I - g_(k-1) 1')
+
+    An infinite step (d = 0) begins a new series.
 
     Parameters
     ----------
@@ -147,23 +167,27 @@ class _Filter:
         times = np.array([process.time for process in processes])
         decay = np.exp(-steps[:, None] / times)
         fresh = -np.expm1(-2 * steps[:, None] / times) * power
-        alike = variance.max() < LARGEST_SAFE_RATIO * (variance + fresh[:, 0]).min()
-        if len(power) == 1 and alike:
-            self.total, gain = _gains_of_one(variance, decay[:, 0], fresh[:, 0])
+        is_safe = variance.max() < LARGEST_SAFE_RATIO * (variance + fresh[:, 0]).min()
+        if len(power) == 1 and is_safe:
+            total, gain = _gains_of_one(variance, decay[:, 0], fresh[:, 0])
         else:
-            self.total, gain = _gains(variance, decay, fresh)
-
-        # The states follow s_k = F_k s_(k-1) + u_k with F_k = diag(decay) (I - gain 1'): a banded
-        # system for all of them at once.
+            total, gain = _gains(variance, decay, fresh)
+        self.total = total
+        """Variances S of the innovations, shape (n,)."""
         self._width = width = len(power)
+        """Number m of processes."""
         self._driven_by = decay[1:] * gain[:-1]
+        """Factors ``d_k g_(k-1)`` of the row before in the states, shape (n - 1, m)."""
+
+        # All states from one banded system, s_k - F_k s_(k-1) = d_k g_(k-1) y_(k-1). Element (i, j)
+        # of -F_k is on the diagonal that is `width + i - j` below the main one.
         self._bands = np.zeros((2 * width, width * (len(variance) - 1)))
+        """Its unit lower triangle in the band storage of LAPACK, shape (2 m, m (n - 1))."""
         self._bands[0] = 1.0
         for i in range(width):
             for j in range(width):
-                self._bands[width + i - j, j:-width:width] = -decay[2:, i] * (
-                    (i == j) - gain[1:-1, i]
-                )
+                factor = (i == j) - gain[1:-1, i]
+                self._bands[width + i - j, j:-width:width] = -decay[2:, i] * factor
 
     def forward(self, values: np.ndarray) -> np.ndarray:
         """Return the innovations of rows, shape (n, q), which it overwrites."""
@@ -196,16 +220,29 @@ class _Filter:
 def _gains(
     variance: np.ndarray, decay: np.ndarray, fresh: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (variances of the innovations, shape (n,), gains, shape (n, m)) of m processes."""
-    spread = np.zeros((decay.shape[1],) * 2)
+    """
+    Return (variances S of the innovations, shape (n,), gains g, shape (n, m)) of m processes.
+
+    The Kalman filter with the covariance P of the states, ``P <- d P d' + diag(fresh)``,
+    ``S = 1'P1 + variance``, ``g = P1 / S``, ``P <- P - g 1'P``.
+
+    Parameters
+    ----------
+    variance : array, shape (n,)
+        Independent part of the variance of each row.
+    decay, fresh : array, shape (n, m)
+        Factor on each state since the row before, and the variance that it gained.
+
+    """
+    covariance = np.zeros((decay.shape[1],) * 2)
     total = np.empty(len(variance))
     gain = np.empty(decay.shape)
-    for k, own in enumerate(variance):
-        spread = decay[k][:, None] * spread * decay[k] + np.diag(fresh[k])
-        reach = spread.sum(axis=1)
-        total[k] = reach.sum() + own
-        gain[k] = reach / total[k]
-        spread = spread - np.outer(gain[k], reach)
+    for k, of_row in enumerate(variance):
+        covariance = decay[k][:, None] * covariance * decay[k] + np.diag(fresh[k])
+        with_row = covariance.sum(axis=1)
+        total[k] = with_row.sum() + of_row
+        gain[k] = with_row / total[k]
+        covariance = covariance - np.outer(gain[k], with_row)
     return total, gain
 
 
@@ -213,10 +250,10 @@ def _gains_of_one(
     variance: np.ndarray, decay: np.ndarray, fresh: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the same for one process, the common case (called hundreds of times).
+    Return the result of `_gains` for one process, all arguments of shape (n,).
 
-    Differences ``y_k - decay_k y_(k-1)`` have a tridiagonal covariance, whose pivots are the
-    variances of the innovations.
+    It is the common case, called hundreds of times. Differences ``y_k - decay_k y_(k-1)`` have a
+    tridiagonal covariance, whose pivots are the variances of the innovations.
     """
     carried = decay[1:] * variance[:-1]
     diagonal = fresh + variance

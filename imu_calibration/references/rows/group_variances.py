@@ -1,6 +1,7 @@
 """Variances of groups of rows in addition to the known noise, by restricted likelihood."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -60,13 +61,13 @@ def estimate_group_variances(
 
     """
     problem = _Groups(rows, len(start))
-    none = np.zeros(len(start), bool)
+    no_group = np.zeros(len(start), bool)
 
     # Groups with enough degrees of freedom are estimated. At a large variance these depend on the
     # layout of the rows only.
     large = 100 * (np.asarray(fallback, float) + problem.typical(np.zeros(len(start))))
-    spare = problem.step(large, none).dof
-    free = spare >= DOF_LEAST
+    dof_of_layout = problem.step(large, no_group).dof
+    free = dof_of_layout >= DOF_LEAST
 
     current = np.where(free, start, fallback)
     for _ in range(SCORING_STEPS):
@@ -80,7 +81,7 @@ def estimate_group_variances(
 
     # Few degrees of freedom widen the intervals. A group with almost none may have all the misfit.
     upper = current * np.where(dof > DOF_LEAST, student_factor(dof), 1.0)
-    for index in np.flatnonzero(spare < DOF_SEPARATE):
+    for index in np.flatnonzero(dof_of_layout < DOF_SEPARATE):
         alone = np.arange(len(free)) == index
         upper[index] = max(upper[index], _attributed(problem, alone, fallback)[index])
     return GroupVariances(current, dof, upper)
@@ -106,18 +107,19 @@ def scoring(rows: Rows, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     white = flat(rows.white())
     factor = triangular_of_band(white)
     # Only the rows of groups: the cost grows with the square of their number.
-    some = members.any(axis=0)
-    white = white[some]
-    weighted = (members / rows.variance.ravel())[:, some]
-    # With A = Q R, `left` is Q of these rows: residuals e = y - Q Q'y, hat matrix H = Q Q'.
-    left = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
-    rest = white[:, -1] - left @ factor[:-1, -1]
-    redundancy = 1 - np.einsum('ij,ij->i', left, left)
-    # Score (e^2 - (1 - h)) / 2 and information (I - H)^2 / 2, summed over the groups.
-    spread = left @ left.T
-    spread[np.diag_indices_from(spread)] -= 1
-    np.square(spread, out=spread)  # in place: the square of the number of rows
-    return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ spread @ weighted.T
+    in_group = members.any(axis=0)
+    white = white[in_group]
+    weighted = (members / rows.variance.ravel())[:, in_group]
+    # With A = Q R, the Q of these rows: residuals e = y - Q Q'y, hat matrix H = Q Q'.
+    q = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
+    residual = white[:, -1] - q @ factor[:-1, -1]
+    redundancy = 1 - np.einsum('ij,ij->i', q, q)
+    # Score (e^2 - (1 - h)) / 2 and information (I - H)^2 / 2, summed over the groups; the squares
+    # are of each element.
+    squares = q @ q.T
+    squares[np.diag_indices_from(squares)] -= 1
+    np.square(squares, out=squares)  # in place: the memory is the square of the number of rows
+    return 0.5 * weighted @ (residual**2 - redundancy), 0.5 * weighted @ squares @ weighted.T
 
 
 def student_factor(dof: np.ndarray) -> np.ndarray:
@@ -139,27 +141,36 @@ class _ScoringStep:
     """Degrees of freedom of each, shape (n_groups,)."""
 
 
+@dataclass(frozen=True, eq=False)
 class _Groups:
-    """The likelihood as a function of the additional variances of groups."""
+    """The restricted likelihood of rows as a function of the additional variances of groups."""
 
-    def __init__(self, rows: Rows, count: int):
-        self.rows = rows
-        self.members = np.array([rows.component == number for number in range(count)], float)
+    rows: Rows
+    """Rows of one axis; their component is the group."""
+    n_groups: int
+    """Number of groups."""
+
+    @cached_property
+    def members(self) -> np.ndarray:
+        """1 for the rows of each group, else 0, shape (n_groups, m)."""
+        return np.array([self.rows.component == k for k in range(self.n_groups)], float)
 
     def typical(self, extra: np.ndarray) -> np.ndarray:
-        """Return the mean variance of each group's rows, shape (n_groups,)."""
+        """Return the mean variance of each group's rows, `extra` included, shape (n_groups,)."""
         variance = self.rows.with_scatter(extra).variance.ravel()
         return (self.members @ variance) / np.maximum(self.members.sum(1), 1)
 
     def step(self, extra: np.ndarray, free: np.ndarray) -> _ScoringStep:
         """
-        Return the next variances and the degrees of freedom of each.
+        Return the next variances after `extra`, and the degrees of freedom of each group.
 
-        The variances follow from a scoring step over the free groups that are not pinned at zero.
+        The variances change by a scoring step over the free groups (mask). Groups at zero whose
+        likelihood rises below zero keep zero.
         """
         score, information = scoring(self.rows.with_scatter(extra), self.members)
         typical = self.typical(extra)
-        index = np.flatnonzero(free & ~((extra <= 0) & (score < 0)))
+        is_at_bound = (extra <= 0) & (score < 0)
+        index = np.flatnonzero(free & ~is_at_bound)
         step = np.zeros(len(extra))
         if len(index):
             step[index] = np.linalg.solve(information[np.ix_(index, index)], score[index])
@@ -171,15 +182,15 @@ class _Groups:
 
 def _attributed(problem: _Groups, alone: np.ndarray, fallback: np.ndarray) -> np.ndarray:
     """
-    Return the variance of one group if all misfit is its own, shape (n_groups,).
+    Return the variance of the group `alone` (mask) if it causes all misfit, shape (n_groups,).
 
-    It is at least `fallback` and widened by Student's t.
+    The variance is at least `fallback`, widened by Student's t; that of the other groups is zero.
     """
-    none = np.zeros(len(alone), bool)
-    first = problem.step(np.where(alone, fallback, 0.0), none)
+    no_group = np.zeros(len(alone), bool)
+    first = problem.step(np.where(alone, fallback, 0.0), no_group)
     current = first.variance
     if first.dof[alone] > SPARE_LEAST:
         for _ in range(ATTRIBUTION_STEPS):
             current = problem.step(current, alone).variance
     current = np.where(alone, np.maximum(current, fallback), 0.0)
-    return current * student_factor(problem.step(current, none).dof)
+    return current * student_factor(problem.step(current, no_group).dof)

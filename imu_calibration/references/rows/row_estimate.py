@@ -101,11 +101,16 @@ def estimate_rows(
     asked = ~reference.fixed
     held = np.zeros(len(asked), bool) if withheld is None else withheld & asked
     problem = _RowProblem(reference, fallback, held, asked, reference.priors)
-    found = estimate(problem, _Iterated(state, _known_scatter(fallback)))
-    last = found.state
-    factor = found.rows.design
+    joint = estimate(problem, _Iterated(state, _known_scatter(fallback)))
+    last = joint.state
     return RowEstimate(
-        last.state, found.terms, found.held, found.free, last.scatter, factor, last.n_steps
+        state=last.state,
+        terms=joint.terms,
+        held=joint.held,
+        free=joint.free,
+        scatter=last.scatter,
+        factor=joint.rows.design,
+        steps=last.n_steps,
     )
 
 
@@ -138,25 +143,29 @@ class _RowProblem:
     asked: np.ndarray
     """False where a convention fixes a parameter, shape (n,)."""
     prior_sd: np.ndarray
-    """Shape (n,)."""
+    """Standard deviations of the parameters before any data, shape (n,)."""
 
     def fitted(self, state: _Iterated) -> _Iterated:
-        """Return the values with the priors, and the scatter."""
+        """Return the values of least cost with the priors, and the scatter of the components."""
         return self._solved(state, self.withheld, self.prior_sd)
 
     def _solved(self, state: _Iterated, held: np.ndarray, prior_sd: np.ndarray) -> _Iterated:
-        """Return values and scatter of least cost, without changes of the held parameters."""
+        """
+        Return values and scatter after Gauss-Newton steps, the held parameters (mask) unchanged.
+
+        `prior_sd`: standard deviations of the priors that count in this fit, shape (n,).
+        """
         squares = _RowSquares(self.reference, self.asked & ~held, prior_sd, self.fallback)
         return gauss_newton(squares, state, n_steps=MAX_NEWTON_STEPS)
 
     def undetermined(self, state: _Iterated) -> np.ndarray:
-        """Return the parameters that the data alone do not determine."""
+        """Return a mask of the parameters that the data alone do not determine."""
         flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * self.prior_sd))
         rows = np.vstack([self.weighted(state).design, flat_prior])
         return undetermined_parameters(rows, self.prior_sd, free=self.asked, held=self.withheld)
 
     def holding(self, state: _Iterated, held: np.ndarray) -> _Iterated:
-        """Return the values from the data alone, the held ones nominal, and the scatter."""
+        """Return the values from the data almost without priors, the held ones nominal."""
         values = np.where(held, self.reference.nominal, state.state.values)
         variance = np.maximum(state.scatter.variance, LEAST_START_VARIANCE * self.fallback)
         start = _Iterated(replace(state.state, values=values), _known_scatter(variance))
@@ -170,7 +179,7 @@ class _RowProblem:
     def not_believed(
         self, state: _Iterated, free: np.ndarray, sd: np.ndarray
     ) -> Mapping[int, float]:
-        """Return none: the scatter of few rows contains their misfit."""
+        """Return no parameter: the scatter of few rows contains their misfit."""
         return {}
 
 
@@ -179,7 +188,7 @@ class _RowStep:
     """A step, and the scatter with which the rows were weighted."""
 
     change: np.ndarray
-    """Of the nuisances, then of all parameters."""
+    """Change of the nuisances, then of all parameters, shape (d + n,)."""
     length: float
     """Length in joint standard deviations."""
     scatter: GroupVariances
@@ -201,8 +210,9 @@ class _RowSquares:
     """Variances of the components where the data are too few, shape (n_components,)."""
 
     def step(self, at: _Iterated) -> _RowStep:
-        """Return the step from a state, with the scatter estimated at it."""
-        free, fallback = self.free, self.fallback
+        """Return the Gauss-Newton step from a state, with the scatter estimated at that state."""
+        free = self.free
+        fallback = self.fallback
         # Rows of the reference, of nuisances and free parameters, and rows of the priors.
         distance = self.reference.nominal - at.state.values
         rows = self.reference.linearise(at.state).of_parameters(free)
@@ -241,35 +251,34 @@ class _ScatteredRows:
     """Rows with the scatter of their components (`WeightedRows`)."""
 
     rows: Rows
+    """Rows of the reference, with the variance of the known noise."""
     scatter: GroupVariances
+    """Scatter of the components beyond the noise."""
 
     @cached_property
     def design(self) -> np.ndarray:
         """
-        Triangular factor of the parameters with the nuisances eliminated.
+        Triangular factor of the parameters with the nuisances eliminated, shape (n, n).
 
-        The factor is at inflated variances.
+        The rows are weighted with the upper variances of the components.
         """
         n_nuisances = self.rows.n_nuisances
         factor = triangular_of_band(flat(self.rows.with_scatter(self.scatter.upper).white()))
         return factor[n_nuisances:-1, n_nuisances:-1]
 
-    def scatter_term(self, own: np.ndarray) -> np.ndarray:
+    def scatter_term(self, covariance: np.ndarray) -> np.ndarray:
         """
-        Return the part of the covariance that is due to the scatter of the components.
+        Return the part ``G (V - N) G'`` of the covariance of the free parameters, shape (n, n).
 
-        With the changes G of the parameters by errors of the rows, the variance V of the rows and
-        their noise N::
-
-            covariance = G (V - N) G'
-
+        It is due to the scatter of the components, with the changes G of the parameters by errors
+        of the rows, the variance V of the rows and their noise N.
         """
-        free = np.diag(own) > 0
+        free = np.diag(covariance) > 0
         added = self.rows.with_scatter(self.scatter.upper).variance - self.rows.variance
         gain = gain_of_rows(self.rows, self.scatter, free) * np.sqrt(added.ravel())
-        found = np.zeros_like(own)
-        found[np.ix_(free, free)] = gain @ gain.T
-        return found
+        term = np.zeros_like(covariance)
+        term[np.ix_(free, free)] = gain @ gain.T
+        return term
 
 
 def gain_of_rows(rows: Rows, scatter: GroupVariances, free: np.ndarray) -> np.ndarray:

@@ -13,38 +13,37 @@ def model_error_of_rows(
     rows: Rows, found: RowEstimate, model: SensorModel, *, block: np.ndarray
 ) -> ModelError:
     """
-    Return the model error from the scatter of parameters between blocks of rows.
+    Return the model error from shifts of the parameters between blocks of rows.
 
-    It is the scatter beyond noise and known scatter.
-
-    Nuisances are estimated too, so that the expected covariance of the shifts is the one of rows
-    from which these, and the parameters, have been fitted.
+    The shifts count as far as they exceed noise and the scatter of the components. Their expected
+    covariance is that of rows from which parameters and nuisances have been fitted.
 
     Parameters
     ----------
     rows : Rows
         At the estimate.
     found : RowEstimate
+        The estimate from these rows.
     model : SensorModel
         Its parameters are those of the rows.
     block : array of int, shape (m,)
         Number of each row's block.
 
     """
-    # Rows of unit variance, the design without its part along the nuisances (F F' A).
+    # Rows of unit variance; F is a basis of the nuisances, and the design has no part along it.
     white = flat(rows.with_scatter(found.scatter.variance).white())
-    nuisances, main, rest = np.split(white, [rows.n_nuisances, white.shape[1] - 1], axis=1)
-    fitted = scipy.linalg.qr(nuisances, mode='economic')[0]
-    main = main - fitted @ (fitted.T @ main)
+    nuisances, design, residual = np.split(white, [rows.n_nuisances, white.shape[1] - 1], axis=1)
+    basis = scipy.linalg.qr(nuisances, mode='economic')[0]
+    design = design - basis @ (basis.T @ design)
 
     information = []
     gradient = []
     shared = []
     for number in range(block.max() + 1):
-        own = block == number
-        information.append(main[own].T @ main[own])
-        gradient.append(main[own].T @ rest[own, 0])
-        shared.append(fitted[own].T @ main[own])
+        in_block = block == number
+        information.append(design[in_block].T @ design[in_block])
+        gradient.append(design[in_block].T @ residual[in_block, 0])
+        shared.append(basis[in_block].T @ design[in_block])
     waves = waves_of_blocks(
         np.array(information),
         np.array(gradient),

@@ -255,9 +255,10 @@ class _WeightedWindows:
     def design(self) -> np.ndarray:
         return np.concatenate([self.data, self.system.prior.root])
 
-    def scatter_term(self, own: np.ndarray) -> np.ndarray:
+    def scatter_term(self, covariance: np.ndarray) -> np.ndarray:
         """Return the part of the covariance that is due to offsets and bias processes."""
-        return own @ self.system.bias_information(self.fit.values, self.fit.noises) @ own
+        information = self.system.bias_information(self.fit.values, self.fit.noises)
+        return covariance @ information @ covariance
 
 
 def _refuse_held(
