@@ -1,10 +1,11 @@
 """
-How well a choice of parameters predicts windows that it was not fitted to.
+Likelihood of choices of parameters, on all rows and on rows that they are not fitted to.
 
 Small problems on normal matrices.
 """
 
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,13 +27,19 @@ last again.
 """
 
 
-def _squares(parts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def squares_of_folds(normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """
-    Return residual sums of squares from normal matrices of folds.
+    Return ``sum_f w_f' N_pf w_f``, the residual sums of squares over f folds, shape (p,).
 
-    Shape (p, f, n, n), and residual vectors (f, n), shape (p,).
+    Parameters
+    ----------
+    normals : array, shape (p, f, n, n)
+        Normal matrix N of each of p parts of the rows and each fold.
+    weights : array, shape (f, n)
+        Weights w of the residuals of each fold (`weights_of`).
+
     """
-    return ((parts @ rows[:, :, None])[..., 0] * rows).sum(axis=(1, 2))
+    return ((normals @ weights[:, :, None])[..., 0] * weights).sum(axis=(1, 2))
 
 
 class Recent(dict):
@@ -57,52 +64,46 @@ class Recent(dict):
             del self[next(iter(self))]
 
 
+@dataclass(eq=False)
 class Evidence:
     """
     Evidence for choices of parameters, each a sequence of indices, from rows in folds.
 
     Losses are minus twice log likelihoods, up to a constant; here those of known noise.
-
-    Parameters
-    ----------
-    blocks : sequence of Rows
-        Explicit rows.
-    folds : sequence of array, each shape (m,)
-        Fold of each row of each block.
-    total : array, shape (q + 1, q + 1)
-        Normal matrix ``[design | residual]' V^-1 [design | residual]`` of all rows.
-    without : array, shape (n_folds, q + 1, q + 1)
-        The same of all rows but those of each fold.
-    prior_sd, prior_mean : array, shape (q,)
-        Prior of the parameters.
-
     """
 
-    def __init__(
-        self,
-        blocks: Sequence[Rows],
-        folds: Sequence[np.ndarray],
-        *,
-        total: np.ndarray,
-        without: np.ndarray,
-        prior_sd: np.ndarray,
-        prior_mean: np.ndarray,
-    ):
-        self.blocks = blocks
-        self.folds = folds
-        self.total = total
-        self.without = without
-        self.prior_sd = prior_sd
-        self.prior_mean = prior_mean
-        self._fits: dict[tuple, tuple] = Recent(MOST_FITS)
-        self._losses: dict[tuple, float] = {}
-        self._predictions: dict[tuple, np.ndarray] = Recent(MOST_FITS)
+    blocks: Sequence[Rows]
+    """Explicit rows."""
+    folds: Sequence[np.ndarray]
+    """Fold of each row of each block, each shape (m,)."""
+    _: KW_ONLY
+    total: np.ndarray
+    """
+    Normal matrix ``[design | residual]' V^-1 [design | residual]`` of all rows, shape
+    (q + 1, q + 1).
+    """
+    without: np.ndarray
+    """The same of all rows but those of each fold, shape (n_folds, q + 1, q + 1)."""
+    prior_sd: np.ndarray
+    """Prior standard deviations of the parameters, shape (q,)."""
+    prior_mean: np.ndarray
+    """Prior values of the parameters, shape (q,)."""
+    _fits: dict[tuple, ParameterFit] = field(
+        default_factory=lambda: Recent(MOST_FITS), init=False, repr=False
+    )
+    """Sorted choice -> its fit to all rows."""
+    _losses: dict[tuple, float] = field(default_factory=dict, init=False, repr=False)
+    """Sorted choice, after 'held out' or not -> its loss."""
+    _heldout_fits: dict[tuple, np.ndarray] = field(
+        default_factory=lambda: Recent(MOST_FITS), init=False, repr=False
+    )
+    """Sorted choice -> `_heldout_weights`."""
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (matrix, right side) of the normal equations of all parameters on all rows.
+        Return (matrix, right side) of the normal equations of all parameters, with the prior.
 
-        With the prior.
+        Of all rows, shapes (q, q) and (q,).
         """
         known = 1 / self.prior_sd**2
         matrix = self.total[:-1, :-1] + np.diag(known)
@@ -121,7 +122,7 @@ class Evidence:
         return values[places], covariance[np.ix_(places, places)]
 
     def _fitted(self, normal: np.ndarray, used: Sequence[int]) -> ParameterFit:
-        """Return the same from the normal matrix of some rows."""
+        """Return (values, covariance) of the parameters `used` by a normal matrix and the prior."""
         return solve_normal(normal, np.array(used), self.prior_sd, prior_mean=self.prior_mean)
 
     def loss(self, used: Sequence[int]) -> float:
@@ -140,9 +141,9 @@ class Evidence:
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
-        Return the loss on held-out data by sensor.
+        Return sensor -> loss on held-out data, shape (2, 3).
 
-        Of the windows' means and within the windows, of each axis, shape (2, 3).
+        Rows are the means of the windows, and the samples about them; columns are the axes.
         """
         raise NotImplementedError(f'{type(self).__name__} has no effect that acts on both sensors')
 
@@ -158,59 +159,53 @@ class Evidence:
         raise NotImplementedError
 
     def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
-        """
-        Return the residual of every row under the fit without its fold.
-
-        Shape (m, n_axes) per block.
-        """
-        left = self.left_by_others(used)
-        found = []
+        """Return the residuals of each block, every row under the fit without its fold."""
+        weights = self.heldout_weights(used)
+        residuals = []
         for block, fold in zip(self.blocks, self.folds):
-            found.append(block.residuals_at(left[fold]))
-        return found
+            residuals.append(block.residuals_at(weights[fold]))
+        return residuals
 
-    def left_by_others(self, used: Sequence[int]) -> np.ndarray:
+    def heldout_weights(self, used: Sequence[int]) -> np.ndarray:
         """
-        Return the vectors that map rows of all parameters to residuals, per fold.
+        Return the weights of the residuals of each fold (`weights_of`), shape (n_folds, q + 1).
 
-        The residuals are of the fit to all other folds, and the shape is (n_folds, q + 1).
+        The parameters `used` have the values of the fit to all other folds, all others are zero.
         """
-        left = np.zeros((len(self.without), len(self.total)))
-        left[:, np.append(sorted(used), -1)] = self._left_by_others(tuple(sorted(used)))
-        return left
+        weights = np.zeros((len(self.without), len(self.total)))
+        weights[:, np.append(sorted(used), -1)] = self._heldout_weights(tuple(sorted(used)))
+        return weights
 
     def _loss(self, used: Sequence[int]) -> float:
+        """Return the loss of the best fit of a sorted choice to all rows."""
         return quadratic(self.total, used, self.fit(used)[0])
 
     def _heldout(self, used: tuple[int, ...]) -> float:
+        """Return the loss of each fold of a sorted choice under the fit to the others, summed."""
         places = np.append(used, -1)
-        folds = self.total[np.ix_(places, places)] - self.without[:, places[:, None], places]
-        return float(_squares(folds[None], self._left_by_others(used))[0])
+        of_folds = self.total[np.ix_(places, places)] - self.without[:, places[:, None], places]
+        return float(squares_of_folds(of_folds[None], self._heldout_weights(used))[0])
 
-    def _left_by_others(self, used: tuple[int, ...]) -> np.ndarray:
-        """
-        Return for each fold the map from rows of `used`, sorted, to residuals.
-
-        The residuals are of the fit to all other folds, and the shape is (n_folds, n + 1).
-        """
-        if used not in self._predictions:
-            at = np.array(used)
-            known = 1 / self.prior_sd[at] ** 2
-            places = np.append(at, -1)
+    def _heldout_weights(self, used: tuple[int, ...]) -> np.ndarray:
+        """Return `heldout_weights` of the n sorted parameters `used` alone, (n_folds, n + 1)."""
+        if used not in self._heldout_fits:
+            parameters = np.array(used)
+            information = 1 / self.prior_sd[parameters] ** 2
+            places = np.append(parameters, -1)
             normal = self.without[:, places[:, None], places]
-            matrix = normal[:, :-1, :-1] + np.diag(known)
-            values = solve_scaled(matrix, normal[:, :-1, -1] + known * self.prior_mean[at])
-            # A residual is the last column less the prediction.
-            self._predictions[used] = np.column_stack([-values, np.ones(len(values))])
-        return self._predictions[used]
+            matrix = normal[:, :-1, :-1] + np.diag(information)
+            right = normal[:, :-1, -1] + information * self.prior_mean[parameters]
+            values = solve_scaled(matrix, right)
+            self._heldout_fits[used] = np.column_stack([-values, np.ones(len(values))])
+        return self._heldout_fits[used]
 
 
 DISAGREE = 1e-4
 """Significance level of the test that the halves differ."""
 MAX_HALVES_LOSS = 1 / 16
 """
-Share of an effect's chi-square that is lost with one value for both halves, above which they
-disagree.
+Share of an effect's chi-square, above which the loss with one value for both halves is a
+disagreement.
 
 For halves of equal precision: values that differ by half of the joint estimate.
 """
@@ -220,9 +215,14 @@ def agree(halves: Sequence[ParameterFit], whole: ParameterFit, at: Sequence[int]
     """
     Return whether the estimates of some parameters from two halves agree within their precision.
 
-    They disagree when the difference is significant and one value for both loses more than
-    `MAX_HALVES_LOSS` of the chi-square. A half that hardly determines an effect loses little, for
-    any value: before any rotation, an arm may be estimated at a metre.
+    With the estimates x and their covariances C of the halves 1, 2 and of both::
+
+        chi2_difference = (x_1 - x_2)' (C_1 + C_2)^-1 (x_1 - x_2)
+        chi2_effect = x' C^-1 x
+
+    They disagree when the difference is significant and exceeds `MAX_HALVES_LOSS` of the chi-square
+    of the effect. A half that determines an effect badly loses little, for any value: before any
+    rotation, an arm may be estimated at a metre.
 
     Parameters
     ----------
@@ -233,10 +233,14 @@ def agree(halves: Sequence[ParameterFit], whole: ParameterFit, at: Sequence[int]
 
     """
     at = list(at)
-    difference = (halves[0][0] - halves[1][0])[at]
-    apart = float(
-        difference @ np.linalg.solve((halves[0][1] + halves[1][1])[np.ix_(at, at)], difference)
-    )
-    value = whole[0][at]
-    explained = float(value @ np.linalg.solve(whole[1][np.ix_(at, at)], value))
-    return bool(chi2_sf(apart, len(at)) > DISAGREE or apart < MAX_HALVES_LOSS * explained)
+    (first, first_cov), (second, second_cov) = halves
+    difference = (first - second)[at]
+    covariance = (first_cov + second_cov)[np.ix_(at, at)]
+    chi2_difference = float(difference @ np.linalg.solve(covariance, difference))
+
+    joint, joint_cov = whole
+    value = joint[at]
+    chi2_effect = float(value @ np.linalg.solve(joint_cov[np.ix_(at, at)], value))
+
+    is_insignificant = chi2_sf(chi2_difference, len(at)) > DISAGREE
+    return bool(is_insignificant or chi2_difference < MAX_HALVES_LOSS * chi2_effect)

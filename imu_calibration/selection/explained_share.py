@@ -5,6 +5,7 @@ Prevents findings that stand in for a cause outside the catalogue.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -31,36 +32,25 @@ heavier tails.
 """
 
 
+@dataclass(eq=False)
 class Explained:
+    """Excess over noise on held-out data, and the share of it that effects remove."""
+
+    search: Search
+    """The search, with the parameters of its questions."""
+    losses: Callable[[Sequence[int]], Mapping[str, np.ndarray]]
     """
-    Excess over noise on held-out data, and the share of it that effects remove.
-
-    Parameters
-    ----------
-    search : Search
-    losses : callable
-        Returns for parameters in use: sensor -> squares on held-out data in units of their noise,
-        shape (n_parts, n_axes).
-    numbers : dict
-        Sensor -> number of squares of each part, their expectation from noise, shape (n_parts,).
-    least_part : float
-        Share of its largest removal with which an effect counts in a part; minus infinity: in all
-        parts.
-
+    Returns for parameters in use: sensor -> squares on held-out data in units of their noise, shape
+    (n_parts, n_axes).
     """
-
-    def __init__(
-        self,
-        search: Search,
-        losses: Callable,
-        numbers: Mapping[str, np.ndarray],
-        *,
-        least_part: float = SHOWS,
-    ):
-        self.search = search
-        self.losses = losses
-        self.numbers = numbers
-        self.least_part = least_part
+    numbers: Mapping[str, np.ndarray]
+    """Sensor -> number of squares of each part, their expectation from noise, shape (n_parts,)."""
+    _: KW_ONLY
+    least_part: float = SHOWS
+    """
+    Share of its largest removal with which an effect counts in a part; minus infinity: in all
+    parts.
+    """
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """
@@ -86,27 +76,29 @@ class Explained:
 
     def _sigmas(self, sensor: str, excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the same of all axes together, shape (n_parts,), and of each axis.
+        Return the excess in standard deviations of all axes together, and of each axis.
 
-        Shape (n_parts, n_axes). A sum of n squares of unit noise has the variance 2 n.
+        Shapes (n_parts,) and (n_parts, n_axes). A sum of n squares of unit noise has the variance
+        2 n; the limit of a single axis is stricter by `ONE_OF_THREE`.
         """
         sd = np.sqrt(2 * np.maximum(self.numbers[sensor], 1.0))
         sd_of_axis = sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE
         return excess.sum(axis=1) / sd, excess / sd_of_axis[:, None]
 
     def rest(self, chosen: Sequence[Question]) -> float:
-        """
-        Return the excess that noise does not explain.
-
-        It covers all sensors and parts in which it is significant.
-        """
+        """Return the sum of the excess over the sensors, parts and axes where it is significant."""
         total = 0.0
         for sensor, excess in self.excess(chosen).items():
             total += self._rest(sensor, excess).sum()
         return float(total)
 
     def _rest(self, sensor: str, excess: np.ndarray) -> np.ndarray:
-        """Return the same of each part, shape (n_parts,)."""
+        """
+        Return the significant excess of one sensor in each part, shape (n_parts,).
+
+        It is that of the significant axes, or of all axes if they are significant together and sum
+        to more.
+        """
         together, alone = self._sigmas(sensor, excess)
         of_axes = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
         of_all = np.maximum(excess.sum(axis=1), of_axes)
@@ -114,12 +106,11 @@ class Explained:
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
         """
-        Return the least share of the unexplained that the effect removes.
+        Return the least ``removed / (removed + remaining)`` of the sensors in which an effect acts.
 
-        It is the least over the sensors in which the effect shows.
-
-        In each sensor only the parts with the effect count (means of windows, within windows, or
-        both): an unexplained excess in the other part does not hide it.
+        Of the excess over noise with and without the effect in the choice. In each sensor only the
+        parts with the effect count (means of windows, within windows, or both): an unexplained
+        excess in the other part does not hide it.
         """
         shares = []
         for removed, remaining in self._where_it_shows(chosen, question):
@@ -127,16 +118,17 @@ class Explained:
         return min(shares, default=0.0)
 
     def rest_beside(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return the excess over noise of the choice, in the parts where the effect shows."""
-        return sum(rest for _, rest in self._where_it_shows(chosen, question))
+        """Return the significant excess of the choice in the parts on which the effect acts."""
+        return sum(remaining for _, remaining in self._where_it_shows(chosen, question))
 
     def _where_it_shows(
         self, chosen: Sequence[Question], question: Question
     ) -> list[tuple[float, float]]:
         """
-        Return (removed by the effect, significant remaining excess) of each sensor.
+        Return (excess that the effect removes, remaining significant excess) of each sensor.
 
-        Both refer to the parts where the effect shows.
+        Both are sums over the parts in which the removal is at least `least_part` of the largest.
+        Sensors of which little is removed are omitted.
         """
         excess_with = self.excess(chosen)
         excess_without = self.excess([q for q in chosen if q is not question])
@@ -156,17 +148,20 @@ class Explained:
         return shows
 
 
-def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
+def pruned(
+    chosen: Sequence[Question], share: Callable[[Sequence[Question], Question], float]
+) -> Sequence[Question]:
     """
     Return the choice without effects that remove too little, weakest first.
 
-    `share(chosen, question)` is the share that each removes.
+    `share(chosen, question)` is the share of the excess that an effect of a choice removes.
     """
 
     def weakest(kept: list[Question]) -> int | None:
-        shares = [share(kept, question) / needed_share(question) for question in kept]
-        place = int(np.argmin(shares))
-        return place if shares[place] < 1.0 else None
+        """Return the place of the effect with the least share over the needed one, if below it."""
+        ratios = [share(kept, question) / needed_share(question) for question in kept]
+        place = int(np.argmin(ratios))
+        return place if ratios[place] < 1.0 else None
 
     return without_weakest(chosen, weakest)
 

@@ -75,7 +75,11 @@ class Gain:
 def gain_of(
     sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]], *, of: str = OF_MODEL
 ) -> Gain:
-    """Return the Gain from (sums of squares, numbers) of each group of rows, before and after."""
+    """
+    Return the Gain of a sensor by a measure.
+
+    `pair`: (sums of squares, numbers of squares) before and after, each of shape (n_groups,).
+    """
     rms = []
     for squares, number in pair:
         rms.append(float(np.sqrt(squares.sum() / max(number.sum(), 1))))
@@ -86,16 +90,16 @@ def gain_of(
 
 def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
     """
-    Return the 95 % interval of the reduction over resampled windows.
+    Return the 95 % interval of ``1 - rms after / rms before`` over resampled windows.
 
-    From (sums of squares, numbers) per window before and after.
+    `pair`: (sums of squares, numbers of squares) before and after, each of shape (n_windows,).
     """
     n_windows = len(pair[0][0])
     if n_windows < 3:
         return (float('nan'), float('nan'))
     draw = np.random.default_rng(1).integers(0, n_windows, (WINDOW_RESAMPLES, n_windows))
-    rms = [
-        np.sqrt(squares[draw].sum(axis=1) / number[draw].sum(axis=1)) for squares, number in pair
-    ]
+    rms = []  # of each resample, before and after
+    for squares, number in pair:
+        rms.append(np.sqrt(squares[draw].sum(axis=1) / number[draw].sum(axis=1)))
     low, high = np.quantile(1 - rms[1] / rms[0], (0.025, 0.975))
     return (float(low), float(high))

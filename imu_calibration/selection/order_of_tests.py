@@ -28,18 +28,22 @@ class EffectTests(ABC):
 
     @abstractmethod
     def preferred(self, named: Sequence[Question]) -> Sequence[Question]:
-        """Return the effects, or others that explain the excess better or more simply."""
+        """Return the effects, or a choice that explains the excess better or more simply."""
 
     def admissible(self, named: Sequence[Question]) -> Sequence[Question]:
-        """Return the effects whose prediction is tested, here all."""
+        """Return the effects of which the prediction is tested, here all."""
         return named
 
     @abstractmethod
     def least_predicting(self, kept: list[Question]) -> int | None:
-        """Return the place of the effect that predicts least; None where all predict."""
+        """
+        Return the place of the effect that improves the prediction least.
+
+        None if all improve the prediction of held-out data.
+        """
 
     def significant(self, named: Sequence[Question]) -> Sequence[Question]:
-        """Return the effects that are significant without those that were removed, here all."""
+        """Return the effects that are still significant after removals, here all."""
         return named
 
 
@@ -48,9 +52,9 @@ class Findings:
     """Effects of a choice that data support."""
 
     named: Sequence[Question]
-    """Questions that became findings, in the order found."""
+    """Effects that became findings, in the order found."""
     unstable: list[Question]
-    """Rejected, because the estimates of the two halves differ significantly."""
+    """Effects that are rejected because the estimates of the two halves differ significantly."""
 
 
 def select_findings(tests: EffectTests, chosen: Sequence[Question]) -> Findings:
@@ -67,8 +71,8 @@ def select_findings(tests: EffectTests, chosen: Sequence[Question]) -> Findings:
     # Likelihood alone prefers any effect that correlates with an unknown cause.
     named = tests.predicting(tests.explaining(chosen))
 
-    # An effect of the sensor is the same in both halves. Without the others a finding may predict
-    # no longer, or be no longer significant.
+    # An effect of the sensor is the same in both halves. Without the removed effects a finding may
+    # predict no longer, or be no longer significant.
     search = tests.problem.search
     unstable = [question for question in named if not search.agrees_in_halves(named, question)]
     if unstable:

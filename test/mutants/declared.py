@@ -231,7 +231,7 @@ SEARCH = _of(
     ),
     (
         'cross-validation that leaks',
-        'Evidence._left_by_others',
+        'Evidence._heldout_weights',
         'self.without[:, _1[:, None], _1]',
         'self.total[None, _1[:, None], _1] + 0 * self.without[:, _1[:, None], _1]',
         (

@@ -204,7 +204,7 @@ def test_memory_of_a_search_does_not_grow_with_the_choices_it_tried():
     parts = np.array([rows.T @ rows for rows in np.random.default_rng(1).normal(size=(6, 20, 11))])
     evidence = evidence_of_folds(parts, 10)
     tried = list(combinations(range(10), 4))
-    first = evidence.left_by_others(tried[0])
+    first = evidence.heldout_weights(tried[0])
     for choice in tried:
         evidence.heldout(choice)
     kept = [
@@ -213,7 +213,7 @@ def test_memory_of_a_search_does_not_grow_with_the_choices_it_tried():
         if isinstance(each, dict) and any(isinstance(v, np.ndarray) for v in each.values())
     ]
     assert len(tried) > MOST_FITS and max(map(len, kept)) == MOST_FITS
-    np.testing.assert_array_equal(evidence.left_by_others(tried[0]), first)
+    np.testing.assert_array_equal(evidence.heldout_weights(tried[0]), first)
 
 
 def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
@@ -246,7 +246,7 @@ class Squares:
     evidence = SimpleNamespace(
         fold=np.arange(30) % 6,
         fit=lambda used: (-np.ones(len(used)), None),
-        left_by_others=lambda used: np.tile([float(len(used)), 1.0], (6, 1)),
+        heldout_weights=lambda used: np.tile([float(len(used)), 1.0], (6, 1)),
     )
     search = SimpleNamespace(indices=lambda chosen: list(range(len(chosen))))
     space = SimpleNamespace(size=1)

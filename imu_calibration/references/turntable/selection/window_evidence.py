@@ -1,4 +1,4 @@
-"""How well a choice of parameters predicts windows that it was not fitted to."""
+"""Likelihood of choices of parameters on all windows, and on windows that are held out."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ from imu_calibration.references.turntable.selection.parameter_space import (
     normal_matrix,
     within_of_axis,
 )
-from imu_calibration.selection.evidence import Evidence, ParameterFit, _squares
+from imu_calibration.selection.evidence import Evidence, ParameterFit, squares_of_folds
 
 MIN_FOLD_WINDOWS = 8
 """Least number of windows for held-out folds."""
@@ -39,23 +39,29 @@ One of this many windows of each kind is locked: excluded from estimation, selec
 
 def locked_windows(kind: np.ndarray) -> np.ndarray:
     """
-    Return the mask of the windows that are used only for the gain.
+    Return the mask of the windows that are used only for the gain, shape (k,).
 
     Every fourth of each kind, spread through the session.
     """
-    return _turn_of(kind, LOCKED_EVERY) == LOCKED_EVERY - 2
+    return _dealt_out(kind, LOCKED_EVERY) == LOCKED_EVERY - 2
 
 
 def folds_of(kind: np.ndarray) -> np.ndarray:
     """Return the fold of each window; windows of each kind are dealt out in turn."""
-    return _turn_of(kind, EVIDENCE_FOLDS)
+    return _dealt_out(kind, EVIDENCE_FOLDS)
 
 
-def _turn_of(kind: np.ndarray, modulus: int) -> np.ndarray:
-    turn = np.zeros(len(kind), int)
-    for offset, name in enumerate(np.unique(kind)):
-        turn[kind == name] = (np.arange((kind == name).sum()) + offset) % modulus
-    return turn
+def _dealt_out(kind: np.ndarray, n_parts: int) -> np.ndarray:
+    """
+    Return the number of the part that each window is dealt to, shape (k,).
+
+    Windows of one kind are dealt to the parts in turn; each kind begins with another part.
+    """
+    part = np.zeros(len(kind), int)
+    for first, name in enumerate(np.unique(kind)):
+        is_kind = kind == name
+        part[is_kind] = (np.arange(is_kind.sum()) + first) % n_parts
+    return part
 
 
 class WindowEvidence(Evidence):
@@ -85,52 +91,59 @@ class WindowEvidence(Evidence):
     ):
         self.space = space
         self.noise = noise
-        self.fold = fold
+        self._in_fold = [fold == number for number in range(fold.max() + 1)]
+        """Mask of the windows of each fold, shape (k,)."""
         self._white: dict[str, list[np.ndarray]] = {}
         """Sensor -> independent means of unit variance of each axis."""
         self._of_axis: dict[str, list[np.ndarray]] = {}
         """Sensor -> of each axis the products of means and within windows, (2, n_folds, n, n)."""
         blocks = []
         for sensor in space.sensors:
-            own_scatter = None if scatter is None else scatter.get(sensor)
-            means = mean_rows(space, noise, sensor, scatter=own_scatter)
+            scatter_of_sensor = None if scatter is None else scatter.get(sensor)
+            means = mean_rows(space, noise, sensor, scatter=scatter_of_sensor)
             self._white[sensor] = [flat(rows.white()) for rows in means]
             self._of_axis[sensor] = []
             for axis, white in enumerate(self._white[sensor]):
-                of_means = [white[own].T @ white[own] for own in self._folds]
+                of_means = [white[in_fold].T @ white[in_fold] for in_fold in self._in_fold]
                 within = self._within(space, sensor, axis)
                 self._of_axis[sensor].append(np.array([of_means, within]))
             blocks += means
-        parts = np.sum([self._of_sensor(sensor) for sensor in space.sensors], axis=0)
-        total = np.sum(parts, axis=0)
+        of_folds = np.sum([self._of_sensor(sensor) for sensor in space.sensors], axis=0)
+        total = np.sum(of_folds, axis=0)
         super().__init__(
             blocks,
             [fold] * len(blocks),
             total=total,
-            without=total - parts,
+            without=total - of_folds,
             prior_sd=space.prior_sd,
             prior_mean=space.prior_mean,
         )
 
     @property
-    def _folds(self) -> list[np.ndarray]:
-        """Mask of the windows of each fold."""
-        return [self.fold == number for number in range(self.fold.max() + 1)]
+    def fold(self) -> np.ndarray:
+        """Fold of each window, shape (k,): each block has one row per window."""
+        return self.folds[0]
 
     def _within(self, space: ParameterSpace, sensor: str, axis: int) -> list[np.ndarray]:
-        """Return the normal matrix of an axis from within the windows, of each fold."""
-        found = []
-        for own in self._folds:
-            found.append(within_of_axis(space, self.noise[sensor], sensor, axis=axis, select=own))
-        return found
+        """
+        Return the normal matrix of the samples about the means of their windows, for each fold.
+
+        Over the columns of an axis, ``space.places(sensor, axis)``.
+        """
+        noise = self.noise[sensor]
+        normals = []
+        for in_fold in self._in_fold:
+            normals.append(within_of_axis(space, noise, sensor, axis=axis, select=in_fold))
+        return normals
 
     def _of_sensor(self, sensor: str) -> np.ndarray:
-        """Return the normal matrices of one sensor, of each fold."""
-        found = np.zeros((self.fold.max() + 1, self.space.size + 1, self.space.size + 1))
+        """Return the normal matrices of a sensor for each fold, (n_folds, q + 1, q + 1)."""
+        size = self.space.size + 1
+        normals = np.zeros((len(self._in_fold), size, size))
         for axis, parts in enumerate(self._of_axis[sensor]):
             at = self.space.places(sensor, axis)
-            found[:, at[:, None], at] += parts.sum(axis=0)
-        return found
+            normals[:, at[:, None], at] += parts.sum(axis=0)
+        return normals
 
     def fits_of_halves(
         self, used: Sequence[int]
@@ -142,7 +155,8 @@ class WindowEvidence(Evidence):
     @cached_property
     def _halves(self) -> list[np.ndarray]:
         """Normal matrices of the first and second half of the windows."""
-        early = np.arange(len(self.fold)) < len(self.fold) // 2
+        n_windows = len(self.fold)
+        early = np.arange(n_windows) < n_windows // 2
         return [normal_matrix(self.space, self.noise, half) for half in (early, ~early)]
 
     def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
@@ -153,63 +167,65 @@ class WindowEvidence(Evidence):
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
-        Return the loss of `heldout` by sensor.
+        Return sensor -> the part of the loss `heldout` of each sensor, shape (2, 3).
 
-        Of the windows' means and within the windows, of each axis, shape (2, 3).
+        Rows are the means of the windows, and the samples about them; columns are the axes.
         """
-        left = self.left_by_others(used)
-        found = {}
+        weights = self.heldout_weights(used)
+        losses = {}
         for sensor, axes in self._of_axis.items():
-            losses = []
+            of_axes = []
             for axis, parts in enumerate(axes):
-                losses.append(_squares(parts, left[:, self.space.places(sensor, axis)]))
-            found[sensor] = np.stack(losses, axis=1)
-        return found
+                of_columns = weights[:, self.space.places(sensor, axis)]
+                of_axes.append(squares_of_folds(parts, of_columns))
+            losses[sensor] = np.stack(of_axes, axis=1)
+        return losses
 
     def unpredicted(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
-        Return the same loss.
+        Return the loss of `heldout_parts`, the means in units of their prediction error.
 
-        The means are in units of their prediction error by the fit to the other folds: their number
-        is expected.
+        With the residuals e of the means of a fold, their columns A and the information N of the
+        other folds it is ``e' (I + A N^-1 A')^-1 e``; its expectation is the number of means.
 
         A slow bias process is correlated over folds: without this, the loss of a fold includes the
-        uncertainty of the fit to the other folds. The effect of a drift within windows, which does
-        not determine it, is predicted too.
+        uncertainty of the fit to the other folds. Within windows a drift is predicted too, although
+        the samples there do not count for its estimate.
         """
-        own = np.array(sorted(used))
-        left = self.left_by_others(used)
-        found = self.heldout_parts(used)
-        # Information N of the other folds, with the prior.
-        others = self.without[:, own[:, None], own] + np.diag(1 / self.prior_sd[own] ** 2)
+        parameters = np.array(sorted(used))
+        weights = self.heldout_weights(used)
+        losses = self.heldout_parts(used)
+        information = self.without[:, parameters[:, None], parameters]
+        information = information + np.diag(1 / self.prior_sd[parameters] ** 2)
         for sensor, axes in self._of_axis.items():
             for axis, (means, _) in enumerate(axes):
                 places = self.space.places(sensor, axis)
-                _, at, of = np.intersect1d(own, places, return_indices=True)
+                # Places of the parameters of this axis: among the fitted ones, and in its rows.
+                _, at, column = np.intersect1d(parameters, places, return_indices=True)
 
-                # e' (1 + A N^-1 A')^-1 e = e'e - g' (N + A'A)^-1 g with the slopes g = A'e.
-                slopes = np.zeros(others.shape[:2])
-                slopes[:, at] = np.einsum('fij,fj->fi', means[:, of], left[:, places])
-                known = others.copy()
-                known[:, at[:, None], at] += means[:, of[:, None], of]
-                found[sensor][0, axis] -= (slopes * solve_scaled(known, slopes)).sum()
+                # e' (I + A N^-1 A')^-1 e = e'e - g' (N + A'A)^-1 g with the slopes g = A'e.
+                slopes = np.zeros(information.shape[:2])
+                slopes[:, at] = np.einsum('fij,fj->fi', means[:, column], weights[:, places])
+                with_fold = information.copy()
+                with_fold[:, at[:, None], at] += means[:, column[:, None], column]
+                losses[sensor][0, axis] -= (slopes * solve_scaled(with_fold, slopes)).sum()
 
-                whole = self._within_whole[sensor][axis]
-                found[sensor][1, axis] = _squares(whole, left[:, places])[0]
-        return found
+                within = self._within_whole[sensor][axis]
+                losses[sensor][1, axis] = squares_of_folds(within, weights[:, places])[0]
+        return losses
 
     @cached_property
     def _within_whole(self) -> dict[str, list[np.ndarray]]:
         """
-        Sensor -> part within the windows of each fold.
+        Sensor -> of each axis the normal matrices within windows, shape (1, n_folds, n, n).
 
-        For each axis, including effects that are smooth in time.
+        In contrast to `_of_axis`, effects that are smooth in time have their columns.
         """
         whole = replace(self.space, join_within=self.space.join)
-        found = {}
+        normals = {}
         for sensor in self.space.sensors:
-            found[sensor] = [np.array([self._within(whole, sensor, axis)]) for axis in range(3)]
-        return found
+            normals[sensor] = [np.array([self._within(whole, sensor, axis)]) for axis in range(3)]
+        return normals
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """
@@ -224,32 +240,33 @@ class WindowEvidence(Evidence):
         """
         # Slopes g_k of the windows, shape (n_windows, q + 1).
         values, covariance = self.fit(used)
-        reduced = weights_of(used, values, self.space.size)
+        weights = weights_of(used, values, self.space.size)
         kind = self.space.recording.kind
-        slopes = np.zeros((len(self.fold), self.space.size + 1))
+        n_windows = len(kind)
+        slopes = np.zeros((n_windows, self.space.size + 1))
         for sensor in self.space.sensors:
             of_kind = {name: self.noise[sensor].row_variance(name) for name in np.unique(kind)}
             variance = np.array([of_kind[name] for name in kind])
             for axis, means in enumerate(self._white[sensor]):
                 at = self.space.places(sensor, axis)
-                within = self.space.slopes_within(sensor, axis, reduced[at])
+                within = self.space.slopes_within(sensor, axis, weights[at])
                 within = within / variance[:, axis : axis + 1]
-                slopes[:, at] += means * (means @ reduced[at])[:, None] + within
+                slopes[:, at] += means * (means @ weights[at])[:, None] + within
 
         # Shifts of the estimates by each window, in sds, and their scatter.
         places = [list(used).index(k) for k in parameters]
         sd = np.sqrt(np.diag(covariance)[places])
-        moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
-        sizes, directions = np.linalg.eigh(moved.T @ moved)
+        shifts = slopes[:, list(used)] @ (covariance[:, places] / sd)
+        scatter, directions = np.linalg.eigh(shifts.T @ shifts)
         # Without unobservable directions: compliances in no pose, arms that cancel.
-        observable = sizes > CONVENTION_SHARE * sizes[-1]
-        n_windows = len(moved)
-        n_own = int(observable.sum())
-        if n_windows - n_own < LEAST_SCATTER:
+        observable = scatter > CONVENTION_SHARE * scatter[-1]
+        rank = int(observable.sum())
+        dof = n_windows - rank
+        if dof < LEAST_SCATTER:
             return 0.0
 
-        # T^2 = z' S^-1 z, an F statistic with n_own and n_windows - n_own degrees of freedom.
+        # T^2 = z' S^-1 z, an F statistic with rank and n_windows - rank degrees of freedom.
         along = (directions.T @ (values[places] / sd))[observable]
-        t_squared = (along**2 / sizes[observable]).sum()
-        ratio = (n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared
-        return float(f_sf(ratio, n_own, n_windows - n_own))
+        t_squared = (along**2 / scatter[observable]).sum()
+        ratio = dof / (rank * (n_windows - 1)) * t_squared
+        return float(f_sf(ratio, rank, dof))

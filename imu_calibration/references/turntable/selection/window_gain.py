@@ -66,7 +66,7 @@ def gain_in_turn(
         # Each window is predicted by a fit to the other folds.
         squares_of_choices = []
         for choice in (before, after):
-            weights = problem.evidence.left_by_others(problem.search.indices(choice))[fold]
+            weights = problem.evidence.heldout_weights(problem.search.indices(choice))[fold]
             squares_of_choices.append(_squares(problem.all_samples, weights, sensor))
         for measure in MEASURES:
             pair = [squares[measure] for squares in squares_of_choices]
