@@ -43,13 +43,13 @@ def with_exchanged(chosen: Sequence[Question], place: int, other: Question) -> l
     return [*chosen[:place], other, *chosen[place + 1 :]]
 
 
-def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ...]]]:
-    """Return sensor -> list of the parameters of effects that are smooth in time."""
-    found: dict[str, list[tuple[int, ...]]] = {sensor: [] for sensor in SENSORS}
-    for question in asked:
-        if question.effect.smooth and question.sensor in found:
-            found[question.sensor].append(question.parameters)
-    return found
+def smooth_parameters(questions: Sequence[Question]) -> dict[str, list[tuple[int, ...]]]:
+    """Return sensor -> the parameters of each of its effects that is smooth in time."""
+    parameters: dict[str, list[tuple[int, ...]]] = {sensor: [] for sensor in SENSORS}
+    for question in questions:
+        if question.effect.smooth and question.sensor in parameters:
+            parameters[question.sensor].append(question.parameters)
+    return parameters
 
 
 def sort_effects(
@@ -58,34 +58,36 @@ def sort_effects(
     sensors: Sequence[str] = SENSORS,
 ) -> tuple[list[Effect], list[dict]]:
     """
-    Return (testable effects, list of {'effect', 'why', 'needs'}).
+    Return (testable effects, list of {'effect', 'why', 'needs'} of untestable ones).
 
-    Both refer to the catalogue's candidates on the `sensors` with readings that the model lacks.
-
-    ``why_not(effect)`` gives (why, needs), or None for a testable effect.
+    Both are candidates of the catalogue that the model lacks and that act on `sensors`, those with
+    readings. ``why_not(effect)`` gives (why, needs), or None for a testable effect.
     """
-    known, lacking = [], []
-    have = {e.key for e in model.effects}
+    testable = []
+    untestable = []
+    in_model = {e.key for e in model.effects}
     for key, effect in model.catalogue.effects(model.joint_names).items():
         acted_on = tuple(sensor for sensor in effect.sensors if sensor in sensors)
-        if key in have or not acted_on or not model.catalogue.is_candidate(effect):
+        if key in in_model or not acted_on or not model.catalogue.is_candidate(effect):
             continue
         # An effect of table or clock shows in the present sensors only.
         if acted_on != effect.sensors:
             effect = replace(effect, acts_on=acted_on)
-        why = why_not(effect)
-        if why is None:
-            known.append(effect)
+        reason = why_not(effect)
+        if reason is None:
+            testable.append(effect)
         else:
-            lacking.append({'effect': effect.name, 'why': why[0], 'needs': why[1]})
-    return known, lacking
+            why, needs = reason
+            untestable.append({'effect': effect.name, 'why': why, 'needs': needs})
+    return testable, untestable
 
 
 def lacking_temperature(effect: Effect, span: float | None) -> tuple[str, str] | None:
     """
-    Return (why, needs) of an effect that the temperature of a recording does not show.
+    Return (why, needs) of an effect for which the temperature of a recording does not suffice.
 
-    `span`: range of the temperature, K; None where it is not known throughout.
+    None for all other effects. `span`: range of the temperature, K; None where it is not known
+    throughout.
     """
     if 'temperature' not in effect.needs:
         return None
@@ -110,7 +112,7 @@ def time_constants(duration: float, number: int = N_TIME_CONSTANTS) -> np.ndarra
 
 def special(effect: Effect) -> bool:
     """
-    Return whether an effect has no columns of its own.
+    Return whether an effect has no columns before its time is known, or none at all.
 
     Saturation (censoring), warm-up (bank of time constants), step (its time).
     """

@@ -5,7 +5,7 @@ With earlier choices reconsidered after each step.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import AbstractSet, Any, ClassVar
 
 import numpy as np
@@ -46,6 +46,8 @@ preferred.
 """
 MOST_FINDINGS = 6
 """Effects that one recording may be found to lack."""
+MOST_BACKWARD_STEPS = 6
+"""Removals and exchanges of effects after an effect joins."""
 CLASS_SIZE = 3
 """Members of a class of inseparable effects, the named one included."""
 
@@ -83,53 +85,30 @@ class Score:
         )
 
 
+@dataclass(eq=False)
 class Search:
+    """Forward selection with reconsideration over a fixed set of candidate effects."""
+
+    evidence: Evidence
+    """Losses and fits of choices of parameters."""
+    baseline: Sequence[int]
+    """Parameters that are part of every choice."""
+    questions: Sequence[Question]
+    """Candidate effects."""
+    _: KW_ONLY
+    encoder_step: float = 0.0
+    """Resolution of the encoders, rad."""
+    any_size: bool = False
+    """Whether sizes above those of any known instrument are allowed, for a remaining excess."""
+    resolved: AbstractSet[str] = frozenset()
     """
-    Forward selection with reconsideration over a fixed set of questions.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    baseline : sequence of int
-        Parameters that are always there.
-    questions : sequence of Question
-    encoder_step : float
-        Resolution of the encoders, rad.
-    any_size : bool
-        Whether sizes above those of any known instrument are allowed, for a remaining excess.
-    resolved : set of str
-        Effects that were compared at their own linearisation; this search must not revise them: not
-        tested unless chosen.
-
+    Effects that were compared at their own linearisation: this search neither adds nor replaces
+    them.
     """
-
-    def __init__(
-        self,
-        evidence: Evidence,
-        baseline: Sequence[int],
-        questions: Sequence[Question],
-        *,
-        encoder_step: float = 0.0,
-        any_size: bool = False,
-        resolved: AbstractSet[str] = frozenset(),
-    ):
-        self.evidence = evidence
-        self.baseline = tuple(baseline)
-        self.questions = questions
-        self.encoder_step = encoder_step
-        self.any_size = any_size
-        self.resolved = resolved
 
     def asking_any_size(self) -> 'Search':
-        """Return a search that allows sizes that are known of no instrument too."""
-        return Search(
-            self.evidence,
-            self.baseline,
-            self.questions,
-            encoder_step=self.encoder_step,
-            any_size=True,
-            resolved=self.resolved,
-        )
+        """Return the same search with sizes above those of any known instrument allowed."""
+        return replace(self, any_size=True)
 
     def indices(self, chosen: Sequence[Question]) -> tuple[int, ...]:
         """Return the indices of the parameters of the baseline, then of the chosen effects."""
@@ -139,15 +118,16 @@ class Search:
         return tuple(indices)
 
     def others(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return the questions about effects that are not chosen, and not resolved."""
+        """Return the candidate effects that are neither chosen nor resolved."""
         names = {q.name for q in chosen}.union(self.resolved)
         return [q for q in self.questions if q.name not in names]
 
     def cost(self, chosen: Sequence[Question], most: float = np.inf) -> float:
         """
-        Return the held-out cost of a choice, nats, penalties included.
+        Return the held-out cost of a choice, nats: half of the loss, and the penalties.
 
-        Above `most` without the penalty for implausible sizes.
+        If the cost exceeds `most` without the penalty for implausible sizes, it is returned without
+        that penalty, which needs a fit.
         """
         n_charged = sum(q.penalty for q in chosen)
         cost = 0.5 * self.evidence.heldout(self.indices(chosen)) + PENALTY * n_charged
@@ -189,10 +169,11 @@ class Search:
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
         """
-        Return whether the effect's estimate is possible.
+        Return whether the estimate of an effect of the choice is possible.
 
-        A lag is not negative, no angle (at 1 g) is within half an encoder step, and no size is
-        implausible, unless allowed.
+        A lag is not negative, no angle (at 1 g) is within half an encoder step, a size is neither
+        above a known limit nor implausible (unless any size is allowed), and no sensor is predicted
+        worse.
         """
         value, sd = self.estimate(chosen, question)
         if question.effect.nonnegative and value[0] < 0:
@@ -207,9 +188,9 @@ class Search:
 
     def early(self, chosen: Sequence[Question]) -> list[Question]:
         """
-        Return the lags that would be significant if they were not negative.
+        Return the candidate lags that would be significant if a negative lag were possible.
 
-        An early clock with a late sensor.
+        They are an early clock together with a late sensor.
         """
         early = []
         for question in self.others(chosen):
@@ -235,9 +216,9 @@ class Search:
 
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
         """
-        Return all parameters for a choice, fitted to all rows.
+        Return all parameters for a choice, fitted to all rows, shape (q,).
 
-        Zero for those of other effects, shape (q,).
+        The parameters of effects that are not chosen are zero.
         """
         used = self.indices(chosen)
         fitted, _ = self.evidence.fit(used)
@@ -258,7 +239,7 @@ class Search:
         self, chosen: Sequence[Question], question: Question, names: Sequence[str]
     ) -> dict[str, float]:
         """
-        Return parameter -> its change when an effect joins the baseline and the other choices.
+        Return parameter -> change of its estimate when an effect joins the other chosen effects.
 
         Parameters
         ----------
@@ -282,7 +263,7 @@ class Search:
 
     def shows_alike(self, chosen: Sequence[Question], question: Question) -> bool:
         """
-        Return whether no sensor on which an effect acts is predicted worse with it.
+        Return whether no sensor on which an effect acts is predicted worse with the effect.
 
         A cause in the table must not improve one sensor and degrade the second.
         """
@@ -304,7 +285,7 @@ class Search:
         """
         Return whether the estimates of a chosen effect from both halves of the data agree.
 
-        Effects that are smooth in time differ by nature.
+        Effects that are smooth in time are not tested: they differ by nature.
         """
         if question.effect.smooth:
             return True
@@ -314,9 +295,9 @@ class Search:
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
         """
-        Return the chosen questions in the order in which they were found.
+        Return the chosen effects in the order in which they were found.
 
-        From none or from a first choice.
+        The search starts from the effects `start`, which may be removed.
         """
         chosen = self.reconsidered(list(start)) if start else []
         for _ in range(2 * MOST_FINDINGS):
@@ -340,19 +321,19 @@ class Search:
 
     def reconsidered(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """
-        Return the choice without effects that are no longer needed.
+        Return the choice after backward steps.
 
-        Better explanations are substituted in it.
+        A step removes an insignificant effect, or exchanges one effect for a better one.
         """
-        for _ in range(6):
+        for _ in range(MOST_BACKWARD_STEPS):
             smaller = self._dropped(chosen)
             if smaller is not None:
                 chosen = smaller
                 continue
-            other = self._replaced(chosen)
-            if other is None:
+            exchanged = self._replaced(chosen)
+            if exchanged is None:
                 return chosen
-            chosen = other
+            chosen = exchanged
         return chosen
 
     def _dropped(self, chosen: Sequence[Question]) -> list[Question] | None:
@@ -369,7 +350,8 @@ class Search:
         best: list[Question] | None = None
         cost = self.cost(chosen) - MIN_REPLACEMENT_NATS
         for place, question in enumerate(chosen):
-            # It could not be added again, and an effect that cancels it may be in the model.
+            # A resolved effect could not be added again, and an effect that cancels it may be in
+            # the model.
             if question.name in self.resolved:
                 continue
             remaining = [*chosen[:place], *chosen[place + 1 :]]
@@ -389,21 +371,23 @@ class Search:
 
     def drop_insignificant(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """
-        Return the effects of a choice that are still significant after removals.
+        Return the choice after insignificant effects were removed, one at a time.
 
-        Of a clock and a lag that cancel, none.
+        Of a clock and a lag that cancel, none remains.
         """
-        while (smaller := self._dropped(chosen)) is not None:
+        while True:
+            smaller = self._dropped(chosen)
+            if smaller is None:
+                return chosen
             chosen = smaller
-        return chosen
 
     def confounded(
         self, chosen: Sequence[Question], question: Question, *, most: int | None = CLASS_SIZE - 1
     ) -> list[tuple[Question, float]]:
         """
-        Return (question, difference in nats) of effects that could replace `question`.
+        Return (effect, rise of the cost in nats) of effects that could replace `question`.
 
-        They would do as well in its place, best first, at most `most`.
+        The rise is below `TIE`; the least is first, and at most `most` are returned.
         """
         place = chosen.index(question)
         cost = self.cost(chosen)
@@ -433,7 +417,7 @@ class Search:
 
 def least_angle(effect: Effect, encoder_step: float) -> float:
     """
-    Return the size of an effect, an angle (at 1 g), that is half an encoder step (rad).
+    Return the least size of an effect that is an angle (at 1 g): half an encoder step, rad.
 
     0 for other effects.
 
@@ -451,7 +435,9 @@ class SelectionSettings:
     """How a solution with the findings of a search judges them."""
 
     joint_test: bool = True
-    """Whether the coefficients of an effect have to be significant together, besides one alone."""
+    """
+    Whether the coefficients of an effect have to be significant together, in addition to one alone.
+    """
     judge_requested: bool = True
     """Whether findings that are in the requested model have to be significant, too."""
 
@@ -492,7 +478,7 @@ class SelectedEffects:
 
     @property
     def jitter_entry(self) -> Mapping[str, Any]:
-        """Independent errors of the stamps, for a document."""
+        """Entry of a document for independent errors of the stamps; empty without any."""
         return {}
 
     @property
@@ -531,12 +517,16 @@ class SelectedEffects:
         return None
 
     def unexplained_rests(self) -> Mapping[str, Any]:
-        """Return sensor -> its residual that no finding explains, and free what it needed."""
+        """
+        Return sensor -> its residual that no finding explains (`Unexplained`).
+
+        Intermediate results are freed.
+        """
         raise NotImplementedError
 
     @property
     def search(self) -> Search:
-        """On which they were chosen."""
+        """Search in which the findings were chosen."""
         return self.problem.search
 
     @property
@@ -544,14 +534,13 @@ class SelectedEffects:
         """
         Findings with sizes above those of any known instrument.
 
-        Reported, but added to a model only on request.
+        They are reported, but added to a model only on request.
         """
-        return [
-            question for question in self.named if self.search.implausible(self.named, question)
-        ]
+        search = self.search
+        return [question for question in self.named if search.implausible(self.named, question)]
 
     @property
     def adopted(self) -> list[Question]:
-        """Findings that belong into the model."""
+        """Findings of plausible sizes, which are added to the model."""
         implausible = self.implausible
         return [question for question in self.named if question not in implausible]

@@ -1,8 +1,4 @@
-"""
-Independent errors of the time stamps, from the scatter of the residual in motion.
-
-The scatter without them.
-"""
+"""Independent errors of the time stamps, from the scatter of the residual in motion."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -14,6 +14,7 @@ from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.bias_courses import relative_temperature, temperature_courses
+from imu_calibration.selection.regimes import RestRegime
 
 LEAST_OF_AXIS = 0.1
 """Share of the strongest axis' squares from which another axis has an excess too."""
@@ -43,9 +44,9 @@ class Unexplained:
     sigma: float
     """Standard deviations by which it exceeds noise."""
     correlates_with: str | None
-    """Variable of the largest correlation, or None."""
+    """Variable that explains most of the variance of the windows' means, or None."""
     share: float
-    """Share of the windows' variance explained by it."""
+    """Share of that variance that the variable explains."""
     residual: np.ndarray
     """Residual of the windows' means, shape (k, 3)."""
     noise_sd: np.ndarray
@@ -57,8 +58,8 @@ class Unexplained:
     """
     axes: tuple = ()
     """Axes of the sensor that carry it, the strongest first."""
-    regimes: tuple = ()
-    """Conditions under which it appears (`RestRegime`), at most one for each axis."""
+    regimes: tuple[RestRegime, ...] = ()
+    """Conditions under which it appears, at most one for each axis."""
     proposal: Any = None
     """Formula that it follows (`Proposal`), or None."""
     tones: tuple = ()
@@ -72,9 +73,10 @@ class Unexplained:
     @property
     def entry(self) -> dict[str, Any]:
         """Entry of a calibration document."""
-        return {'rms': self.rms, 'axes': list(self.axes)} | (
-            {'unit': self.unit} if self.unit else {}
-        )
+        entry: dict[str, Any] = {'rms': self.rms, 'axes': list(self.axes)}
+        if self.unit:
+            entry['unit'] = self.unit
+        return entry
 
 
 def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
@@ -84,13 +86,17 @@ def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dic
     A different offset in half of the windows scatters their means by as much as it shifts the bias.
     Which half is correct is unknown, for any number of windows.
     """
-    found = []
+    errors = []
     for sensor, rest in rests.items():
-        if rest.significant:
-            names = model.param_names[model.part(sensor, Role.OFFSET)]
-            scatter = np.sqrt(np.maximum(np.mean(rest.residual**2 - rest.noise_sd**2, axis=0), 0.0))
-            found += [{names[k]: float(scatter[k])} for k in map(AXES.index, rest.axes)]
-    return found
+        if not rest.significant:
+            continue
+        names = model.param_names[model.part(sensor, Role.OFFSET)]
+        excess = np.mean(rest.residual**2 - rest.noise_sd**2, axis=0)
+        scatter = np.sqrt(np.maximum(excess, 0.0))
+        for axis in rest.axes:
+            k = AXES.index(axis)
+            errors.append({names[k]: float(scatter[k])})
+    return errors
 
 
 def correlate(
@@ -101,58 +107,63 @@ def correlate(
     fitted: Sequence[np.ndarray] | None = None,
 ) -> tuple[str | None, float]:
     """
-    Return (name, adjusted share of the variance) of the best variable, or (None, 0).
+    Return (name, adjusted share of the variance) of the variable that explains most, or (None, 0).
 
-    The best variable is the one with the largest correlation, beside the columns of the fit whose
-    residual this is::
+    The residual of axis i is fitted with the columns of a variable, and with those of the fit whose
+    residual it is::
 
         residual_i = bias_i + fitted_i @ a_i + columns @ b_i + noise_i
+
+    With the weighted squares S and degrees of freedom of all axes, with and without the variable::
+
+        share = 1 - (S_with / dof_with) / (S_without / dof_without)
 
     Parameters
     ----------
     explanations : iterator
-        (name, columns (k, m), mask of the windows where they are known).
+        (name, columns (k, m), mask of the windows where they are known) of each variable.
     residual : ndarray, shape (k, n)
-        Of n axes.
+        Of k windows and n axes.
     noise_sd : ndarray, shape (k, n)
         Its expected sd from noise.
     fitted : list of ndarray, shape (k, q_i)
-        Columns of the fit of each axis beside its bias; default: none.
+        Columns of the fit of each axis, without its bias; default: none.
 
     """
     best = (None, 0.0)
     if fitted is None:
         fitted = [np.zeros((len(residual), 0))] * residual.shape[1]
     bias = np.ones((len(residual), 1))
-    for name, columns, rows in explanations:
-        if rows.sum() < 3 * columns.shape[1] + 6:
+    for name, columns, known in explanations:
+        if known.sum() < 3 * columns.shape[1] + 6:
             continue
-        total = 0.0
-        total_dof = 0
-        rest = 0.0
-        rest_dof = 0
-        for axis, own in enumerate(fitted):
-            weight = 1 / noise_sd[rows, axis, None]
-            design = weight * np.column_stack([bias, own, columns])[rows]
-            values = weight[:, 0] * residual[rows, axis]
-            misfit, dof = _misfit(design[:, : 1 + own.shape[1]], values)
-            total = total + misfit
-            total_dof = total_dof + dof
-            misfit, dof = _misfit(design, values)
-            rest = rest + misfit
-            rest_dof = rest_dof + dof
-        gained = total_dof - rest_dof
-        if min(gained, rest_dof) <= 0:
+        squares_without = 0.0
+        dof_without = 0
+        squares_with = 0.0
+        dof_with = 0
+        for axis, fitted_columns in enumerate(fitted):
+            weight = 1 / noise_sd[known, axis, None]
+            design = weight * np.column_stack([bias, fitted_columns, columns])[known]
+            values = weight[:, 0] * residual[known, axis]
+            squares, dof = _residual_squares(design[:, : 1 + fitted_columns.shape[1]], values)
+            squares_without += squares
+            dof_without += dof
+            squares, dof = _residual_squares(design, values)
+            squares_with += squares
+            dof_with += dof
+        n_added = dof_without - dof_with
+        if min(n_added, dof_with) <= 0:
             continue
-        share = 1 - (rest / rest_dof) / (total / total_dof)
-        p_value = f_sf((total - rest) / gained / max(rest / rest_dof, 1e-300), gained, rest_dof)
+        share = 1 - (squares_with / dof_with) / (squares_without / dof_without)
+        variance = max(squares_with / dof_with, 1e-300)
+        p_value = f_sf((squares_without - squares_with) / n_added / variance, n_added, dof_with)
         if p_value < ALPHA and share > max(best[1], 0.15):
             best = (name, float(share))
     return best
 
 
-def _misfit(design: np.ndarray, values: np.ndarray) -> tuple[float, int]:
-    """Return the sum of squares that a fit leaves, and its degrees of freedom."""
+def _residual_squares(design: np.ndarray, values: np.ndarray) -> tuple[float, int]:
+    """Return the residual sum of squares of a least-squares fit, and its degrees of freedom."""
     solution, _, rank, _ = np.linalg.lstsq(design, values, rcond=1e-9)
     return float(((values - design @ solution) ** 2).sum()), len(values) - int(rank)
 
