@@ -6,6 +6,7 @@ Angles, rates and sides of the joints, speed, force, time, temperature, in range
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from imu_calibration.core.units import DEG
 FEWEST = 6
 """Blocks that a regime holds at least."""
 N_BINS = 24
+"""Bins of a variable, at most; of an angle of a complete turn exactly."""
 SMOOTH_ORDER = 3
 """Order of smooth functions of a variable."""
 MOST_BOUNDS = 16
@@ -29,20 +31,23 @@ def block_means(rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class Variable:
     """
-    A variable of regimes at the rows of all blocks, in bins.
+    A variable of regimes at the n rows of b blocks, in k bins.
 
-    It also holds the description of a range of values.
+    A range of it is a sequence of neighbouring bins.
     """
 
     name: str
+    """Name, as printed."""
     bins: np.ndarray
     """Bin of each row, shape (n,)."""
     edges: np.ndarray
-    """Where bins begin, and where the last one ends; none for classes."""
+    """Where bins begin, and where the last one ends, shape (k + 1,); none for classes."""
     cyclic: bool
-    words: Callable
+    """Whether it is an angle of an endless joint, in degrees: the last bin adjoins the first."""
+    words: Callable[[Sequence[int], Any], str]
     """
-    ``words(chosen, bounds)``: the condition, from the bins in order and where they begin and end.
+    ``words(chosen, bounds)`` describes a range from its bins in order and its two bounds (None for
+    classes).
     """
     values: np.ndarray
     """Value at each row, in the unit of the edges, shape (n,)."""
@@ -58,23 +63,22 @@ class Variable:
 
     @property
     def ranges(self) -> np.ndarray:
-        """
-        Ranges of neighbouring bins, 1 in each bin of a range, the shortest first, shape (r, k).
-        """
-        count = int(self.bins.max()) + 1
-        places = np.arange(int(self.bins.max()) + 1)
-        parts = []
-        for length in range(1, count):
-            starts = count if self.cyclic else count - length + 1
-            parts += [(places - first) % count < length for first in range(starts)]
-        return np.array(parts, float).reshape(-1, count)
+        """All r ranges: 1 in each bin of a range, else 0, the shortest first, shape (r, k)."""
+        n_bins = int(self.bins.max()) + 1
+        places = np.arange(n_bins)
+        ranges = []
+        for length in range(1, n_bins):
+            n_starts = n_bins if self.cyclic else n_bins - length + 1
+            ranges += [(places - first) % n_bins < length for first in range(n_starts)]
+        return np.array(ranges, float).reshape(-1, n_bins)
 
     @property
     def curves(self) -> np.ndarray:
         """
-        Means over the blocks of smooth functions of the variable, cubic or of the third order.
+        Means over the blocks of smooth functions of the variable, shape (b, number of functions).
 
-        None of classes; shape (b, k).
+        Harmonics of an angle, Legendre polynomials of other values, up to `SMOOTH_ORDER`; no
+        function of classes.
         """
         if not len(self.edges):
             return np.zeros((len(self.starts), 0))
@@ -83,68 +87,66 @@ class Variable:
             return block_means(np.concatenate([np.cos(turns), np.sin(turns)], axis=1), self.starts)
         low = self.values.min()
         high = self.values.max()
-        return block_means(
-            np.polynomial.legendre.legvander(
-                2 * (self.values - low) / (high - low) - 1, SMOOTH_ORDER
-            )[:, 1:],
-            self.starts,
-        )
+        scaled = 2 * (self.values - low) / (high - low) - 1
+        polynomials = np.polynomial.legendre.legvander(scaled, SMOOTH_ORDER)[:, 1:]
+        return block_means(polynomials, self.starts)
 
     def chosen(self, member: np.ndarray) -> list[int]:
-        """Return the bins of a range, in order."""
+        """Return the bins of a range in order; `member`: 1 in each of its bins, shape (k,)."""
         bins = np.flatnonzero(member)
-        gap = np.flatnonzero(np.diff(bins) > 1)  # a cyclic range may begin beyond where it ends
-        return np.roll(bins, -gap[0] - 1).tolist() if len(gap) else bins.tolist()
+        # A cyclic range may pass from the last bin to the first: it begins after the gap.
+        gap = np.flatnonzero(np.diff(bins) > 1)
+        if len(gap):
+            bins = np.roll(bins, -gap[0] - 1)
+        return bins.tolist()
 
     def bounds(self, chosen: Sequence[int]) -> tuple[float, float] | None:
-        """Return where a range of bins begins and ends, or None for classes."""
-        return (
-            (float(self.edges[chosen[0]]), float(self.edges[chosen[-1] + 1]))
-            if len(self.edges)
-            else None
-        )
+        """Return the values at which a range of bins begins and ends, or None for classes."""
+        if not len(self.edges):
+            return None
+        return float(self.edges[chosen[0]]), float(self.edges[chosen[-1] + 1])
 
     def inside(self, low: float, high: float) -> np.ndarray:
         """
         Return the share of each block between two bounds, shape (b,).
 
-        The first and the last range are open at their ends.
+        A bound at the first or last edge is no bound.
         """
         if self.cyclic:
+            # Equal bounds are a complete turn.
             rows = (self.values - low) % 360.0 < ((high - low) % 360.0 or 360.0)
         else:
-            rows = ((self.values >= low) | (low <= self.edges[0])) & (
-                (self.values < high) | (high >= self.edges[-1])
-            )
+            above = (self.values >= low) | (low <= self.edges[0])
+            below = (self.values < high) | (high >= self.edges[-1])
+            rows = above & below
         return block_means(rows.astype(float), self.starts)
 
     def near(self, chosen: Sequence[int], end: int) -> list[float]:
         """
-        Return where a range of bins may begin (`end` 0) or end (1).
+        Return values near an edge at which a range of bins may begin (`end` 0) or end (1).
 
-        Between values that lie in the bins on both sides, evenly spread.
+        They are middles between values in the bins on both sides of the edge, at most
+        `MOST_BOUNDS` of them, evenly spread, and the edge itself. None where the range is open.
         """
-        first = chosen[0] if end == 0 else chosen[-1] + 1
-        if not self.cyclic and first in (0, len(self.edges) - 1):
+        number = chosen[0] if end == 0 else chosen[-1] + 1
+        if not self.cyclic and number in (0, len(self.edges) - 1):
             return []
-        places = np.sort(
-            (self.values - self.edges[first] + 180.0) % 360.0 - 180.0
-            if self.cyclic
-            else self.values - self.edges[first]
-        )
-        low, high = (
-            (-360.0 / N_BINS, 360.0 / N_BINS)
-            if self.cyclic
-            else self.edges[[first - 1, first + 1]] - self.edges[first]
-        )
-        between = np.unique(0.5 * (places[1:] + places[:-1]))
-        between = between[(between > low) & (between < high)]
-        some = (
-            between[np.unique(np.linspace(0, len(between) - 1, MOST_BOUNDS).round().astype(int))]
-            if len(between)
-            else between
-        )
-        return [*(self.edges[first] + some), float(self.edges[first])]
+
+        # Values relative to the edge, and the two adjoining bins.
+        edge = self.edges[number]
+        if self.cyclic:
+            distances = (self.values - edge + 180.0) % 360.0 - 180.0
+            low, high = -360.0 / N_BINS, 360.0 / N_BINS
+        else:
+            distances = self.values - edge
+            low, high = self.edges[[number - 1, number + 1]] - edge
+        distances = np.sort(distances)
+        middles = np.unique(0.5 * (distances[1:] + distances[:-1]))
+        middles = middles[(middles > low) & (middles < high)]
+        if len(middles):
+            spread = np.linspace(0, len(middles) - 1, MOST_BOUNDS).round().astype(int)
+            middles = middles[np.unique(spread)]
+        return [*(edge + middles), float(edge)]
 
 
 def ranged(
@@ -157,26 +159,24 @@ def ranged(
     is_rate: bool = False,
 ) -> list[Variable]:
     """
-    Return the variable of a value at each row, in bins of equal numbers of blocks.
+    Return [the Variable of a value at each row], in bins of equal numbers of blocks.
 
-    Return none where the value hardly changes.
+    The list is empty if the edges of the bins differ by less than `least`, in `unit`, or are fewer
+    than four. `starts`: first row of each block.
     """
-    edges = np.unique(
-        np.round(np.quantile(block_means(values, starts), np.linspace(0.0, 1.0, N_BINS + 1)), 3)
-    )
+    quantiles = np.quantile(block_means(values, starts), np.linspace(0.0, 1.0, N_BINS + 1))
+    edges = np.unique(np.round(quantiles, 3))
     if len(edges) < 4 or np.ptp(edges) < least:
         return []
 
     def words(chosen: Sequence[int], bounds: tuple[float, float]) -> str:
+        """Return the condition of a range; the first and the last one are open."""
         low, high = bounds
         if chosen[0] == 0:
             return f'while the {name} is below {high:.3g} {unit}'
-        span = (
-            f'{low:.3g} {unit} or more'
-            if chosen[-1] == len(edges) - 2
-            else f'{low:.3g} to {high:.3g} {unit}'
-        )
-        return f'while the {name} is {span}'
+        if chosen[-1] == len(edges) - 2:
+            return f'while the {name} is {low:.3g} {unit} or more'
+        return f'while the {name} is {low:.3g} to {high:.3g} {unit}'
 
     bins = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
     return [Variable(name, bins, edges, False, words, values, starts, is_rate)]

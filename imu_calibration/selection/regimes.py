@@ -98,12 +98,10 @@ class RestRegime:
 
 def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np.ndarray:
     """
-    Return random exchanges of the blocks' residuals.
+    Return random exchanges of the residual between windows of one kind and intensity of motion.
 
-    Each window has the sequence of another of its kind and intensity of motion.
-
-    Exchanged are whole windows, since the residual within a window is correlated; a sequence is
-    repeated or cut to the length of its new window.
+    Whole windows are exchanged, since the residual within a window is correlated; the sequence of
+    blocks of a window is repeated or cut to the length of its new window.
 
     Parameters
     ----------
@@ -125,25 +123,35 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np
         window, return_index=True, return_inverse=True, return_counts=True
     )
     speed = np.sqrt(np.add.reduceat(intensity**2, starts) / count)
+
+    # Window whose residual each window has, shape (PERMUTED, n_windows).
     partner = np.tile(np.arange(len(starts)), (PERMUTED, 1))
-    for each in np.unique(kind):
-        own = np.flatnonzero(kind[starts] == each)
-        own = own[np.argsort(speed[own], kind='stable')]
-        classes = min(INTENSITIES, len(own) // LEAST_ALIKE) if np.ptp(speed[own]) > DEG else 1
-        for part in np.array_split(own, max(classes, 1)):
-            partner[:, part] = rng.permuted(np.tile(part, (PERMUTED, 1)), axis=1)
-    taken = partner[:, place]
-    return starts[taken] + (np.arange(len(window)) - starts[place]) % count[taken]
+    for name in np.unique(kind):
+        of_kind = np.flatnonzero(kind[starts] == name)
+        of_kind = of_kind[np.argsort(speed[of_kind], kind='stable')]
+        n_classes = 1
+        if np.ptp(speed[of_kind]) > DEG:
+            n_classes = max(min(INTENSITIES, len(of_kind) // LEAST_ALIKE), 1)
+        for of_class in np.array_split(of_kind, n_classes):
+            partner[:, of_class] = rng.permuted(np.tile(of_class, (PERMUTED, 1)), axis=1)
+
+    # Block k of a window has the residual of block k of its partner, modulo the partner's length.
+    source = partner[:, place]
+    return starts[source] + (np.arange(len(window)) - starts[place]) % count[source]
 
 
 class AxisResidual:
     """
-    The residual of one axis, independent and of unit variance, beside the columns of the model.
+    The residual of one axis at the fit of the model, independent and of unit variance.
+
+    With the columns A of the model, its prior mean m and information W::
+
+        residual = y - A (A'A + W)^-1 (A'y + W m)
 
     Parameters
     ----------
     rows : ndarray, shape (b, q + 1)
-        ``[columns of the model | measured]``.
+        ``[columns of the model | measured]`` of each block.
     information, mean : ndarray, shape (q,)
         Prior of the parameters.
 
@@ -151,33 +159,33 @@ class AxisResidual:
 
     def __init__(self, rows: np.ndarray, information: np.ndarray, mean: np.ndarray):
         self.design = rows[:, :-1]
+        """Columns of the model, shape (b, q)."""
         self._inverse = np.linalg.inv(self.design.T @ self.design + np.diag(information + TINY))
-        self.values = rows[:, -1] - self.design @ (
-            self._inverse @ (self.design.T @ rows[:, -1] + information * mean)
-        )
+        fitted = self._inverse @ (self.design.T @ rows[:, -1] + information * mean)
+        self.values = rows[:, -1] - self.design @ fitted
+        """The residual, shape (b,)."""
 
     def free(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns without the part that the model imitates, shape of the columns."""
+        """Return columns (b, k) without the part that the model imitates, shape (b, k)."""
         return columns - self.design @ (self._inverse @ (self.design.T @ columns))
 
     def offsets(self, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (amplitude, residual sum of squares) per column, both shape (k,).
+        Return (amplitude, residual sum of squares) with one more column in the model, each (k,).
 
-        Each one of some columns is in the model in turn.
+        Each of the columns `marks`, shape (b, k), is added to the model without the other ones.
         """
         size = np.maximum((marks * self.free(marks)).sum(axis=0), TINY)
         product = marks.T @ self.values
         return product / size, self.values @ self.values - product**2 / size
 
     def energy(self, columns: np.ndarray) -> float:
-        """Return the residual sum of squares with more columns in the model."""
+        """Return the residual sum of squares with all these columns (b, k) added to the model."""
         norm = np.sqrt((columns**2).sum(axis=0)) + TINY
-        free = self.free(columns / norm)
+        scaled = columns / norm
+        free = self.free(scaled)
         amplitudes = np.linalg.lstsq(
-            (columns / norm).T @ free + TINY * np.eye(len(norm)),
-            (columns / norm).T @ self.values,
-            rcond=1e-10,
+            scaled.T @ free + TINY * np.eye(len(norm)), scaled.T @ self.values, rcond=1e-10
         )[0]
         return float(((self.values - free @ amplitudes) ** 2).sum())
 
@@ -187,6 +195,7 @@ class Ranges:
     """The ranges of a variable under test."""
 
     variable: Variable
+    """The variable."""
     marks: np.ndarray
     """Share of each block in each bin, shape (b, k)."""
     member: np.ndarray
@@ -230,8 +239,8 @@ class RegimeSearch:
         self.sensor = sensor
         self.time = time
         self.exchange = exchange
-        # Ranges with neither too few nor too many of the blocks.
         self.ranges: list[Ranges] = []
+        """Of each variable, the ranges with neither too few nor too many of the blocks."""
         for variable in variables:
             marks = variable.marks
             member = variable.ranges
@@ -251,9 +260,9 @@ class RegimeSearch:
         formula: np.ndarray | None = None,
     ) -> list[RestRegime]:
         """
-        Return the ranges with another offset, the likeliest first.
+        Return the ranges with another offset, the largest share of the excess first.
 
-        Without those that a smooth curve or a formula describes as well.
+        Ranges that a smooth curve or a formula describes as well are omitted.
 
         The statistic is the largest share of the squares that one offset explains. With the
         residual r and the indicator x of a range, both white and without the model::
@@ -265,7 +274,9 @@ class RegimeSearch:
         Parameters
         ----------
         axis : str
+            Axis of the sensor.
         rest : AxisResidual
+            Its residual.
         white : callable
             Makes columns over the blocks independent and of unit variance, as the rows of `rest`.
         level : float
@@ -274,61 +285,64 @@ class RegimeSearch:
             Columns of a formula for the residual.
 
         """
+        # Column 0 is the residual, the others are exchanges of its blocks.
         exchanged = np.column_stack([rest.values, rest.free(rest.values[self.exchange].T)])
         energy = (exchanged**2).sum(axis=0)
         shares = []
-        for each in self.ranges:
-            marks = white(each.marks)
+        for ranges in self.ranges:
+            marks = white(ranges.marks)
             products = marks.T @ rest.free(marks)  # of the bins; a range is a sum of bins
-            size = np.einsum('rk,kl,rl->r', each.member, products, each.member)
-            projection = each.member @ (marks.T @ exchanged)
+            size = np.einsum('rk,kl,rl->r', ranges.member, products, ranges.member)
+            projection = ranges.member @ (marks.T @ exchanged)
             shares.append(projection**2 / np.maximum(size, TINY)[:, None] / energy)
-        p_value, likely = self.tested(shares)
+        p_value, likeliest = self.tested(shares)
         if p_value > level:
             return []
 
         # A regime must fit clearly better than any smooth curve of a variable, and the formula.
-        smooth = [each.variable.curves for each in self.ranges if len(each.variable.edges)]
+        smooth = [ranges.variable.curves for ranges in self.ranges if len(ranges.variable.edges)]
         if formula is not None:
             smooth.append(formula)
         least_energy = min([energy[0], *(rest.energy(white(columns)) for columns in smooth)])
         limit = variance_cost(least_energy, len(self.time)) - SURE
         regimes = []
-        for each, number in likely:
-            refined = self._refined(rest, white, each, number)
+        for ranges, number in likeliest:
+            refined = self._refined(rest, white, ranges, number)
             # Share of the excess over noise, which is 1 for each block.
-            count = len(refined.inside)
-            excess = max(energy[0] - count, TINY)
-            share = 1.0 - max(refined.squares - count, 0.0) / excess
-            if share >= MOST_OF_IT and variance_cost(refined.squares, count) < limit:
-                regimes.append(
-                    RestRegime(
-                        self.sensor,
-                        axis,
-                        each.variable.name,
-                        refined.words + ', by another offset',
-                        float(share),
-                        p_value,
-                        float(refined.offset),
-                        refined.inside > 0.5,
-                        self.time,
-                        True,
-                        refined.bounds,
-                        each.variable.is_rate,
-                    )
+            n_blocks = len(refined.inside)
+            excess = max(energy[0] - n_blocks, TINY)
+            share = 1.0 - max(refined.squares - n_blocks, 0.0) / excess
+            fits_better = variance_cost(refined.squares, n_blocks) < limit
+            if not (share >= MOST_OF_IT and fits_better):
+                continue
+            regimes.append(
+                RestRegime(
+                    sensor=self.sensor,
+                    axis=axis,
+                    variable=ranges.variable.name,
+                    text=refined.words + ', by another offset',
+                    share=float(share),
+                    p_value=p_value,
+                    size=float(refined.offset),
+                    inside=refined.inside > 0.5,
+                    time=self.time,
+                    offset=True,
+                    bounds=refined.bounds,
+                    is_rate=ranges.variable.is_rate,
                 )
+            )
         return largest_share_first(regimes)
 
     def _refined(
-        self, rest: AxisResidual, white: Callable, each: Ranges, number: int
+        self, rest: AxisResidual, white: Callable, ranges: Ranges, number: int
     ) -> _RefinedRange:
-        """Return a range with refined bounds."""
-        variable = each.variable
-        chosen = variable.chosen(each.member[number])
+        """Return range `number` of a variable with the bounds at which the residual is least."""
+        variable = ranges.variable
+        chosen = variable.chosen(ranges.member[number])
         bounds = variable.bounds(chosen)
-        mark = each.marks[:, chosen].sum(axis=1)
+        mark = ranges.marks[:, chosen].sum(axis=1)
 
-        # Each end in turn where the residual is least, between the edges of the bins too.
+        # One end after the other; the candidates are between the edges of the bins too.
         for end in (0, 1):
             if not bounds:
                 break
@@ -348,14 +362,21 @@ class RegimeSearch:
 
     def tested(self, gains: Sequence[np.ndarray]) -> tuple[float, list[tuple[Ranges, int]]]:
         """
-        Return (p-value of the largest gain, the likeliest ranges (Ranges, number)).
+        Return (p-value of the largest gain, the likeliest range of each of some variables).
 
-        The gains have shape (r, 1 + m), and the ranges are in order of variables.
+        The p-value is the share of the exchanges with at least this gain. The variables with the
+        largest gains are returned, at most `REPORTED`, in their order, as (`Ranges`, number of the
+        range).
+
+        Parameters
+        ----------
+        gains : sequence of array, shape (r, 1 + m)
+            Gain of each range of a variable in the recording and in m exchanges of its blocks.
+
         """
         if not gains:
             return 1.0, []
-        # Column 0 is the recording, the others are exchanges of its blocks.
-        largest = np.max([gain.max(axis=0) for gain in gains], axis=0)
+        largest = np.max([gain.max(axis=0) for gain in gains], axis=0)  # of the recording first
         p_value = float((largest >= largest[0]).mean())
         of_recording = [gain[:, 0] for gain in gains]
         order = np.argsort([-gain.max() for gain in of_recording], kind='stable')[:REPORTED]
@@ -365,13 +386,15 @@ class RegimeSearch:
 
 def largest_share_first(found: Iterable[RestRegime]) -> list[RestRegime]:
     """Return regimes in order of their shares; among nearly equal ones the order is kept."""
-    alike = max((regime.share for regime in found), default=0.0) - REGIME_SHARE_TIE
-    return sorted(found, key=lambda regime: -min(regime.share, alike))
+    nearly_largest = max((regime.share for regime in found), default=0.0) - REGIME_SHARE_TIE
+    return sorted(found, key=lambda regime: -min(regime.share, nearly_largest))
 
 
 def variance_cost(energy: float | np.ndarray, count: float | np.ndarray) -> float | np.ndarray:
     """
-    Return minus twice the log likelihood of residuals with one variance, at least that of noise.
+    Return ``n log v + S / v``, minus twice the log likelihood of n residuals with one variance v.
+
+    With their sum of squares S (`energy`) in units of the noise, ``v = max(S / n, 1)``.
     """
     variance = np.maximum(energy / np.maximum(count, 1.0), 1.0)
     return count * np.log(variance) + energy / variance
