@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from imu_calibration.core.progress import report
-from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.base import SENSORS, ColumnGroup, Effect
 from imu_calibration.effects.forward_equations import (
     References,
     all_arms,
@@ -41,29 +42,46 @@ six on it does not.
 
 
 @dataclass(frozen=True, eq=False)
+class UsedColumns:
+    """The columns of one group that an effect multiplies with its amplitudes."""
+
+    group: ColumnGroup
+    """Group of the effect."""
+    indices: np.ndarray
+    """Columns with a nonzero coefficient, shape (n_columns,)."""
+
+
+@dataclass(frozen=True, eq=False)
 class BankEntry:
-    """One effect at one time constant."""
+    """
+    One effect at one time constant: a linear model of its output.
+
+    With the time constant fixed the output of axis i is linear in the amplitudes a::
+
+        output_i(t) = columns(t) @ slopes[:, i, :] @ a
+    """
 
     effect: Effect
-    """It."""
+    """Effect with a time constant."""
     number: int
-    """Number of the time constant."""
-    point: dict
-    """Point of linearisation."""
-    used: tuple
-    """(ColumnGroup, columns that the amplitudes multiply), ..."""
+    """Number of the time constant in the bank."""
+    point: dict[str, Any]
+    """Effect -> values at which columns are linearised; this effect at its time constant."""
+    used: tuple[UsedColumns, ...]
+    """Columns of each group of the effect."""
     slopes: np.ndarray
     """d(coefficients) / d(amplitudes), shape (n_columns, 3, n_amplitudes)."""
-    label: str
-    """Effect name and number of the time constant."""
+
+    @property
+    def label(self) -> str:
+        """Effect name and number of the time constant."""
+        return f'{self.effect.name}@{self.number}'
 
     @property
     def param_names(self) -> list[str]:
         """Names of the amplitudes."""
-        return [
-            f'{self.label}.{component}'
-            for component in self.effect.amplitudes(self.effect.components)
-        ]
+        components = self.effect.amplitudes(self.effect.components)
+        return [f'{self.label}.{component}' for component in components]
 
     @property
     def prior_sd(self) -> np.ndarray:
@@ -72,9 +90,10 @@ class BankEntry:
 
     def columns(self, ref: Reference) -> np.ndarray:
         """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
-        return np.concatenate(
-            [group.columns(ref, self.point)[:, rows] for group, rows in self.used], axis=1
-        )
+        columns_of_groups = []
+        for used in self.used:
+            columns_of_groups.append(used.group.columns(ref, self.point)[:, used.indices])
+        return np.concatenate(columns_of_groups, axis=1)
 
 
 def make_bank(
@@ -83,15 +102,15 @@ def make_bank(
     """
     Return sensor -> list of BankEntry for the `effects` that have a time constant.
 
-    They are taken at `values` of a model for the rest of the sensor.
+    Each is linearised at each of the time `constants` and at the `values` of the other parameters
+    of the model.
     """
     bank: dict[str, list[BankEntry]] = {sensor: [] for sensor in SENSORS}
     for effect in effects:
-        if effect.time_constant:
-            bank[effect.sensor] += [
-                _entry(effect, number, constant, model, values)
-                for number, constant in enumerate(constants)
-            ]
+        if not effect.time_constant:
+            continue
+        for number, constant in enumerate(constants):
+            bank[effect.sensor].append(_bank_entry(effect, number, constant, model, values))
     return bank
 
 
@@ -99,34 +118,29 @@ def columns_with_bank(
     references: References, sensor: str, bank: dict[str, list[BankEntry]]
 ) -> np.ndarray:
     """Return the columns of `sensor` in the model of `references`, and those of the bank."""
-    return np.concatenate(
-        [
-            columns(references, sensor),
-            *(entry.columns(references.at(sensor)) for entry in bank[sensor]),
-        ],
-        axis=1,
-    )
+    of_model = columns(references, sensor)
+    of_bank = [entry.columns(references.at(sensor)) for entry in bank[sensor]]
+    return np.concatenate([of_model, *of_bank], axis=1)
 
 
-def _entry(
-    effect: Effect, number: int, constant: float, model: SensorModel, values: np.ndarray
+def _bank_entry(
+    effect: Effect, number: int, time_constant: float, model: SensorModel, values: np.ndarray
 ) -> BankEntry:
-    own = effect.at_time_constant(constant)
-    point = {**model.full_point(), effect.name: own}
-    slopes = effect_slopes(
-        effect, {**model.values_of(effect.sensor, values), effect.name: own}, point
-    )[1]
-    amplitudes = {
-        name: effect.amplitudes(np.moveaxis(block, -1, 0)) for name, block in slopes.items()
-    }
-    used = [
-        (group, np.flatnonzero(np.any(amplitudes[group.name] != 0, axis=(0, 2))))
-        for group in effect.groups
-    ]
-    joined = np.concatenate([amplitudes[group.name][:, rows] for group, rows in used], axis=1)
-    return BankEntry(
-        effect, number, point, tuple(used), np.moveaxis(joined, 0, -1), f'{effect.name}@{number}'
-    )
+    """Return the entry of an effect, linearised at its prior amplitudes and a time constant."""
+    effect_values = effect.at_time_constant(time_constant)
+    point = {**model.full_point(), effect.name: effect_values}
+    sensor_values = {**model.values_of(effect.sensor, values), effect.name: effect_values}
+    _, slopes = effect_slopes(effect, sensor_values, point)
+
+    used = []
+    used_slopes = []
+    for group in effect.groups:
+        # Shape (width, 3, n_amplitudes): without the time constant, which is fixed.
+        of_amplitudes = slopes[group.name][..., : effect.n_amplitudes]
+        indices = np.flatnonzero(np.any(of_amplitudes != 0, axis=(1, 2)))
+        used.append(UsedColumns(group, indices))
+        used_slopes.append(of_amplitudes[indices])
+    return BankEntry(effect, number, point, tuple(used), np.concatenate(used_slopes))
 
 
 FACTOR_PARTS = ('within', 'slow')
@@ -142,7 +156,7 @@ MOST_SUMS = 32
 @dataclass(frozen=True, eq=False)
 class ReducedRecording(WindowMeans):
     """
-    Windows of one recording as statistics, and residuals at a point.
+    Windows of one recording as statistics, and their residuals at values of the parameters.
 
     The statistics are of ``[columns of the model | bank of time constants | output]``.
     """
@@ -150,7 +164,7 @@ class ReducedRecording(WindowMeans):
     model: SensorModel
     """Model of all candidate effects, linearised at its point."""
     values: np.ndarray
-    """Parameters that residuals belong to."""
+    """Parameters of the model that are subtracted from the output for a residual."""
     bank: dict[str, list[BankEntry]]
     """Sensor -> effects with a time constant, at each of a bank; their columns are last."""
     windows: tuple[WindowStatistics, ...]
@@ -168,22 +182,20 @@ class ReducedRecording(WindowMeans):
 
     @cached_property
     def slow_rows(self) -> np.ndarray:
-        """Short pieces of each window, shape (k,)."""
-        (sensor, *_) = self.sensors
+        """Number of short pieces of each window, shape (k,)."""
+        sensor = self.sensors[0]
         return np.array([window.sensors[sensor].slow_rows for window in self.windows])
 
     @property
     def period(self) -> float:
         """Typical time from sample to sample, s."""
-        return float(
-            np.median([max(window.duration, 1e-3) / window.count for window in self.windows])
-        )
+        periods = [max(window.duration, 1e-3) / window.count for window in self.windows]
+        return float(np.median(periods))
 
     def mean(self, sensor: str) -> np.ndarray:
         """Return the mean rows ``[columns | residual]``, shape (k, p + 3)."""
-        return self._with_residual(
-            sensor, np.array([window.sensors[sensor].mean for window in self.windows])
-        )
+        means = np.array([window.sensors[sensor].mean for window in self.windows])
+        return self._with_residual(sensor, means)
 
     def factors_of(
         self, sensor: str, part: str, rows: np.ndarray
@@ -212,15 +224,11 @@ class ReducedRecording(WindowMeans):
 
         """
         chosen = np.flatnonzero(rows & self.moving)
-        for at in range(0, len(chosen), UNPACKED_WINDOWS):
-            some = chosen[at : at + UNPACKED_WINDOWS]
-            yield (
-                some,
-                self._with_residual(
-                    sensor,
-                    unpacked([self.factors[sensor, part][k] for k in some], self._width(sensor)),
-                ),
-            )
+        for first in range(0, len(chosen), UNPACKED_WINDOWS):
+            indices = chosen[first : first + UNPACKED_WINDOWS]
+            packed_factors = [self.factors[sensor, part][k] for k in indices]
+            factors = unpacked(packed_factors, self._width(sensor))
+            yield indices, self._with_residual(sensor, factors)
 
     def product_sum(self, sensor: str, part: str, rows: np.ndarray) -> np.ndarray:
         """
@@ -238,27 +246,27 @@ class ReducedRecording(WindowMeans):
         return self._sums[key]
 
     def _width(self, sensor: str) -> int:
+        """Return the number of columns and outputs of a sensor, p + 3."""
         return len(self.windows[0].sensors[sensor].mean)
 
     @cached_property
     def _sums(self) -> Recent:
+        """(sensor, part, mask of windows as bytes) -> last results of `product_sum`."""
         return Recent(MOST_SUMS)
 
     @cached_property
     def _coefficients(self) -> dict[str, np.ndarray]:
+        """Sensor -> coefficients of the columns of the model at `values`, shape (n_columns, 3)."""
         return {sensor: coefficients(self.model, sensor, self.values) for sensor in self.sensors}
 
     def _with_residual(self, sensor: str, rows: np.ndarray) -> np.ndarray:
-        own = self._coefficients[sensor]
-        rows[..., -3:] -= rows[..., : len(own)] @ own
+        """Return rows ``[columns | output]`` with the residual in place of the output, in place."""
+        of_model = self._coefficients[sensor]
+        rows[..., -3:] -= rows[..., : len(of_model)] @ of_model
         return rows
 
     def rebased(self, values: np.ndarray) -> 'ReducedRecording':
-        """
-        Return the same recording with the residual of other `values`.
-
-        The point of linearisation is unchanged.
-        """
+        """Return the recording with residuals at other `values`, columns unchanged."""
         return replace(self, values=values)
 
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
@@ -321,10 +329,9 @@ def reduce_recording(
     factors: dict[tuple[str, str], list[np.ndarray]] = {
         key: [] for key in product(sensors_of(windows), FACTOR_PARTS)
     }
-    for some in chunks(windows):
-        for window in reduce_windows(
-            some, model, table, column_function=partial(columns_with_bank, bank=bank)
-        ):
+    column_function = partial(columns_with_bank, bank=bank)
+    for chunk in chunks(windows):
+        for window in reduce_windows(chunk, model, table, column_function=column_function):
             for (sensor, part), kept in factors.items():
                 factor = getattr(window.sensors[sensor], part)
                 kept.append(np.zeros(0) if factor is None else packed(factor))
@@ -341,26 +348,28 @@ def reduce_recording(
 
 
 def _describe(window: Window) -> dict[str, float]:
+    """Return the variables of `ReducedRecording.describe` of one window."""
     motion = window.motion
-    found = {
+    temperature = np.nan
+    if window.temperature_c is not None:
+        temperature = float(window.temperature_c.mean())
+    variables = {
         'time': float(window.time.mean()),
         'specific force': float(np.linalg.norm(window.force_s.mean(axis=0))),
-        'temperature': (
-            np.nan if window.temperature_c is None else float(window.temperature_c.mean())
-        ),
+        'temperature': temperature,
         'rate': float(np.sqrt((motion.rate**2).sum(axis=1).mean())),
     }
     for joint in range(motion.position.shape[1]):
-        found[f'angle{joint}'] = float(motion.position[:, joint].mean())
-        found[f'span{joint}'] = float(np.ptp(motion.position[:, joint]))
-    return found
+        variables[f'angle{joint}'] = float(motion.position[:, joint].mean())
+        variables[f'span{joint}'] = float(np.ptp(motion.position[:, joint]))
+    return variables
 
 
 def mean_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """
-    Return the mean lever arm of the accelerometers for each of them, zero where a model has none.
+    Return the mean lever arm of the three accelerometers, once for each of them, shape (3, 3).
 
-    Shape (3, 3).
+    It is zero where a model has none.
 
     Their differences change the derivative of a delay little where they are millimetres, and
     distort it where a recording does not determine them and they are estimated as centimetres.
