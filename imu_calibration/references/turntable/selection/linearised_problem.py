@@ -51,7 +51,7 @@ DELAY_FREQUENCY = 2 * np.pi * 3.0
 TOO_COARSE = 4.0
 """Evidence of a curvature above which the columns are relinearised, nats."""
 BILINEAR = 2e-3
-"""Relative change of the matrix that an effect left out may have caused."""
+"""Relative change of the matrix that an omitted effect may have caused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class SearchedWindows:
 
 class LinearisedProblem:
     """
-    One linearisation: the reduced recording, its noise, the evidence and the search.
+    One linearisation of the windows: columns, noise, evidence and search.
 
     Parameters
     ----------
@@ -112,12 +112,16 @@ class LinearisedProblem:
         windows = searched.windows
         baseline = searched.baseline
         effects = searched.effects
-        locked = searched.locked
         self.baseline = baseline
         self.effects = effects
+        locked = searched.locked
         self.locked = locked
         self.duration = max(float(window.time[-1]) for window in windows)
+        """Duration of the recording, s."""
         self.constants = time_constants(self.duration)
+        """Time constants of the bank, s."""
+
+        # Reduce all windows with the columns of all effects.
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
         recording = reduce_recording(
@@ -127,32 +131,36 @@ class LinearisedProblem:
             values=values,
             bank=make_bank(effects, self.constants, model, values=values),
         )
+
+        # Noise, fits and choices are from the windows that are not locked.
         places = range(len(values))
-        own = chain.from_iterable(places[model.slices[effect.key]] for effect in baseline.effects)
-        used = tuple(own)  # parameters of the baseline within the full model
-        judged = recording.select(~locked)
+        parts = [places[model.slices[effect.key]] for effect in baseline.effects]
+        in_baseline = tuple(chain.from_iterable(parts))
+        of_selection = recording.select(~locked)
         if point is None:
-            judged = _at_baseline(judged, baseline, used)
-            recording = recording.rebased(judged.values)
-        self.all_samples = parameter_space(judged, baseline)
-        judged = in_trusted_band(self.all_samples)
-        self.space = replace(judged, recording=recording)
-        self.questions = questions(judged, effects)
+            of_selection = _at_baseline(of_selection, baseline, in_baseline)
+            recording = recording.rebased(of_selection.values)
+        self.all_samples = parameter_space(of_selection, baseline)
+        """The selection windows with all of their samples."""
+        space = in_trusted_band(self.all_samples)
+        self.space = replace(space, recording=recording)
+        """All windows, locked ones included, in the trusted band."""
+        self.questions = questions(space, effects)
         self.noise = noise_beside_effects(
-            judged, smooth_parameters(self.questions), searched.bias_processes
+            space, smooth_parameters(self.questions), searched.bias_processes
         )
-        self.evidence = WindowEvidence(judged, self.noise, folds_of(judged.recording.kind))
+        self.evidence = WindowEvidence(space, self.noise, folds_of(space.recording.kind))
         self.search = Search(
             self.evidence,
-            used,
+            in_baseline,
             self.questions,
-            encoder_step=judged.recording.encoder_step,
+            encoder_step=space.recording.encoder_step,
             any_size=searched.any_size,
             resolved=searched.resolved,
         )
 
     def asking_any_size(self) -> 'LinearisedProblem':
-        """Return the same, asking about sizes that are known of no instrument too."""
+        """Return the same, with a search that allows sizes above those of any known instrument."""
         other = copy(self)
         other.search = self.search.asking_any_size()
         return other
@@ -171,19 +179,20 @@ class LinearisedProblem:
         """
         Return all parameters of the space for a choice, fitted to the selection windows.
 
-        With all of the baseline, shape (q,).
+        The parameters of effects that are neither chosen nor in the baseline are zero, shape (q,).
         """
         return self.absolute(self.search.values(chosen))
 
     def absolute(self, values: np.ndarray) -> np.ndarray:
         """
-        Return parameters of the whole space in full, from those that count from the linearisation.
+        Return the parameters of the space from fitted ones, shape (q,).
 
-        Shape (q,).
+        The fitted parameters of the baseline are changes from the linearisation
+        (`counted_from_values`), whose values are added.
         """
         values = np.array(values)
-        change = counted_from_values(self.recording.model, self.baseline)
-        values[: len(change)] += np.where(change, self.recording.values, 0.0)
+        is_change = counted_from_values(self.recording.model, self.baseline)
+        values[: len(is_change)] += np.where(is_change, self.recording.values, 0.0)
         return values
 
     def judged_by(self, judge: 'LinearisedProblem') -> WindowEvidence:
@@ -197,25 +206,26 @@ class LinearisedProblem:
 
     def needs_another(self, chosen: Sequence[Question]) -> bool:
         """
-        Return whether the linearisation is too coarse for the choice: curvature times evidence.
+        Return whether the choice must be linearised again.
+
+        A warm-up of the bank has no columns of its own yet; of other effects the evidence of the
+        curvature is too large.
         """
-        return any(
-            '@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE
-            for question in chosen
-        )
+        for question in chosen:
+            if '@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE:
+                return True
+        return False
 
     def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
         """
-        Return the evidence of an effect's curvature, nats.
+        Return the evidence that separates an effect of the choice from its tangent, nats.
 
-        Its separability from its first derivative.
+        That is the fall of the loss by the effect times the squared relative error of its tangent.
         """
         without = self.search.indices([q for q in chosen if q is not question])
-        weight = self.evidence.loss(without) - self.evidence.loss(self.search.indices(chosen))
-        return (
-            weight
-            * _curvature(question, self.values(chosen), self.recording.model, self.duration) ** 2
-        )
+        fall = self.evidence.loss(without) - self.evidence.loss(self.search.indices(chosen))
+        values = self.values(chosen)
+        return fall * _curvature(question, values, self.recording.model, self.duration) ** 2
 
     def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -228,20 +238,24 @@ class LinearisedProblem:
 
     def acts_beside(self, chosen: Sequence[Question]) -> bool:
         """
-        Return whether the point of linearisation has a timing effect that is not chosen.
+        Return whether the columns are linearised at a warped effect that is not chosen.
 
-        Timing effects are a lag, a delay or an error of the table that is not among the chosen
-        effects.
+        Such an effect is a lag, a delay or an error of the table, with values that are not zero.
         """
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         model = self.recording.model
-        return any(
-            e.warp is not None and e.key not in kept and np.any(model.point_of(e))
-            for e in model.effects
-        )
+        for effect in model.effects:
+            is_other = effect.warp is not None and effect.key not in kept
+            if is_other and np.any(model.point_of(effect)):
+                return True
+        return False
 
     def point(self, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray]:
-        """Return the point of linearisation (model, values) for this choice."""
+        """
+        Return the point of linearisation (model, values) for this choice.
+
+        The model has columns of all effects, the amplitudes of those that are not chosen are zero.
+        """
         values = self.values(chosen)
         model = extended_model(self.baseline, self.effects)
         for question in chosen:
@@ -249,19 +263,20 @@ class LinearisedProblem:
                 model = model.with_effect(question.sensor, question.name)
         start = model.start()
         for effect in model.effects:
-            known = self.recording.model.slices.get(effect.key)
-            if known is not None:
-                start[model.slices[effect.key]] = values[known]
-                if effect.time_constant:  # a straight line may lead beyond zero
-                    last = model.slices[effect.key].stop - 1
-                    start[last] = np.clip(
-                        start[last], 0.25 * self.constants[0], 4.0 * self.constants[-1]
-                    )
+            part = self.recording.model.slices.get(effect.key)
+            if part is None:
+                continue
+            start[model.slices[effect.key]] = values[part]
+            if effect.time_constant:
+                # A step along the tangent may pass zero.
+                last = model.slices[effect.key].stop - 1
+                shortest = 0.25 * self.constants[0]
+                longest = 4.0 * self.constants[-1]
+                start[last] = np.clip(start[last], shortest, longest)
         for question in chosen:
             if '@' in question.label:
-                start[model.slices[question.sensor, question.name]] = self._warm_up(
-                    chosen, question, values
-                )
+                part = model.slices[question.sensor, question.name]
+                start[part] = self._warm_up(chosen, question, values)
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         for effect in model.effects:
             if effect.key not in kept:
@@ -271,46 +286,54 @@ class LinearisedProblem:
     def _warm_up(
         self, chosen: Sequence[Question], question: Question, values: np.ndarray
     ) -> np.ndarray:
-        """Return amplitudes and time constant of a warm-up, interpolated in the bank."""
+        """
+        Return amplitudes and time constant of a chosen warm-up of the bank.
+
+        The time constant is at the minimum of a parabola through the losses of this and the two
+        neighbouring time constants, over their logarithms.
+        """
         number = int(question.label.split('@')[1])
         place = chosen.index(question)
+        amplitudes = values[list(question.parameters)]
         near = [k for k in (number - 1, number, number + 1) if 0 <= k < len(self.constants)]
+        if len(near) < 3:
+            return np.append(amplitudes, self.constants[number])
         losses = []
         for k in near:
             other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
             used = self.search.indices(with_exchanged(chosen, place, other))
             losses.append(self.evidence.loss(used))
         logs = np.log(self.constants[near])
-        if len(near) < 3:
-            return np.append(values[list(question.parameters)], self.constants[number])
         curve = np.polyfit(logs - logs[1], losses, 2)
-        shift = (
-            np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1])
-            if curve[0] > 0
-            else 0.0
-        )
-        return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
+        shift = 0.0
+        if curve[0] > 0:
+            shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1])
+        return np.append(amplitudes, np.exp(logs[1] + shift))
 
 
 def _start(baseline: SensorModel, effects: Sequence[Effect]) -> tuple[SensorModel, np.ndarray]:
+    """Return (model of the baseline and all effects, its start values; zero without one)."""
     model = extended_model(baseline, effects)
     values = model.start()
     return model, np.where(np.isfinite(values), values, 0.0)
 
 
 def _at_baseline(
-    recording: ReducedRecording, baseline: SensorModel, used: Sequence[int]
+    recording: ReducedRecording, baseline: SensorModel, in_baseline: Sequence[int]
 ) -> ReducedRecording:
-    """Move the residual to the baseline's own solution."""
+    """
+    Return the recording with residuals at the least-squares solution of the baseline.
+
+    `in_baseline`: its parameters. With lever arms, which the columns depend on, two steps.
+    """
     for _ in range(2 if baseline.arms else 1):
         space = in_trusted_band(parameter_space(recording, baseline))
+        normal = normal_matrix(space, noise_before_fit(space))
+        step, _ = solve_normal(
+            normal, np.asarray(in_baseline), space.prior_sd, prior_mean=space.prior_mean
+        )
         values = recording.values.copy()
-        values[list(used)] += solve_normal(
-            normal_matrix(space, noise_before_fit(space)),
-            np.asarray(used),
-            space.prior_sd,
-            prior_mean=space.prior_mean,
-        )[0]
+        values[list(in_baseline)] += step
         recording = recording.rebased(values)
     return recording
 
@@ -318,13 +341,18 @@ def _at_baseline(
 def _curvature(
     question: Question, values: np.ndarray, model: SensorModel, duration: float
 ) -> float:
-    """Return the relative error of the first derivative at the size of the effect."""
+    """
+    Return the relative error of the tangent of an effect at its estimate.
+
+    For a lag it is its change from the linearisation times `DELAY_FREQUENCY`, for a time constant
+    the logarithm of the ratio.
+    """
     effect = question.effect
     value = values[list(question.parameters)]
     if effect.warp is not None:
-        moved = np.max(np.abs(value - model.point_of(effect)))
+        change = np.max(np.abs(value - model.point_of(effect)))
         sensitivity = {'s': DELAY_FREQUENCY, 's/s': DELAY_FREQUENCY * duration}
-        return moved * sensitivity.get(str(effect.unit), 1.0)
+        return change * sensitivity.get(str(effect.unit), 1.0)
     if effect.time_constant:
         return abs(np.log(max(value[-1], 1e-3) / model.point_of(effect)[-1]))
     return BILINEAR

@@ -9,7 +9,7 @@ import numpy as np
 
 from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
-from imu_calibration.estimation.rows import Rows
+from imu_calibration.estimation.rows import Rows, weights_of
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.sensor_noise import NATURAL, BiasProcess
 from imu_calibration.references.turntable.estimation.noise_search import (
@@ -39,9 +39,10 @@ from imu_calibration.selection.bias_courses import step_places, temperature_cour
 
 def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
     """
-    Return the space with only the slow part of the centred rows on some axes.
+    Return the space with only the slow part compared on axes with an unexplained fast part.
 
-    These are the axes with a fast part that no effect explains.
+    The rows are the samples about the mean of their window; the slow part are the means of short
+    pieces of a window.
 
     Joint states at 100 Hz do not show a motor's ripple at 47 Hz, and no effect of the catalogue
     makes up for it; judged sample by sample, such a recording is evidence for any effect that
@@ -92,9 +93,9 @@ an arc, half a milligravity, was one.
 """
 MAX_MIDDLE_RATIO, MAX_WANDER_RATIO = 3.0, 4.0
 """
-So does one of up to this many times that of the middle axis, and of this many times the plausible
-one at most: the axes of a sensor are of one make and their biases wander alike, while a cable pulls
-along one. Not of the quietest: a bias that steps may rest on one axis.
+A wander of up to the first times that of the middle axis passes for noise too, but of at most the
+second times the plausible one: the axes of a sensor are of one make and their biases wander alike,
+while a cable pulls along one. Not of the quietest: a bias that steps may rest on one axis.
 """
 STABLE = {'accelerometer': 1e-4, 'gyroscope': 0.0}
 """
@@ -135,116 +136,148 @@ def noise_beside_effects(
         Sensor -> its bias processes, where measured separately.
 
     """
-    noise = noise_before_fit(space)
+    noise = {}
+    for sensor, at_rest in noise_before_fit(space).items():
+        noise[sensor] = replace(at_rest, known=(known or {}).get(sensor, ()))
+
+    # Variance within moving windows: from a fit with the noise at rest, then, with its serial
+    # correlation, from a fit with the first variance.
     every = np.arange(space.size)
-    noise = {
-        sensor: replace(own, known=(known or {}).get(sensor, ())) for sensor, own in noise.items()
-    }
-    for look_along in (False, True):
-        values = solve_normal(
+    for is_correlated in (False, True):
+        values, _ = solve_normal(
             normal_matrix(space, noise), every, space.prior_sd, prior_mean=space.prior_mean
-        )[0]
-        noise = {
-            sensor: _with_moving_factors(space, sensor, noise[sensor], values, look_along)
-            for sensor in space.sensors
-        }
-    return {
-        sensor: _with_bias_process(space, sensor, noise, smooth[sensor]) for sensor in space.sensors
-    }
+        )
+        for sensor in space.sensors:
+            noise[sensor] = _with_moving_factors(
+                space, sensor, noise[sensor], values, is_correlated
+            )
+
+    with_processes = {}
+    for sensor in space.sensors:
+        with_processes[sensor] = _with_bias_process(space, sensor, noise, smooth[sensor])
+    return with_processes
 
 
 def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
     """
-    Return the least bias processes.
+    Return the least bias processes of a sensor.
 
-    The known ones, else from the white noise of the sensor and the time between samples, s.
+    They are the known ones, else one with `NATURAL` times the white noise of one second; `period`:
+    time between samples, s.
     """
-    return noise.known or (
-        BiasProcess(
-            NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), CORRELATION_TIMES[0]
-        ),
-    )
+    if noise.known:
+        return noise.known
+    of_second = float(np.sqrt(np.median(noise.white_variance) * period))
+    return (BiasProcess(NATURAL * of_second, CORRELATION_TIMES[0]),)
 
 
 def plausible_processes(
     noise: NoiseModel, period: float, *, sensor: str, duration: float
 ) -> tuple[BiasProcess, ...]:
     """
-    Return the bias processes up to a size that is plausible as noise.
+    Return the bias processes of a recording, reduced to a size that is plausible as noise.
 
-    As found in the recording, naturally at least, at most as such biases do within its duration, s:
-    further where all axes do so.
+    With the sd s of the estimated processes within the duration, the sd w of the bias of the middle
+    axis there, and p = PLAUSIBLE times the usual sd of a bias, s is at most::
+
+        clip(MAX_MIDDLE_RATIO w, p, MAX_WANDER_RATIO p)
+
+    The middle axis is the one with the second largest wander.
+
+    Parameters
+    ----------
+    noise : NoiseModel
+    period, duration : float
+        Time between samples, and of the recording, s.
+    sensor : str
+
     """
     natural = natural_processes(noise, period)
     if noise.known or not noise.bias_processes:
         return natural
-    seen = float(np.sqrt(sum(process.within(duration) ** 2 for process in noise.bias_processes)))
-    most = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
-    alike = MAX_MIDDLE_RATIO * noise.middle_wander * seen / float(np.sqrt(noise.bias_variance))
-    share = min(1.0, float(np.clip(alike, most, MAX_WANDER_RATIO * most)) / seen)
+    within = float(np.sqrt(sum(process.within(duration) ** 2 for process in noise.bias_processes)))
+    plausible = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
+    # `middle_wander` is of a long duration, as `bias_variance`.
+    by_middle = (
+        MAX_MIDDLE_RATIO * noise.middle_wander * within / float(np.sqrt(noise.bias_variance))
+    )
+    most = float(np.clip(by_middle, plausible, MAX_WANDER_RATIO * plausible))
+    share = min(1.0, most / within)
     return tuple(replace(process, sd=share * process.sd) for process in noise.bias_processes)
 
 
 def noise_before_fit(space: ParameterSpace) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel before anything is fitted: the noise at rest."""
-    found = {}
+    recording = space.recording
+    models = {}
     for sensor in space.sensors:
-        white, inflation = white_noise(space.recording.windows, sensor) or (
-            _white_without_rest(space, sensor),
-            np.ones(3),
-        )
-        found[sensor] = NoiseModel(
+        at_rest = white_noise(recording.windows, sensor)
+        if at_rest is None:
+            at_rest = (_white_without_rest(space, sensor), np.ones(3))
+        white, inflation = at_rest
+        models[sensor] = NoiseModel(
             white,
             inflation,
-            reference=ReferenceNoise.of_steps(space.recording.encoder_step, sensor),
-            shaken=shaken_means(space.recording.windows, sensor),
+            reference=ReferenceNoise.of_steps(recording.encoder_step, sensor),
+            shaken=shaken_means(recording.windows, sensor),
         )
-    return found
+    return models
 
 
 def _white_without_rest(space: ParameterSpace, sensor: str) -> np.ndarray:
+    """
+    Return the variance of single samples in motion at the best fit of all effects, shape (3,).
+
+    It is the noise of a recording without rests.
+    """
     moving = space.recording.moving
     dof = max((space.recording.count[moving] - 1).sum(), 1)
-    return np.array(
-        [
-            max(least_misfit(space.within_sum(sensor, axis, moving))[0] / dof, 1e-30)
-            for axis in range(3)
-        ]
-    )
+    variances = []
+    for axis in range(3):
+        squares, _ = least_misfit(space.within_sum(sensor, axis, moving))
+        variances.append(max(squares / dof, 1e-30))
+    return np.array(variances)
 
 
 def _with_moving_factors(
-    space: ParameterSpace, sensor: str, noise: NoiseModel, values: np.ndarray, look_along: bool
+    space: ParameterSpace, sensor: str, noise: NoiseModel, values: np.ndarray, is_correlated: bool
 ) -> NoiseModel:
     """
-    Return the noise with the scatter of moving windows.
+    Return the noise with the scatter of samples in each kind of moving window.
 
-    The residual's variance, and a factor for directions along the columns.
+    The scatter is the variance of the residual at the parameters `values`, shape (q,). With
+    `is_correlated` it grows by the ratio of the mean square of the residual along the columns of
+    each window to this variance, which is 1 for white noise.
     """
-    found = {}
+    weights = weights_of(range(space.size), values, space.size)
+    moving = {}
     for kind in np.unique(space.recording.kind[space.recording.moving]):
-        rows = space.recording.kind == kind
-        dof = (space.recording.count[rows] - 1).sum()
+        of_kind = space.recording.kind == kind
+        dof = (space.recording.count[of_kind] - 1).sum()
         variances = np.zeros(3)
-        along = np.zeros(3)
+        along = np.zeros(3)  # mean square of the residual along the columns of a window
         for axis in range(3):
-            reduced = np.append(-values[space.index[sensor][axis]], 1.0)
-            if look_along:
-                squares, rank = 0.0, 0
-                for products in space.within_each(sensor, axis, rows):
-                    products[:, :, -1] = products @ reduced
-                    variances[axis] += (reduced @ products[:, :, -1].T).sum() / dof
-                    misfit, dimensions = misfit_along(products)
-                    squares = squares + misfit
-                    rank = rank + dimensions
+            of_axis = weights[space.places(sensor, axis)]
+            if is_correlated:
+                squares = 0.0
+                rank = 0
+                for products in space.within_each(sensor, axis, of_kind):
+                    # With the residual of the fit in place of that of the linearisation.
+                    products[:, :, -1] = products @ of_axis
+                    variances[axis] += (of_axis @ products[:, :, -1].T).sum() / dof
+                    squares_of_windows, rank_of_windows = misfit_along(products)
+                    squares = squares + squares_of_windows
+                    rank = rank + rank_of_windows
                 along[axis] = squares / max(rank, 1)
             else:
-                variances[axis] = reduced @ space.within_sum(sensor, axis, rows) @ reduced / dof
-        share = float(np.clip(np.mean(along / variances), 1.0, None)) if look_along else 1.0
+                variances[axis] = of_axis @ space.within_sum(sensor, axis, of_kind) @ of_axis / dof
+        correlation = 1.0
+        if is_correlated:
+            correlation = float(np.clip(np.mean(along / variances), 1.0, None))
         factor = np.maximum(variances / noise.white_variance, LEAST_NOISE_SHARE)
-        factor = factor * share / noise.inflation
-        found[str(kind)] = MovingFactors(factor, factor, np.maximum(factor, 1.0), share)
-    return replace(noise, moving=found)
+        factor = factor * correlation / noise.inflation
+        moving[str(kind)] = MovingFactors(factor, factor, np.maximum(factor, 1.0), correlation)
+    return replace(noise, moving=moving)
 
 
 def _with_bias_process(
@@ -256,60 +289,74 @@ def _with_bias_process(
     """
     Return the noise of a sensor with window offsets and bias process.
 
-    It is estimated with all effects but the superfluous smooth ones. A wander would follow a step
-    of the biases, or a temperature that acts late: one of these that beats the process is a part
-    of the model too.
+    It is estimated with all effects of the sensor; of the smooth ones only the one that explains
+    the means better than a bias process remains. A wander would follow a step of the biases, or a
+    temperature that acts late: one of these that beats the process is a part of the model too.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+    sensor : str
+    noise : dict
+        Sensor -> NoiseModel.
+    smooth : sequence of sequences of int
+        Parameters of each effect of the sensor that is smooth in time.
+
     """
+    # Means of the windows with the parameters of the sensor, the smooth effects last.
     recording = space.recording
-    superfluous = sorted(set().union(*smooth))
-    structural = np.setdiff1d(np.concatenate(space.index[sensor]), superfluous)
-    own = np.append(structural, superfluous).astype(int)
-    place = {parameter: k for k, parameter in enumerate(own)}
-    equations = np.zeros((len(recording.windows), 3, len(own) + 1))
+    of_smooth = sorted(set().union(*smooth))
+    structural = np.setdiff1d(np.concatenate(space.index[sensor]), of_smooth)
+    parameters = np.append(structural, of_smooth).astype(int)
+    place = {parameter: k for k, parameter in enumerate(parameters)}
+    equations = np.zeros((len(recording.windows), 3, len(parameters) + 1))
     for axis in range(3):
         columns = [*(place[parameter] for parameter in space.index[sensor][axis]), -1]
         equations[:, axis, columns] = space.mean[sensor][axis]
-    products = _known_otherwise(space, sensor, noise, own)
+    products = _information_without_means(space, sensor, noise, parameters)
     rows = recording.mean_rows(equations, noise[sensor], products)
     rows = recording.without_offsets(rows, noise[sensor])
-    natural = float(
-        np.sqrt(
-            sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))
-        )
-    )
+
+    # Which smooth effect, course in time or step explains them better than a bias process?
+    processes = natural_processes(noise[sensor], recording.period)
+    natural = float(np.sqrt(sum(process.sd**2 for process in processes)))
     smooth_columns = equations[:, :, len(structural) : -1]
-    options = []  # columns of each smooth effect
-    for parameters in smooth:
-        options.append([place[k] - len(structural) for k in parameters])
+    options = []  # columns of each smooth effect among `smooth_columns`
+    for parameters_of_effect in smooth:
+        options.append([place[k] - len(structural) for k in parameters_of_effect])
     wander = _WanderProblem(
         recording=recording,
         rows=rows,
         n_structural=len(structural),
         options=options,
         prior_sd=drift_prior(
-            smooth_columns, space.prior_sd[superfluous], max(natural, STABLE[sensor])
+            smooth_columns, space.prior_sd[of_smooth], max(natural, STABLE[sensor])
         ),
         natural=natural,
         stable=STABLE[sensor],
     )
-    found = _best_course(wander)
-    shape = found.search.best(found.used)[0]
-    middle = 0.0
-    if shape[1] > PLAUSIBLE * found.search.usual:
-        middle = found.search.of_middle_axis(shape, found.used)
-    return replace(noise[sensor], middle_wander=middle, **found.search.polished(shape, found.used))
+    choice = _best_course(wander)
+
+    # Offsets and bias process with that model.
+    search = choice.search
+    shape = search.best(choice.used)[0]
+    middle_wander = 0.0
+    if shape[1] > PLAUSIBLE * search.usual:
+        middle_wander = search.of_middle_axis(shape, choice.used)
+    polished = search.polished(shape, choice.used)
+    return replace(noise[sensor], middle_wander=middle_wander, **polished)
 
 
 @dataclass(frozen=True, eq=False)
 class _Choice:
-    """The model beside which a bias process is estimated."""
+    """The model with which a bias process is estimated."""
 
     search: BiasProcessSearch
-    """Noise with these columns."""
+    """Search for the noise of rows with the columns under test."""
     used: Sequence[int]
-    """Parameters of the smooth effect or course of the biases that is needed."""
+    """Parameters of the smooth effect, course or step that is in the model; empty without one."""
     moment: int
-    """Number of the step among the steps; negative: it is none."""
+    """Number of the step among the steps under test; negative if it is no step."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -319,22 +366,27 @@ class _WanderProblem:
     recording: ReducedRecording
     rows: Rows
     """
-    Means ``[structural | smooth | residual]`` without a bias process but the known ones, with the
-    products of what is known of the parameters otherwise.
+    Means of the windows ``[structural | smooth | residual]``, with the known bias processes only.
+
+    Their products are the information on the parameters that is not from means.
     """
     n_structural: int
-    """Columns that every model has."""
+    """Number of columns that every model has."""
     options: Sequence[Sequence[int]]
-    """Numbers of the parameters of each smooth effect."""
+    """Parameters of each smooth effect, counted after the structural ones."""
     prior_sd: np.ndarray
-    """Prior sd of these parameters."""
+    """Prior sd of the parameters of all smooth effects, shape (n_smooth,)."""
     natural: float
     """Standard deviation of the bias processes that are known, SI."""
     stable: float
     """Bias variation of a stable sensor, SI."""
 
     def choice(self, courses: Sequence[np.ndarray], steps: Sequence[np.ndarray] = ()) -> _Choice:
-        """Return the best of the smooth effects, of courses in time and of steps, or none."""
+        """
+        Return the best model: with one of the smooth effects, courses in time and steps, or none.
+
+        Courses and steps are values in each window, shape (k,), times a bias of each axis.
+        """
         # Columns of the courses and steps on each axis, and their priors.
         added = _columns_of_biases([*courses, *steps], len(self.rows))
         usual = max(self.natural, self.stable)
@@ -364,7 +416,7 @@ class _WanderProblem:
 
 
 def _best_course(wander: _WanderProblem) -> _Choice:
-    """Return the best model beside a bias process: a step is sought coarsely, then closely."""
+    """Return the best model of the wander; a step is sought coarsely, then near the best moment."""
     recording = wander.recording
     if np.ptp(recording.session) > 0:  # between two recordings each bias may change
         return wander.choice([])
@@ -372,14 +424,13 @@ def _best_course(wander: _WanderProblem) -> _Choice:
     temperature = recording.describe['temperature']
     courses = [course.values for course in temperature_courses(recording.time, temperature)]
     places = step_places(np.arange(count), MOST_MOMENTS)
-    found = wander.choice(courses, _steps(places, count))
-    if found.moment >= 0 and len(places) == MOST_MOMENTS:
-        # the windows between the neighbours of the best moment
-        first = places[max(found.moment - 1, 0)]
-        last = places[min(found.moment + 1, len(places) - 1)]
+    choice = wander.choice(courses, _steps(places, count))
+    if choice.moment >= 0 and len(places) == MOST_MOMENTS:
+        first = places[max(choice.moment - 1, 0)]
+        last = places[min(choice.moment + 1, len(places) - 1)]
         places = step_places(np.arange(first, last + 1), MOST_MOMENTS, least=0)
-        found = wander.choice(courses, _steps(places, count))
-    return found
+        choice = wander.choice(courses, _steps(places, count))
+    return choice
 
 
 def _steps(places: np.ndarray, count: int) -> list[np.ndarray]:
@@ -397,7 +448,11 @@ def _columns_of_biases(courses: Sequence[np.ndarray], count: int) -> np.ndarray:
 
 
 def _with_priors(information: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Return the information with further parameters before the column of the residual."""
+    """
+    Return a normal matrix extended by parameters of which only the prior sd is known.
+
+    They are inserted before the residual, which is the last row and column.
+    """
     count = len(information) - 1 + len(sd)
     extended = np.zeros((count + 1, count + 1))
     kept = np.append(np.arange(len(information) - 1), count)
@@ -435,32 +490,40 @@ def _needed_smooth(
     prices: np.ndarray | float = 0.0,
 ) -> Sequence[int]:
     """
-    Return the parameters of the smooth effect that beats the bias process.
+    Return the parameters of the option with the least loss; none if the bias process alone is best.
 
-    Each one is judged with the noise estimated jointly, and has a further price.
+    The loss of an option is that of the likeliest noise with its parameters, plus the logarithm of
+    its prior, `STRONG` and its price.
 
     By restricted likelihood, all parameters integrated out under their priors: at its maximum over
     as many as there are windows the wander is underestimated, and noise of 15 s resembles a drift.
+
+    Parameters
+    ----------
+    search : BiasProcessSearch
+    options : sequence of sequences of int
+        Parameters of each smooth effect, course or step.
+    prior_sd : array
+        Of all these parameters.
+    prices : array, shape (n_options,) or float
+        Twice the negative log prior probability of each option.
+
     """
     losses = [search.best([])[1]]
     for option, price in zip(options, np.broadcast_to(prices, len(options)), strict=True):
-        occam = 2 * np.log(prior_sd[option]).sum()
-        losses.append(search.best(option)[1] + occam + STRONG + price)
+        of_prior = 2 * np.log(prior_sd[option]).sum()
+        losses.append(search.best(option)[1] + of_prior + STRONG + price)
     return [[], *options][int(np.argmin(losses))]
 
 
-def _known_otherwise(
-    space: ParameterSpace, sensor: str, noise: dict[str, NoiseModel], own: np.ndarray
+def _information_without_means(
+    space: ParameterSpace, sensor: str, noise: dict[str, NoiseModel], parameters: np.ndarray
 ) -> np.ndarray:
-    """
-    Return the information on the parameters `own` (normal matrix).
-
-    It includes the information from priors and from within windows.
-    """
-    at = np.append(own, space.size)
-    information = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
-    prior = 1 / space.prior_sd[own] ** 2
-    information[:-1, :-1] += np.diag(prior)
-    information[:-1, -1] += space.prior_mean[own] * prior
-    information[-1, :-1] = information[:-1, -1]
-    return information
+    """Return the normal matrix of parameters by their priors and the samples within windows."""
+    at = np.append(parameters, space.size)
+    normal = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
+    prior = 1 / space.prior_sd[parameters] ** 2
+    normal[:-1, :-1] += np.diag(prior)
+    normal[:-1, -1] += space.prior_mean[parameters] * prior
+    normal[-1, :-1] = normal[:-1, -1]
+    return normal
