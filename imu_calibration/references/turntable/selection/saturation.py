@@ -1,6 +1,6 @@
 """Saturation: a limit that outputs pile up at, and the samples that it spoils."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,8 @@ tenth for each sample.
 """
 MIN_LEFT_SAMPLES = 20
 """A window with fewer samples left is dropped."""
+SAME_LEVEL = 1 - 1e-12
+"""Share of the largest output from which an output equals it but for rounding."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +69,19 @@ class Saturation:
 def predictions(
     windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
 ) -> list[dict[str, np.ndarray]]:
-    """Return of each window sensor -> output that the model predicts, shape (n or 1, 3)."""
+    """
+    Return the outputs that the model predicts in each window, as sensor -> array of shape (n, 3).
+
+    Of a window with one sample of motion (at rest) the shape is (1, 3).
+    """
+    if not windows:
+        return []
     references = references_of(windows, model, table)
-    edges = np.cumsum([len(window.motion) for window in windows])[:-1]
+    first_samples = np.cumsum([len(window.motion) for window in windows])[:-1]
     predicted: list[dict[str, np.ndarray]] = [{} for _ in windows]
-    for sensor in sensors_of(windows) if windows else ():
+    for sensor in sensors_of(windows):
         output = columns(references, sensor) @ coefficients(model, sensor, values)
-        for of_window, part in zip(predicted, np.split(output, edges)):
+        for of_window, part in zip(predicted, np.split(output, first_samples)):
             of_window[sensor] = part
     return predicted
 
@@ -85,57 +93,59 @@ def measured(window: Window, sensor: str) -> np.ndarray:
 
 def sample_sd_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
     """
-    Return the sd of samples in static windows, shape (3,).
+    Return the median over static windows of the sd of their samples, shape (3,).
 
-    It is at least that of rounding, and without any static windows it is the sd of second
-    differences.
+    It is at least that of rounding. Without static windows it is the sd of second differences,
+    ``x_k - 2 x_(k+1) + x_(k+2)``, over sqrt(6).
     """
-    rest = [w for w in windows if w.kind == 'static' and len(w.time) > 8]
-    if rest:
-        rounding = np.sqrt(
-            rounding_variance(np.concatenate([measured(w, sensor) for w in windows]))
-        )
-        return np.maximum(
-            np.median([measured(w, sensor).std(axis=0) for w in rest], axis=0), rounding
-        )
-    return np.median(
-        [
-            np.diff(measured(w, sensor), 2, axis=0).std(axis=0) / np.sqrt(6)
-            for w in windows
-            if len(w.time) > 8
-        ],
-        axis=0,
-    )
+    long_enough = [window for window in windows if len(window.time) > 8]
+    at_rest = [window for window in long_enough if window.kind == 'static']
+    if at_rest:
+        readings = np.concatenate([measured(window, sensor) for window in windows])
+        rounding = np.sqrt(rounding_variance(readings))
+        sds = [measured(window, sensor).std(axis=0) for window in at_rest]
+        return np.maximum(np.median(sds, axis=0), rounding)
+    sds = []
+    for window in long_enough:
+        differences = np.diff(measured(window, sensor), 2, axis=0)
+        sds.append(differences.std(axis=0) / np.sqrt(6))
+    return np.median(sds, axis=0)
 
 
 def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> np.ndarray:
-    """Return the parameters of a model by least squares on thinned samples, all weighted alike."""
-    values = np.where(np.isfinite(model.start()), model.start(), 0.0)
+    """
+    Return the parameters of a model by one least-squares step from its start, shape (n_params,).
+
+    On thinned samples of moving windows and on the means of static ones, all with the weight of one
+    sample at rest.
+    """
+    start = np.where(np.isfinite(model.start()), model.start(), 0.0)
     prior, sd = model.prior()
-    picked = [_thinned(window) for window in windows]
-    normal = np.zeros((len(values) + 1,) * 2)
-    references = references_of(picked, model, table)
+    thinned = [_thinned(window) for window in windows]
+    normal = np.zeros((len(start) + 1,) * 2)
+    references = references_of(thinned, model, table)
     for sensor in sensors_of(windows):
         design = columns(references, sensor)
-        outputs = [measured(w, sensor) for w in picked]
-        output = np.concatenate(
-            [
-                o.mean(axis=0, keepdims=True) if w.kind == 'static' else o
-                for w, o in zip(picked, outputs)
-            ]
-        )
-        base = coefficients(model, sensor, values)
-        slope = coefficient_jacobian(model, sensor, values)
+        outputs = []
+        for window in thinned:
+            output_of_window = measured(window, sensor)
+            if window.kind == 'static':
+                output_of_window = output_of_window.mean(axis=0, keepdims=True)
+            outputs.append(output_of_window)
+        output = np.concatenate(outputs)
+        base = coefficients(model, sensor, start)
+        slope = coefficient_jacobian(model, sensor, start)
         weight = 1 / sample_sd_at_rest(windows, sensor) ** 2
         for axis in range(3):
-            rows = np.column_stack(
-                [design @ slope[:, axis], output[:, axis] - design @ base[:, axis]]
-            )
+            residual = output[:, axis] - design @ base[:, axis]
+            rows = np.column_stack([design @ slope[:, axis], residual])
             normal += weight[axis] * rows.T @ rows
-    return values + solve_normal(normal, np.arange(len(values)), sd, prior_mean=prior - values)[0]
+    step, _ = solve_normal(normal, np.arange(len(start)), sd, prior_mean=prior - start)
+    return start + step
 
 
 def _thinned(window: Window, most: int = 50) -> Window:
+    """Return a moving window with every n-th sample only, so that about `most` remain."""
     if window.kind == 'static' or len(window.time) <= most:
         return window
     return window.select(slice(None, None, len(window.time) // most))
@@ -143,25 +153,29 @@ def _thinned(window: Window, most: int = 50) -> Window:
 
 def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     """
-    Return whether several samples share the largest output exactly.
+    Return whether clearly more samples have the largest output than any of the next smaller values.
 
-    They must be more than share any of the next smaller outputs.
+    That is more than three times as many as of the five values below it.
     """
     size = np.concatenate([np.abs(measured(w, sensor)).ravel() for w in windows])
     level = size.max(initial=0.0)
-    at = int((size >= level * (1 - 1e-12)).sum())
-    if at < MIN_CLIPPED_SAMPLES or level == 0:
+    is_largest = size >= level * SAME_LEVEL
+    n_largest = int(is_largest.sum())
+    if n_largest < MIN_CLIPPED_SAMPLES or level == 0:
         return False
     # A coarse output repeats all its values, most of all the step at gravity; the values just below
     # the largest show how often.
-    _, repeats = np.unique(
-        size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)], return_counts=True
-    )
-    return bool(at > 3 * repeats[-5:].max(initial=1))
+    below = size[(size < level * SAME_LEVEL) & (size > 0.9 * level)]
+    _, repeats = np.unique(below, return_counts=True)
+    return bool(n_largest > 3 * repeats[-5:].max(initial=1))
 
 
 def find_saturation(
-    windows: Sequence[Window], predicted: list, noise_sd: np.ndarray, *, sensor: str
+    windows: Sequence[Window],
+    predicted: Sequence[Mapping[str, np.ndarray]],
+    noise_sd: np.ndarray,
+    *,
+    sensor: str,
 ) -> Saturation | None:
     """
     Return the `Saturation` of a sensor, or None.
@@ -169,39 +183,58 @@ def find_saturation(
     Parameters
     ----------
     windows : sequence of Window
-    predicted : list of dict
-        Sensor -> prediction of a model without limit (`predictions`).
+    predicted : sequence of dict
+        Sensor -> prediction of a model without limit, of each window (`predictions`).
     noise_sd : array, shape (3,)
         Standard deviation of single samples.
+    sensor : str
 
     """
     if not may_be_clipped(windows, sensor):
         return None
-    output = np.concatenate([measured(w, sensor) for w in windows])
-    expected = np.concatenate(
-        [np.broadcast_to(p[sensor], measured(w, sensor).shape) for w, p in zip(windows, predicted)]
-    )
+    output = np.concatenate([measured(window, sensor) for window in windows])
+    expected_of_windows = []
+    for window, of_sensors in zip(windows, predicted):
+        shape = measured(window, sensor).shape
+        expected_of_windows.append(np.broadcast_to(of_sensors[sensor], shape))
+    expected = np.concatenate(expected_of_windows)
     level = np.abs(output).max()
-    clipped = np.abs(output) >= level * (1 - 1e-12)
-    beyond = norm_sf((level - np.abs(expected)) / noise_sd)
-    n_expected = float(beyond.sum())
-    if (
-        n_expected < MIN_CLIPPED_SAMPLES
-        or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected
-    ):
+    clipped = np.abs(output) >= level * SAME_LEVEL
+
+    # Probability p of each sample to exceed the level by the model and its noise. If noise decides
+    # which samples are clipped, each with the probability p, the mean of p over clipped samples is
+    # sum p^2 / sum p.
+    p_beyond = norm_sf((level - np.abs(expected)) / noise_sd)
+    n_expected = float(p_beyond.sum())
+    if n_expected < MIN_CLIPPED_SAMPLES:
         return None
-    far = np.abs(expected) > level
-    before = output - expected
-    after = output - np.clip(expected, -level, level)
-    rms = [float(np.sqrt(np.mean(e[far] ** 2))) if far.any() else 0.0 for e in (before, after)]
+    needed = AGREEMENT * clipped.sum() * (p_beyond**2).sum() / n_expected
+    if p_beyond[clipped].sum() < needed:
+        return None
+
+    # Residual with and without the limit in the model, where the model exceeds the limit.
+    exceeds = np.abs(expected) > level
+    rms_before = 0.0
+    rms_after = 0.0
+    if exceeds.any():
+        before = output - expected
+        after = output - np.clip(expected, -level, level)
+        rms_before = float(np.sqrt(np.mean(before[exceeds] ** 2)))
+        rms_after = float(np.sqrt(np.mean(after[exceeds] ** 2)))
     return Saturation(
-        sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms
+        sensor=sensor,
+        level=float(level),
+        level_sd=float(1e-4 * level),
+        n_clipped=int(clipped.any(axis=1).sum()),
+        n_expected=n_expected,
+        rms_before=rms_before,
+        rms_after=rms_after,
     )
 
 
 def without_clipped(
     windows: Sequence[Window],
-    predicted: list,
+    predicted: Sequence[Mapping[str, np.ndarray]],
     levels: dict[str, float],
     *,
     noise_sd: dict[str, np.ndarray],
@@ -213,10 +246,13 @@ def without_clipped(
 
     Parameters
     ----------
+    windows : sequence of Window
+    predicted : sequence of dict
+        Sensor -> prediction of a model without limit, of each window (`predictions`).
     levels : dict
-        Sensor -> level.
+        Sensor -> largest output.
     noise_sd : dict
-        Sensor -> (3,).
+        Sensor -> standard deviation of single samples, shape (3,).
 
     """
     kept = []
@@ -224,8 +260,8 @@ def without_clipped(
         good = np.ones(len(window.time), bool)
         for sensor, level in levels.items():
             near = np.abs(of_sensors[sensor]) > level - CLIP_MARGIN_SDS * noise_sd[sensor]
-            at = np.abs(measured(window, sensor)) >= level * (1 - 1e-12)
-            good &= ~(near | at).any(axis=1)
+            clipped = np.abs(measured(window, sensor)) >= level * SAME_LEVEL
+            good &= ~(near | clipped).any(axis=1)
         if good.all():
             kept.append(window)
         elif window.kind != 'static' and good.sum() >= MIN_LEFT_SAMPLES:
@@ -242,12 +278,11 @@ def without_clipping(
     windows: list[Window], table: Table, model: SensorModel
 ) -> tuple[list[Window], np.ndarray, list[Saturation]]:
     """
-    Return (windows without corrupted samples, mask of the locked ones, limits).
+    Return (windows without samples that a limit spoils, mask of the locked ones, limits).
 
-    Corrupted samples are corrupted by a limit, and the limits are estimated from all other windows.
-
-    One fast swing may be all that reaches a limit: a window in which outputs pile up is not locked,
-    where they do so at a limit.
+    The limits are estimated from the windows that are not locked. One fast swing may be all that
+    reaches a limit: a window with the largest output of a sensor is therefore not locked, if that
+    output is a limit.
     """
     locked = locked_windows(np.array([window.kind for window in windows]))
     piled = _piled(windows)
@@ -271,22 +306,23 @@ def without_clipping(
 
 
 def _piled(windows: Sequence[Window]) -> np.ndarray:
-    """Return which windows hold the largest output of a sensor, where several samples share it."""
-    found = np.zeros(len(windows), bool)
+    """Return a mask of the windows with the largest output of a sensor that may be clipped."""
+    piled = np.zeros(len(windows), bool)
     for sensor in sensors_of(windows):
         if may_be_clipped(windows, sensor):
             largest = np.array([np.abs(measured(window, sensor)).max() for window in windows])
-            found |= largest >= largest.max() * (1 - 1e-12)
-    return found
+            piled |= largest >= largest.max() * SAME_LEVEL
+    return piled
 
 
 def _limits(
     windows: Sequence[Window], table: Table, model: SensorModel
 ) -> tuple[list[Saturation], dict[str, np.ndarray], np.ndarray | None]:
     """
-    Return (limits found, standard deviation of single samples by sensor, parameters).
+    Return (limits found, sensor -> sd of single samples, parameters by `simple_fit`).
 
-    The parameters are from a simple fit without corrupted samples.
+    The fit is without spoiled samples; None where no output may be clipped, or no limit can be
+    determined.
     """
     suspects = [sensor for sensor in sensors_of(windows) if may_be_clipped(windows, sensor)]
     if not suspects:
