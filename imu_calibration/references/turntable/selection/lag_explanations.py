@@ -1,14 +1,13 @@
 """
-One explanation of the lags of both sensors.
-
-As simple and as common to both as the recording allows.
+One explanation of the lags of both sensors: the simplest that the recording allows.
 
 A late clock, a delay of one sensor and its filters have the same first derivative, so a search
-meets them in any order, and halves of one recording may name one lag differently. Here every
-description of a sensor's lag is linearised at its own estimate, both sensors' costs are summed, and
-of all explanations within the search's price of the best the simplest is selected: fewest effects
-first, then a common clock before separate lags, then a delay before a filter. All other ones are
-its rivals.
+meets them in any order, and halves of one recording may name one lag differently. Here each kind
+of lag (`LAG_KINDS`) of both sensors is linearised at its own estimate. An explanation is a
+kind for each sensor, or a common clock with the remaining lags; its cost is the sum over the
+sensors. Of all explanations within the search's price of the best the simplest is selected: fewest
+effects first, then a common clock before separate lags, then a delay before a filter. All other
+ones are its rivals.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,33 +50,35 @@ DELAY_LINEARISATIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class LagHypothesis:
-    """One description of both sensors' lags at once, linearised where it is."""
+    """Lags of one kind of both sensors, linearised at their estimates."""
 
     kind: tuple[str, ...]
+    """One of `LAG_KINDS`."""
     problem: LinearisedProblem
+    """Problem with the columns of these lags."""
     chosen: list[Question]
     """The lags of both sensors, then the other chosen effects."""
 
     @property
     def values(self) -> dict[str, float]:
         """Parameter of the baseline, of the lags and of clocks that change -> value."""
-        wanted = set(self.problem.baseline.param_names)
+        names = set(self.problem.baseline.param_names)
         for question in self.chosen:
             if question.name in FAMILY | CLOCKS:
-                wanted.update(question.effect.param_names())
-        found = {}
+                names.update(question.effect.param_names())
+        values = {}
         for name, value in zip(self.problem.space.names, self.problem.values(self.chosen)):
-            if name in wanted:
-                found[name] = value
-        return found
+            if name in names:
+                values[name] = value
+        return values
 
     def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the lags of one sensor, in the order of the kind."""
         used = self.problem.search.indices(self.chosen)
         values, covariance = self.problem.evidence.fit(used)
         parameter = {question.name: question.parameters[0] for question in self.chosen}
-        at = [used.index(parameter[lag_name(sensor, ending)]) for ending in self.kind]
-        return values[at], covariance[np.ix_(at, at)]
+        places = [used.index(parameter[lag_name(sensor, ending)]) for ending in self.kind]
+        return values[places], covariance[np.ix_(places, places)]
 
     def without(self, sensor: str) -> list[Question]:
         """Return the choice without the lags of one sensor."""
@@ -86,25 +87,27 @@ class LagHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Which effects make both lags."""
+    """Effects that cause the lags of both sensors, with their values."""
 
     lags: dict[str, float]
-    """Effect -> value, s."""
+    """Effect (lag of a sensor, or the clock) -> value, s."""
     cost: float
     """Held-out cost, nats, penalties included."""
     values: dict[str, float] = field(default_factory=dict)
     """Parameter of the baseline and of clocks that change -> value."""
 
     @property
-    def rank(self) -> tuple:
-        """Sort key of simplicity."""
-        kinds = [name.rpartition('_')[2] for name in self.lags]
-        return (
-            len(self.lags),
-            CLOCK not in self.lags,
-            sum(map(('delay', 'offset', 'bandwidth', 'filter').index, kinds)),
-            self.cost,
-        )
+    def rank(self) -> tuple[int, bool, int, float]:
+        """
+        Sort key, the simplest explanation first.
+
+        Number of effects, no common clock, complexity of the kinds of lag, cost.
+        """
+        complexity = 0
+        for name in self.lags:
+            ending = name.rpartition('_')[2]
+            complexity += ('delay', 'offset', 'bandwidth', 'filter').index(ending)
+        return len(self.lags), CLOCK not in self.lags, complexity, self.cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +117,9 @@ class LagExplanations:
     problem: LinearisedProblem
     """Linearised where no lag acts."""
     explanations: Sequence[Explanation]
+    """Each costs less than no lag."""
     rest: Sequence[Question]
-    """The other chosen effects."""
+    """Chosen effects that are no lags."""
     silent: float | None
     """Held-out cost without any lag, nats, without rests; None where rests determine the noise."""
 
@@ -123,52 +127,52 @@ class LagExplanations:
         self, most: int | None = None, refused: Sequence[Explanation] = ()
     ) -> list[Explanation]:
         """
-        Return the explanations with at most so many effects.
+        Return the explanations with at most `most` effects, without the refused ones.
 
-        Without given ones and without those of the same columns and cost.
+        Explanations with the same columns as a refused one have its cost, and are refused too.
         """
-        costs = {each.cost for each in refused}
-        found = []
-        for each in self.explanations:
-            few_enough = most is None or len(each.lags) <= most
-            if few_enough and each.cost not in costs:
-                found.append(each)
-        return found
+        refused_costs = {explanation.cost for explanation in refused}
+        others = []
+        for explanation in self.explanations:
+            few_enough = most is None or len(explanation.lags) <= most
+            if few_enough and explanation.cost not in refused_costs:
+                others.append(explanation)
+        return others
 
     def select(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
-        """Return the simplest explanation of `others`."""
+        """Return the simplest explanation with at most `most` effects that is not refused."""
         return simplest(self.others(most, refused), self.silent)
 
     def settled(
         self, selected: Explanation, searched: SearchedWindows
     ) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
         """
-        Return (the LinearisedProblem at an explanation, the choice with it, alternatives).
+        Return (problem linearised at an explanation, its choice of effects, rivals of its lags).
 
-        The alternatives to the choice's members fit nearly as well.
+        The choice has the lags of the explanation first, then the other chosen effects.
         """
         # Linearise at the lags of the explanation.
         parameter = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
         values = dict(selected.values)
         for name, lag in selected.lags.items():
             values[parameter[name]] = lag
-        there = searched.linearised(
+        settled = searched.linearised(
             point=point_with(self.problem.baseline, self.problem.effects, values)
         )
 
-        # Its effects, the other chosen effects, and what fits nearly as well.
-        asked = _questions_by_name(there)
-        lags = [asked[name] for name in selected.lags]
+        questions = _questions_by_name(settled)
+        lags = [questions[name] for name in selected.lags]
+        chosen = [*lags, *same_questions(settled, self.rest)]
         near = [each for each in self.explanations if each.cost < selected.cost + TIE]
-        return there, [*lags, *same_questions(there, self.rest)], _rivals(there, selected, near)
+        return settled, chosen, _rivals(settled, selected, near)
 
 
 def _questions_by_name(problem: LinearisedProblem) -> dict[str, Question]:
-    """Return effect -> its first question."""
-    found: dict[str, Question] = {}
+    """Return effect -> its first question (of a warm-up that of the first time constant)."""
+    first: dict[str, Question] = {}
     for question in problem.questions:
-        found.setdefault(question.name, question)
-    return found
+        first.setdefault(question.name, question)
+    return first
 
 
 def lag_explanations(
@@ -250,7 +254,20 @@ def _described(
     rest: Sequence[Question],
     clocks: dict[str, float] | None,
 ) -> list[LagHypothesis]:
-    """Return the description of each kind; only the first if no curvature is observable."""
+    """
+    Return the hypothesis of each kind of lag; only that of delays if no curvature is observable.
+
+    Parameters
+    ----------
+    searched : SearchedWindows
+    effects : dict
+        Name -> candidate effect.
+    rest : sequence of Question
+        Chosen effects that are no lags.
+    clocks : dict, optional
+        Parameter of a clock that changes -> value for the first linearisation.
+
+    """
     # Delays only, at zero; without an observable curvature all kinds have the same columns.
     first = _hypothesis(searched, DELAY, clocks, effects=effects, rest=rest)
     curvatures = []
@@ -267,13 +284,13 @@ def _described(
         values = dict(first.values)
         for sensor in SENSORS:
             delay = first.lags(sensor)[0][0]
-            own = [delay]
+            lags = [delay]
             if len(kind) == 2:
                 low_pass = FIRST_SHARE * abs(delay)
-                own = [delay - low_pass, low_pass]
-            for ending, value in zip(kind, own, strict=True):
-                values[effects[lag_name(sensor, ending)].param_names()[0]] = value
-        # A delay beside a low-pass is linearised at its own estimate.
+                lags = [delay - low_pass, low_pass]
+            for ending, lag in zip(kind, lags, strict=True):
+                values[effects[lag_name(sensor, ending)].param_names()[0]] = lag
+        # A delay with a low-pass is linearised at its own estimate.
         for _ in range(DELAY_LINEARISATIONS if len(kind) > 1 else 1):
             hypothesis = _hypothesis(searched, kind, values, effects=effects, rest=rest)
             values = hypothesis.values
@@ -305,30 +322,39 @@ def _explanations(
     described: Sequence[LagHypothesis], judges: Sequence[LinearisedProblem], names: Sequence[str]
 ) -> list[Explanation]:
     """
-    Return every Explanation that the descriptions of each sensor make together.
+    Return every Explanation of a lag of each sensor that costs less than no lag.
 
-    Only an Explanation that is better than none is returned.
+    Parameters
+    ----------
+    described : sequence of LagHypothesis
+    judges : sequence of LinearisedProblem
+        Problems whose noise judges the costs.
+    names : sequence of str
+        Parameters of the baseline and of clocks that change.
+
     """
     # Each sensor without a lag, and with one of each kind.
     options = []
     cost_without = 0.0
     for sensor in SENSORS:
-        none = _none(described[0], judges, sensor)
-        cost_without += none.cost
-        own = [none, *(_option(each, judges, sensor) for each in described)]
+        no_lag = _without_lag(described[0], judges, sensor)
+        cost_without += no_lag.cost
+        of_sensor = [no_lag]
+        for hypothesis in described:
+            of_sensor.append(_option(hypothesis, judges, sensor))
         if len(described) == 1:
             # Without curvature the kinds are one column.
             for ending in ('bandwidth', 'filter'):
-                own.append(replace(own[1], kind=(ending,), alike=True))
-        options.append(own)
+                of_sensor.append(replace(of_sensor[1], kind=(ending,), alike=True))
+        options.append(of_sensor)
 
-    found = []
+    explanations = []
     for one, two in product(*options):
         if one.kind or two.kind:
-            for each in _described_together(one, two, names):
-                if each.cost < cost_without:
-                    found.append(each)
-    return found
+            for explanation in _described_together(one, two, names):
+                if explanation.cost < cost_without:
+                    explanations.append(explanation)
+    return explanations
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,34 +362,43 @@ class _Option:
     """One sensor with a lag of one kind, or with none."""
 
     sensor: str
+    """'accelerometer' or 'gyroscope'."""
     kind: tuple[str, ...]
+    """Endings of the names of its lags, one of `LAG_KINDS`; none without a lag."""
     cost: float
+    """Held-out cost of the windows of this sensor, nats, penalties included."""
     lags: np.ndarray
+    """Estimates of the lags in the order of `kind`, s, shape (n,)."""
     covariance: np.ndarray
+    """Their covariance, shape (n, n)."""
     values: dict[str, float]
+    """Parameter of the baseline and of clocks that change -> value."""
     alike: bool = False
     """Whether its columns equal those of a delay."""
 
-    def own(self, lags: Sequence[float] | np.ndarray) -> dict[str, float]:
-        return {
-            lag_name(self.sensor, ending): float(value) for ending, value in zip(self.kind, lags)
-        }
+    def named(self, lags: Sequence[float] | np.ndarray) -> dict[str, float]:
+        """Return effect -> lag, for values in the order of `kind`."""
+        return {lag_name(self.sensor, ending): float(lag) for ending, lag in zip(self.kind, lags)}
 
     def with_delay(self, delay: float) -> np.ndarray:
-        """Return the lags with the first one given, the remaining ones shifted accordingly."""
+        """Return the lags of least squares with the first one fixed at `delay`, shape (n,)."""
         return self.lags + self.covariance[:, 0] / self.covariance[0, 0] * (delay - self.lags[0])
 
 
 def _option(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str) -> _Option:
+    """Return one sensor with the lag of a hypothesis."""
     cost = _cost(hypothesis, hypothesis.chosen, judges, sensor) + PENALTY * len(hypothesis.kind)
     lags, covariance = hypothesis.lags(sensor)
     return _Option(sensor, hypothesis.kind, cost, lags, covariance, hypothesis.values)
 
 
-def _none(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str) -> _Option:
-    left = hypothesis.without(sensor)
-    values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(left)))
-    cost = _cost(hypothesis, left, judges, sensor)
+def _without_lag(
+    hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str
+) -> _Option:
+    """Return one sensor without a lag, fitted with the columns of a hypothesis."""
+    chosen = hypothesis.without(sensor)
+    values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(chosen)))
+    cost = _cost(hypothesis, chosen, judges, sensor)
     return _Option(sensor, (), cost, np.zeros(0), np.zeros((0, 0)), values)
 
 
@@ -374,9 +409,9 @@ def _cost(
     sensor: str,
 ) -> float:
     """
-    Return the held-out cost of one sensor's windows, nats.
+    Return the held-out cost of the windows of one sensor for a choice of effects, nats.
 
-    It is judged with the noise and the band of each linearisation in turn.
+    It is the mean over the noise and the band of each of the `judges`.
     """
     used = hypothesis.problem.search.indices(chosen)
     losses = []
@@ -398,26 +433,28 @@ def _described_together(one: _Option, two: _Option, names: Sequence[str]) -> Ite
     cost = one.cost + two.cost
 
     # Separate lags.
-    own = one.own(one.lags) | two.own(two.lags)
-    if all(value > 0 for value in own.values()):
-        yield Explanation(own, cost, values)
+    separate = one.named(one.lags) | two.named(two.lags)
+    if all(lag > 0 for lag in separate.values()):
+        yield Explanation(separate, cost, values)
     if not (one.kind and two.kind):
         return
 
-    # A common clock with the smaller lag, and the rest of the larger one.
-    apart = float(one.lags[0] - two.lags[0])
-    late, clock = (one, two) if apart > 0 else (two, one)
-    if clock.kind == DELAY and (late.kind == DELAY or late.alike):
-        yield Explanation({CLOCK: float(clock.lags[0])} | late.own([abs(apart)]), cost, values)
+    # A common clock with the smaller lag, and the difference as lag of the later sensor. The fit is
+    # that of separate lags.
+    difference = float(one.lags[0] - two.lags[0])
+    later, earlier = (one, two) if difference > 0 else (two, one)
+    if earlier.kind == DELAY and (later.kind == DELAY or later.alike):
+        clock = {CLOCK: float(earlier.lags[0])}
+        yield Explanation(clock | later.named([abs(difference)]), cost, values)
 
     # A common clock in place of both delays: a parameter less, for the misfit of their difference.
     if one.kind[0] == two.kind[0] == 'delay':
         variances = np.array([one.covariance[0, 0], two.covariance[0, 0]])
         shared = float(np.average([one.lags[0], two.lags[0]], weights=1 / variances))
-        remaining = one.own(one.with_delay(shared)) | two.own(two.with_delay(shared))
+        remaining = one.named(one.with_delay(shared)) | two.named(two.with_delay(shared))
         remaining = {name: lag for name, lag in remaining.items() if not name.endswith('delay')}
-        if all(value > 0 for value in remaining.values()):
-            misfit = 0.5 * apart**2 / float(variances.sum())
+        if all(lag > 0 for lag in remaining.values()):
+            misfit = 0.5 * difference**2 / float(variances.sum())
             yield Explanation({CLOCK: shared} | remaining, cost - PENALTY + misfit, values)
 
 
@@ -425,9 +462,16 @@ def _rivals(
     settled: LinearisedProblem, selected: Explanation, near: Sequence[Explanation]
 ) -> list[Rival]:
     """
-    Return the alternatives to a member of an explanation that fit nearly as well.
+    Return the lags of other explanations as rivals of the selected explanation's lags.
 
-    Members of explanations with no more effects.
+    Parameters
+    ----------
+    settled : LinearisedProblem
+        Linearised at the selected explanation.
+    selected : Explanation
+    near : sequence of Explanation
+        Explanations of nearly the same cost; those with more effects do not count.
+
     """
     question_of = {question.name: question for question in settled.questions}
     rivals: dict[str, Rival] = {}
@@ -441,7 +485,7 @@ def _rivals(
             if name in rivals:
                 continue
 
-            # It replaces a lag of its own sensor; otherwise that of the clock, or the first one.
+            # It replaces a lag of the same sensor, otherwise the clock or the first removed lag.
             replaced = CLOCK if CLOCK in removed else removed[0]
             for lag in removed:
                 if question_of[lag].sensor == question_of[name].sensor:

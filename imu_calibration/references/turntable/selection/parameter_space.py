@@ -19,23 +19,23 @@ from imu_calibration.selection.questions import Question
 @dataclass(frozen=True, eq=False)
 class ParameterSpace:
     """
-    A reduced recording in the parameters under test.
+    A reduced recording in the q parameters under test.
 
     The parameters of the extended model are first, then the amplitudes of the banks of time
-    constants, per sensor. Rows are ``[design | residual]`` of one axis; all their columns act on
-    that axis.
+    constants, per sensor. Rows are ``[design | residual]`` of one axis; their q_a columns are those
+    of the parameters that act on the axis.
     """
 
     recording: ReducedRecording
-    """The recording."""
+    """Windows, their p columns per sensor, and the point of linearisation."""
     names: tuple[str, ...]
     """Parameter names."""
     prior_sd: np.ndarray
     """Prior standard deviations, shape (q,)."""
     prior_mean: np.ndarray
-    """Prior minus the values of the linearisation, shape (q,)."""
+    """Prior values; of the baseline minus the values of the linearisation, shape (q,)."""
     index: dict[str, list[np.ndarray]]
-    """Sensor -> the parameters that act on each axis."""
+    """Sensor -> the parameters that act on each axis, each of shape (q_a,)."""
     join: dict[str, list[np.ndarray]]
     """
     Sensor -> per axis the matrix that turns ``[columns | residual]`` of three axes into ``[design |
@@ -110,66 +110,71 @@ class ParameterSpace:
 
         Shape (m, q_a + 1, q_a + 1).
         """
-        missing = self._missing(sensor, axis)
+        replacement = self._replacement_of_fast(sensor, axis)
         join = self.join_within[sensor][axis]
-        for some, factors in self.recording.factors_of(sensor, self._compared(sensor, axis), rows):
-            found = join.T @ (factors.transpose(0, 2, 1) @ factors @ join)
-            found[:, -1, -1] += missing[some]
-            yield found
+        compared = self._compared(sensor, axis)
+        for indices, factors in self.recording.factors_of(sensor, compared, rows):
+            products = join.T @ (factors.transpose(0, 2, 1) @ factors @ join)
+            products[:, -1, -1] += replacement[indices]
+            yield products
 
     def within_sum(
         self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None
     ) -> np.ndarray:
         """
-        Return the sum of `within_each`, shape (q_a + 1, q_a + 1).
+        Return the products of the centred rows of the windows `rows` (mask), summed.
 
-        `part` 'within' or 'slow'; default: the part that is compared on this axis.
+        Shape (q_a + 1, q_a + 1). `part`: 'within' or 'slow'; by default the part that is compared
+        on this axis, with the replacement of the fast part.
         """
         join = self.join_within[sensor][axis]
         products = self.recording.product_sum(sensor, part or self._compared(sensor, axis), rows)
-        found = join.T @ products @ join
+        total = join.T @ products @ join
         if part is None:
-            found[-1, -1] += self._missing(sensor, axis)[rows].sum()
-        return found
+            total[-1, -1] += self._replacement_of_fast(sensor, axis)[rows].sum()
+        return total
 
     def slopes_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
         """
-        Return the products of the centred rows of each window with themselves.
+        Return ``B'B w`` of the centred rows B = ``[design | residual]`` of each window.
 
-        They are multiplied by `weights` (q_a + 1,), and the shape is (k, q_a + 1).
+        With the `weights` w of the residual (`weights_of`), shape (q_a + 1,), it is half of the
+        slope of the sum of squares ``w'B'B w``, shape (k, q_a + 1).
         """
         recording = self.recording
         join = self.join_within[sensor][axis]
-        weighed = join @ weights
+        of_columns = join @ weights
         compared = self._compared(sensor, axis)
-        found = np.zeros((len(recording.kind), join.shape[1]))
-        for some, factors in recording.factors_of(sensor, compared, recording.moving):
+        slopes = np.zeros((len(recording.kind), join.shape[1]))
+        for indices, factors in recording.factors_of(sensor, compared, recording.moving):
             # w' J' F' F J of each window, with the factor F of its centred rows.
-            found[some] = ((factors @ weighed)[:, None] @ factors)[:, 0] @ join
-        return found
+            slopes[indices] = ((factors @ of_columns)[:, None] @ factors)[:, 0] @ join
+        return slopes
 
     def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
         """
-        Return the sum of squares of the weighted centred rows of each window, shape (k,).
+        Return the sum of squares of the residual about its mean in each window, shape (k,).
 
-        The centred rows are multiplied by the window's `weights` (k, q_a + 1).
+        `weights`: those of the residual (`weights_of`) in each window, shape (k, q_a + 1). All
+        parts of the rows count, and all effects.
         """
         recording = self.recording
-        columns = weights @ self.join[sensor][axis].T
-        found = np.zeros(len(columns))
-        for some, factors in recording.factors_of(sensor, 'within', recording.moving):
-            found[some] = ((factors @ columns[some, :, None]) ** 2).sum(axis=(1, 2))
-        return found
+        of_columns = weights @ self.join[sensor][axis].T
+        squares = np.zeros(len(of_columns))
+        for indices, factors in recording.factors_of(sensor, 'within', recording.moving):
+            residuals = factors @ of_columns[indices, :, None]
+            squares[indices] = (residuals**2).sum(axis=(1, 2))
+        return squares
 
     def _compared(self, sensor: str, axis: int) -> str:
-        """Return which part of the centred rows is compared on an axis."""
+        """Return the part of the centred rows that is compared on an axis, of `FACTOR_PARTS`."""
         return 'slow' if self.slow_only[sensor][axis] else 'within'
 
-    def _missing(self, sensor: str, axis: int) -> np.ndarray:
+    def _replacement_of_fast(self, sensor: str, axis: int) -> np.ndarray:
         """
-        Return the squares that replace the fast part of each window, shape (k,).
+        Return the sum of squares that replaces the fast part of each window, shape (k,).
 
-        They are zero where that part is compared.
+        It is ``slow_variance (n_samples - n_pieces)``, and zero where the fast part is compared.
         """
         if not self.slow_only[sensor][axis]:
             return np.zeros(len(self.recording.count))
@@ -180,11 +185,9 @@ class ParameterSpace:
 
 def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> ParameterSpace:
     """
-    Return the ParameterSpace of a recording.
+    Return the ParameterSpace of a recording, by the Jacobian of the coefficients.
 
-    The Jacobian of the coefficients joins columns to parameters.
-
-    Parameters of the baseline are relative to the point of linearisation; parameters of all other
+    Parameters of the baseline are changes from the point of linearisation; parameters of all other
     effects are absolute, so that an omitted effect is zero even where the point of linearisation
     includes it.
 
@@ -204,9 +207,9 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
 
     # Parameters of the baseline count from the linearisation, the other ones from zero: their
     # share of the prediction is returned to the residual.
-    in_baseline = counted_from_values(model, baseline)
-    shift = np.where(in_baseline, prior - recording.values, prior)
-    removed = np.where(in_baseline, 0.0, recording.values)
+    is_change = counted_from_values(model, baseline)
+    prior_mean = np.where(is_change, prior - recording.values, prior)
+    removed = np.where(is_change, 0.0, recording.values)
 
     # The parameters of the model, then those of the banks.
     names = list(model.param_names)
@@ -230,7 +233,7 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
         recording,
         tuple(names),
         np.concatenate(sds),
-        np.pad(shift, (0, len(names) - len(shift))),
+        np.pad(prior_mean, (0, len(names) - len(prior_mean))),
         **_matrices(joined),
     )
 
@@ -249,7 +252,7 @@ def bank_places(recording: ReducedRecording) -> dict[str, slice]:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """How columns of three axes become the design of one."""
+    """How the p columns of a sensor, which act on three axes, become the design of one axis."""
 
     used: np.ndarray
     """Parameters that act on the axis, shape (q_a,)."""
@@ -279,26 +282,41 @@ def _join(
     removed: np.ndarray,
     smooth: np.ndarray,
 ) -> _Joined:
-    """Return the matrices that join the columns of an axis to the parameters."""
+    """
+    Return the matrices that turn columns of a sensor into the design of one axis.
+
+    Parameters
+    ----------
+    jacobian : array, shape (n_columns of the model, n_params of the model)
+        Derivative of the coefficients of this axis.
+    sensor : str
+    axis : int
+    recording : ReducedRecording
+    removed : array, shape (n_params of the model,)
+        Values of absolute parameters at the linearisation, whose output is added to the residual.
+    smooth : array of bool, shape (q,)
+        Parameters of effects that are smooth in time.
+
+    """
     bank = recording.bank[sensor]
     places = bank_places(recording)
-    p, n_model = jacobian.shape
-    n_columns = p + sum(len(entry.slopes) for entry in bank)
+    n_of_model, n_params = jacobian.shape
+    n_columns = n_of_model + sum(len(entry.slopes) for entry in bank)
 
     # Rows: columns of the model and of the banks, then the residuals of three axes.
     full = np.zeros((n_columns + 3, len(smooth) + 1))
-    full[:p, :n_model] = jacobian
-    start = p
+    full[:n_of_model, :n_params] = jacobian
+    start = n_of_model
     for entry in bank:
         end = start + len(entry.slopes)
         full[start:end, places[entry.label]] = entry.slopes[:, axis]
         start = end
-    full[:p, -1] = jacobian @ removed
+    full[:n_of_model, -1] = jacobian @ removed
     full[n_columns + axis, -1] = 1.0
 
     # Within windows, effects that are smooth in time have no columns.
     within = np.where(np.append(smooth, False), 0.0, full)
-    within[:p, -1] = jacobian @ np.where(smooth[:n_model], 0.0, removed)
+    within[:n_of_model, -1] = jacobian @ np.where(smooth[:n_params], 0.0, removed)
 
     used = np.flatnonzero(np.any(full[:, :-1] != 0, axis=0))
     kept = np.append(used, -1)
@@ -307,9 +325,9 @@ def _join(
 
 def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray:
     """
-    Return a mask of the parameters that count from the linearisation.
+    Return a mask of the parameters of `model` that are fitted as changes from the linearisation.
 
-    Those of the baseline, time constants and times of steps.
+    They are those of the baseline, time constants and times of steps.
     """
     counted = model.mask(lambda effect: effect.key in baseline.slices)
     for effect in model.effects:
@@ -320,13 +338,13 @@ def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray
 
 def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Question]:
     """
-    Return a Question for each effect.
+    Return a Question for each effect of the model, and one for each entry of the bank.
 
-    One with a time constant gives one per time constant of the bank.
+    An effect with a time constant that the model lacks has a question per time constant.
     """
     model = space.recording.model
     places = bank_places(space.recording)
-    asked = []
+    candidates = []
     for effect in effects:
         if effect.key in model.slices:
             parts = {effect.name: model.slices[effect.key]}
@@ -337,17 +355,17 @@ def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Ques
                     parts[entry.label] = places[entry.label]
         for label, part in parts.items():
             parameters = tuple(range(part.start, part.stop))
-            asked.append(Question(effect, parameters, effect.size, label))
-    return asked
+            candidates.append(Question(effect, parameters, effect.size, label))
+    return candidates
 
 
 def normal_matrix(
     space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None
 ) -> np.ndarray:
     """
-    Return the normal matrix of the windows `select` (mask; all where not given).
+    Return the normal matrix of the windows `select` (mask; default: all), shape (q + 1, q + 1).
 
-    Shape (q + 1, q + 1).
+    It is the sum of the products of their means and of the samples about them.
     """
     means = []
     for sensor in space.sensors:
@@ -362,7 +380,11 @@ def within_matrix(
     *,
     sensors: Sequence[str] | None = None,
 ) -> np.ndarray:
-    """Return the part of the normal matrix from within the windows."""
+    """
+    Return the part of the normal matrix from the samples about the means, (q + 1, q + 1).
+
+    `select`: mask of windows, default all; `sensors`: default all.
+    """
     total = np.zeros((space.size + 1, space.size + 1))
     for sensor in space.sensors if sensors is None else sensors:
         for axis in range(3):
@@ -381,7 +403,11 @@ def within_of_axis(
     axis: int,
     select: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the same of one axis over its own columns, ``space.places(sensor, axis)``."""
+    """
+    Return the normal matrix of the samples of one axis about the means, (q_a + 1, q_a + 1).
+
+    Its columns are ``space.places(sensor, axis)``; `select`: mask of windows, default all.
+    """
     kind = space.recording.kind
     chosen = space.recording.moving
     if select is not None:
@@ -397,23 +423,23 @@ def scatter_of_each(
     space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray
 ) -> dict[str, np.ndarray]:
     """
-    Return sensor -> factor of each window's scatter within, at parameters (q,), over its kind.
+    Return sensor -> variance ratio of the samples of each window, at least 1, shape (k, 3).
 
-    Shape (k, 3).
+    It is the sum of squares of the residual about its mean, at the parameters `values`, shape (q,),
+    over its expectation by the noise of this kind of window.
     """
     recording = space.recording
-    reduced = weights_of(range(space.size), values, space.size)
-    found = {}
+    weights = weights_of(range(space.size), values, space.size)
+    ratios = {}
     for sensor in space.sensors:
-        # Squares that the noise of the kind gives, and those of the window.
         variance = np.array([noise[sensor].row_variance(name) for name in recording.kind])
-        usual = variance * np.maximum(recording.count - 1, 1)[:, None]
+        expected = variance * np.maximum(recording.count - 1, 1)[:, None]
         squares = []
         for axis in range(3):
-            own = reduced[space.places(sensor, axis)]
-            squares.append(space.slopes_within(sensor, axis, own) @ own)
-        found[sensor] = np.maximum(np.stack(squares, axis=1) / usual, 1.0)
-    return found
+            of_axis = weights[space.places(sensor, axis)]
+            squares.append(space.slopes_within(sensor, axis, of_axis) @ of_axis)
+        ratios[sensor] = np.maximum(np.stack(squares, axis=1) / expected, 1.0)
+    return ratios
 
 
 def mean_rows(
@@ -424,16 +450,17 @@ def mean_rows(
     scatter: np.ndarray | None = None,
 ) -> list[Rows]:
     """
-    Return the means of the windows for each axis, with their errors.
+    Return the means of the windows for each axis, with the variance of their errors.
 
-    `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
+    `scatter`: variance ratio of the samples of each window (`scatter_of_each`), shape (k, 3).
     """
     recording = space.recording
-    own = noise[sensor]
-    means = recording.mean_rows(np.zeros((len(recording.kind), 3, 0)), own)
+    of_sensor = noise[sensor]
+    means = recording.mean_rows(np.zeros((len(recording.kind), 3, 0)), of_sensor)
     variance = means.variance
     if scatter is not None:
-        variance = variance + (scatter - 1) * own.mean_variance(recording.kind, recording.count)
+        of_samples = of_sensor.mean_variance(recording.kind, recording.count)
+        variance = variance + (scatter - 1) * of_samples
     found = []
     for axis, equations in enumerate(space.mean[sensor]):
         of_axis = replace(
