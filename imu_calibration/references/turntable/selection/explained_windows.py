@@ -11,7 +11,7 @@ from imu_calibration.selection.search import Search
 
 class ExplainedWindows(Explained):
     """
-    The same on the windows of a table.
+    Excess over noise in the windows of a table, in two parts: means, and samples about them.
 
     The noise here has no window offsets, and the estimated bias process up to a plausible size. A
     window that scatters more within than its kind has a less certain mean: one turn about two fast
@@ -36,8 +36,11 @@ class ExplainedWindows(Explained):
         values, _ = evidence.fit(range(evidence.space.size))
         scatter = scatter_of_each(evidence.space, evidence.noise, values)
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
+        """Evidence with this noise."""
         self.n_means = 3.0 * len(recording.windows)
+        """Number of squares of means, all axes."""
         self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
+        """Number of squares within moving windows, all axes."""
         super().__init__(
             search,
             self.floor.unpredicted,

@@ -11,9 +11,9 @@ from imu_calibration.selection.questions import special
 
 def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel:
     """
-    Return the model with all these effects, except the ones tested differently.
+    Return the model with all these effects that have columns.
 
-    The exceptions are warm-ups and saturation.
+    Warm-ups (bank of time constants) and saturation have none.
     """
     kept = [e for e in effects if e.warp is not None or not special(e)]
     for effect in kept:
@@ -25,16 +25,16 @@ def point_with(
     model: SensorModel, effects: Sequence[Effect], values: dict[str, float]
 ) -> tuple[SensorModel, np.ndarray]:
     """
-    Return (the model with all these effects linearised there, its parameters).
+    Return (the model with all these effects, linearised; the parameters of the linearisation).
 
-    The linearisation is at the given values, else at the prior.
+    They have the given `values`, parameter -> value, else the start of the model.
     """
-    wide = extended_model(model, effects)
-    start = np.array(
-        [values.get(name, known) for name, known in zip(wide.param_names, wide.start())]
-    )
-    start = np.where(np.isfinite(start), start, 0.0)
-    return wide.at(start), start
+    extended = extended_model(model, effects)
+    parameters = []
+    for name, start in zip(extended.param_names, extended.start()):
+        parameters.append(values.get(name, start))
+    point = np.where(np.isfinite(parameters), parameters, 0.0)
+    return extended.at(point), point
 
 
 def without_saturation(effects: Sequence[Effect]) -> list[Effect]:

@@ -70,7 +70,9 @@ class Investigation(SelectedEffects):
     used: list[Window]
     """Windows that were fitted to, without clipped samples."""
     problem: LinearisedProblem
+    """Linearised at the findings."""
     explained: ExplainedWindows
+    """Excess over noise, and the share of it that effects remove."""
     rivals: Sequence[Rival] = field(default_factory=list)
     """Alternatives to findings that fit nearly as well."""
     onset: Onset | None = None
@@ -218,16 +220,16 @@ def _explained(
     problem: LinearisedProblem, searched: SearchedWindows, start: Sequence[Question] = ()
 ) -> tuple['_Outcome', Sequence[Rival], SearchedWindows]:
     """
-    Return (the '_Outcome' of a search, rivals of its findings, `searched`).
+    Return (outcome of a search, rivals of its findings, `searched` for further searches).
 
-    In `searched` the lags are resolved if there are any.
+    Lags are explained together (`lag_explanations`); they are resolved effects in further searches.
+    Without lags, timing effects are compared at their own linearisations (`settle_rivals`).
     """
-    chosen = problem.search.run(start)
-    chosen = [
-        question
-        for question in chosen
-        if question.name not in FAMILY or problem.windows_agree(chosen, question)
-    ]
+    found = problem.search.run(start)
+    chosen = []
+    for question in found:
+        if question.name not in FAMILY or problem.windows_agree(found, question):
+            chosen.append(question)
     explanations = lag_explanations(problem, [*chosen, *problem.search.early(chosen)], searched)
     if explanations is not None:
         searched = replace(searched, resolved=FAMILY)
@@ -240,13 +242,18 @@ def _explained(
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
-    """Result of a choice."""
+    """A choice of effects, linearised, with the result of its tests."""
 
     problem: LinearisedProblem
+    """Linearised at the choice."""
     explained: ExplainedWindows
+    """Excess over noise there."""
     chosen: Sequence[Question]
+    """Effects that the search chose by likelihood."""
     named: Sequence[Question]
+    """Those that became findings."""
     unstable: Sequence[Question]
+    """Those whose estimates from both halves differ significantly."""
 
     @cached_property
     def rest(self) -> float:
@@ -259,13 +266,17 @@ class _Trial:
     """One explanation of the lags with the outcome of its search."""
 
     number: int
+    """Number of the trial, from 0."""
     lags: AbstractSet[str]
+    """Effects of the explanation."""
     outcome: _Outcome
+    """Outcome of the search that starts from these effects."""
     rivals: Sequence[Rival]
+    """Alternatives to its findings."""
 
     @property
     def rank(self) -> tuple[int, int, int]:
-        """Numbers of its lags that are named and chosen, then the order of the trials."""
+        """Sort key: numbers of its lags that are named, and chosen; then the earlier trial."""
         named = {question.name for question in self.outcome.named}
         chosen = {question.name for question in self.outcome.chosen}
         return len(self.lags & named), len(self.lags & chosen), -self.number
@@ -284,24 +295,28 @@ def _with_lags(
     explanations: LagExplanations, searched: SearchedWindows
 ) -> tuple[_Outcome, Sequence[Rival]]:
     """
-    Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
+    Return (outcome with the simplest explanation of the lags that are all named, its rivals).
 
-    Where one of several effects does not help, a shorter one is tried, where a single one does not,
-    another. Only a trial that helps where it begins, or the best of all, is relinearised at its
-    choice.
+    If one of several lags is not named, an explanation with fewer effects is tried; if a single one
+    is not, another explanation. To save time, a trial is relinearised at its choice only if all of
+    its lags are named before, or if no trial succeeds and it is the best.
     """
-    most = None
+    most = None  # number of effects of the next explanation, at most
     refused = []
     tried = []
     for number in range(EXPLANATIONS):
         selected = explanations.select(most, refused)
-        there, chosen, of_lags = explanations.settled(selected, searched)
-        chosen = there.search.run(chosen)
-        settled, rivals = settle_rivals(there, chosen, searched)
-        outcome = _outcome(settled, chosen if settled is there else _chosen_again(settled, chosen))
-        trial = _Trial(number, selected.lags.keys(), outcome, [*of_lags, *rivals])
-        if trial.helps and (trial := trial.finished(searched)).helps:
-            return trial.outcome, trial.rivals
+        at_lags, chosen, rivals_of_lags = explanations.settled(selected, searched)
+        chosen = at_lags.search.run(chosen)
+        settled, rivals = settle_rivals(at_lags, chosen, searched)
+        if settled is not at_lags:
+            chosen = _chosen_again(settled, chosen)
+        outcome = _outcome(settled, chosen)
+        trial = _Trial(number, selected.lags.keys(), outcome, [*rivals_of_lags, *rivals])
+        if trial.helps:
+            trial = trial.finished(searched)
+            if trial.helps:
+                return trial.outcome, trial.rivals
         tried.append(trial)
         most = max(len(selected.lags) - 1, 1)
         refused = [*refused, selected]
@@ -313,20 +328,23 @@ def _with_lags(
 
 def _best_of(trials: Iterable[_Trial], searched: SearchedWindows) -> _Trial:
     """
-    Return the finished trial with the highest rank.
+    Return the finished trial with the highest rank, of at least one trial.
 
-    A trial is finished only if its rank exceeds that of the best.
+    Finishing can lower a rank. A trial is finished only if its rank exceeds that of the best
+    finished one.
     """
-    best = None
-    for trial in sorted(trials, key=lambda trial: trial.rank, reverse=True):
-        if best is None or trial.rank > best.rank:
+    first, *others = sorted(trials, key=lambda trial: trial.rank, reverse=True)
+    best = first.finished(searched)
+    for trial in others:
+        if trial.rank > best.rank:
             finished = trial.finished(searched)
-            best = finished if best is None or finished.rank > best.rank else best
-    assert best is not None, 'there is at least one trial'
+            if finished.rank > best.rank:
+                best = finished
     return best
 
 
 def _labels(chosen: Sequence[Question]) -> frozenset[str]:
+    """Return the labels of a choice, by which equal choices are recognised."""
     return frozenset(question.label for question in chosen)
 
 
@@ -334,11 +352,11 @@ def _looked_again(
     outcome: _Outcome, searched: SearchedWindows, tried: set[frozenset[str]]
 ) -> _Outcome:
     """
-    Return the _Outcome of the searches for the cause of a remaining significant excess.
+    Return the outcome of further searches if they remove nearly all of a remaining excess.
 
-    Further searches start from pairs, or allow implausible sizes. Any two of many effects reduce an
-    excess of a different cause somewhat: together they must remove nearly all. `tried` has the
-    labels of each choice that was linearised.
+    They start from pairs of effects, or allow implausible sizes. Any two of many effects reduce an
+    excess of a different cause somewhat: together they must remove nearly all. Otherwise `outcome`
+    is returned. `tried`: labels of the choices that were linearised; the new one is added.
     """
     if not outcome.rest:
         return outcome
@@ -364,9 +382,7 @@ def _settled(
     searched: SearchedWindows, problem: LinearisedProblem, chosen: Sequence[Question]
 ) -> _Outcome:
     """
-    Return the _Outcome of a choice.
-
-    Relinearise at the effects, then keep the ones with sufficient share and gain.
+    Return the outcome of a choice, linearised at its effects and then at its findings alone.
     """
     return _without_unnamed(_relinearised(searched, problem, chosen), searched)
 
@@ -374,7 +390,7 @@ def _settled(
 def _relinearised(
     searched: SearchedWindows, problem: LinearisedProblem, chosen: Sequence[Question]
 ) -> _Outcome:
-    """Return the same, linearised at all effects of the choice."""
+    """Return the outcome of a choice, linearised at all of its effects."""
     for _ in range(LINEARISATIONS - 1):
         if not problem.needs_another(chosen):
             break
@@ -384,7 +400,7 @@ def _relinearised(
 
 
 def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome:
-    """Return the _Outcome of a choice where it is linearised."""
+    """Return the outcome of a choice at the linearisation of a problem."""
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
     explained = ExplainedWindows(problem.evidence, problem.search)
@@ -394,9 +410,9 @@ def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome
 
 def _without_unnamed(outcome: _Outcome, searched: SearchedWindows) -> _Outcome:
     """
-    Return the _Outcome linearised at its findings alone.
+    Return the outcome linearised at its findings alone.
 
-    Where lags or errors of the table that are not named act at its point.
+    It is unchanged if no lag or error of the table that is not named acts at its linearisation.
     """
     for _ in range(LINEARISATIONS - 1):
         if not outcome.problem.acts_beside(outcome.named):
@@ -415,16 +431,14 @@ def _without_unnamed(outcome: _Outcome, searched: SearchedWindows) -> _Outcome:
 
 
 def _chosen_again(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
-    """
-    Return the choice of a search at another linearisation; it starts from the resolved effects.
-    """
+    """Return the choice of a new search of a problem, from the resolved effects of a choice."""
     return problem.search.run(_resolved(problem, chosen))
 
 
 def _resolved(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
-    return same_questions(
-        problem, [question for question in chosen if question.name in problem.search.resolved]
-    )
+    """Return the questions of a problem for the resolved effects of a choice."""
+    resolved = [question for question in chosen if question.name in problem.search.resolved]
+    return same_questions(problem, resolved)
 
 
 def too_few_windows(count: int) -> NotObservableError:
@@ -458,7 +472,7 @@ class WindowTests(EffectTests):
 
     def least_predicting(self, kept: list[Question]) -> int | None:
         """
-        Return the finding that improves cross-validated prediction least, of those that do not.
+        Return the place of the finding that improves the prediction least; None if all improve it.
 
         Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a
         misfit that repeats with the motion is evidence for any effect that correlates with it. So
@@ -470,15 +484,15 @@ class WindowTests(EffectTests):
         for k, question in enumerate(kept):
             reduction = _sure_reduction(self.problem, kept, question)
             if not reduction > _needed_reduction(self.problem, self.explained, kept, question):
-                # NaN is not sure.
-                rank = -np.inf if np.isnan(reduction) else reduction
-                if place is None or rank < least:
+                # Without an interval (NaN) the reduction is the least of all.
+                reduction = -np.inf if np.isnan(reduction) else reduction
+                if place is None or reduction < least:
                     place = k
-                    least = rank
+                    least = reduction
         return place
 
     def significant(self, named: Sequence[Question]) -> Sequence[Question]:
-        """Return the effects that are significant without those that were removed."""
+        """Return the effects that are still significant after removals."""
         return self.problem.search.drop_insignificant(named)
 
 
@@ -489,13 +503,15 @@ def _needed_reduction(
     question: Question,
 ) -> float:
     """
-    Return the required relative reduction of the residual.
+    Return the required relative reduction of the residual by an effect.
 
     Zero; `LEAST_REDUCTION` with an unexplained excess, or without rests to separate misfit from
     noise.
     """
-    clear = not problem.recording.moving.all() and not explained.rest_beside(chosen, question)
-    return 0.0 if clear else LEAST_REDUCTION
+    has_rests = not problem.recording.moving.all()
+    if has_rests and not explained.rest_beside(chosen, question):
+        return 0.0
+    return LEAST_REDUCTION
 
 
 def _sure_reduction(

@@ -40,7 +40,7 @@ class Rival:
     other: Question
     """The effect that was not chosen."""
     behind: float
-    """Held-out log likelihood that it lacks, nats, each linearised where it is."""
+    """Rise of the held-out cost with it, nats, each effect linearised at its estimate."""
     moves: dict[str, float] = field(default_factory=dict)
     """Parameter of the baseline -> its difference with the rival in the model."""
 
@@ -54,7 +54,9 @@ def settle_rivals(
     problem: LinearisedProblem, chosen: Sequence[Question], searched: SearchedWindows
 ) -> tuple[LinearisedProblem, list[Rival]]:
     """
-    Return (the LinearisedProblem at the best of a choice and its rivals, the rivals close to it).
+    Return (problem linearised at the best of a choice and its variants, the close variants).
+
+    A variant has a rival in place of one effect.
 
     The first derivatives of a delay and of a low-pass are the same, and a search that is linearised
     at one of them represents its rival by its tangent only: the first one would win. So each is
@@ -82,67 +84,70 @@ def settle_rivals(
             effects[question.name] = question.effect
     compared = list(effects.values())
     start = searched.linearised(effects=compared)
-    attempts = []
+    attempts = []  # problem linearised at each choice
     for number, choice in enumerate(choices):
-        there = searched.linearised(
+        attempt = searched.linearised(
             effects=compared, point=start.point(same_questions(start, choice))
         )
-        attempts.append(there)
-        choices[number] = same_questions(there, choice)
+        attempts.append(attempt)
+        choices[number] = same_questions(attempt, choice)
 
     # Mean cost of each choice, judged with the noise of each in turn.
     costs_of_judges = []
     for judge in attempts:
         costs_of_judges.append(
-            [_cost(there, choice, judge) for there, choice in zip(attempts, choices)]
+            [_cost(attempt, choice, judge) for attempt, choice in zip(attempts, choices)]
         )
     costs = np.mean(costs_of_judges, axis=0)
     best = int(np.argmin(costs))
 
-    # The rivals within the resolution of the search, with what they would change.
+    # The rivals within the resolution of the search, with the parameters that they would change.
     values = []
-    for there, choice in zip(attempts, choices):
-        values.append(dict(zip(there.space.names, there.values(choice))))
+    for attempt, choice in zip(attempts, choices):
+        values.append(dict(zip(attempt.space.names, attempt.values(choice))))
     settled = searched.linearised(point=problem.point(same_questions(problem, choices[best])))
-    found = []
+    rivals = []
     for k, choice in enumerate(choices):
         if k == best or costs[k] - costs[best] >= TIE:
             continue
-        # The question of which both choices have another effect.
+        # The two choices have different effects in one place.
         different = next(
             pair for pair in zip(choices[best], choice) if pair[0].name != pair[1].name
         )
-        taken, other = same_questions(settled, different)
+        question, other = same_questions(settled, different)
         moves = {}
         for name in problem.baseline.param_names:
             moves[name] = values[k][name] - values[best][name]
-        found.append(Rival(taken, other, float(costs[k] - costs[best]), moves))
-    return settled, found
+        rivals.append(Rival(question, other, float(costs[k] - costs[best]), moves))
+    return settled, rivals
 
 
 def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[Question]:
     """
-    Return the same questions at another linearisation.
+    Return the questions of a problem for the effects of a choice at another linearisation.
 
-    A warm-up at the likeliest time constant of its bank.
+    Of a warm-up that has no question with the same label it is the one with the likeliest time
+    constant.
     """
-    found = []
+    same = []
     for each in chosen:
-        asked = [question for question in problem.questions if question.name == each.name]
-        same = [question for question in asked if question.label == each.label]
-        if same:
-            found.append(same[0])
+        of_effect = [question for question in problem.questions if question.name == each.name]
+        with_label = [question for question in of_effect if question.label == each.label]
+        if with_label:
+            same.append(with_label[0])
             continue
-        losses = [problem.evidence.loss(problem.search.indices([question])) for question in asked]
-        found.append(asked[int(np.argmin(losses))])
-    return found
+        losses = []
+        for question in of_effect:
+            losses.append(problem.evidence.loss(problem.search.indices([question])))
+        same.append(of_effect[int(np.argmin(losses))])
+    return same
 
 
 def _swapped(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[list[Question]]:
     """
-    Return the choices with an effect replaced by one that only curvature separates from it.
+    Return the choices with one timing effect replaced by another with the same tangent.
 
-    Where the curvature is observable.
+    Only where the curvature, which separates the two, is observable.
     """
     swapped = []
     for place, question in enumerate(chosen):
@@ -159,9 +164,9 @@ def _swapped(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[lis
 def _cost(
     problem: LinearisedProblem, chosen: Sequence[Question], judge: LinearisedProblem
 ) -> float:
-    """Return the held-out cost of a choice at its own linearisation, judged by another one."""
-    misfit = problem.judged_by(judge).heldout(problem.search.indices(chosen))
-    return 0.5 * misfit + PENALTY * sum(question.penalty for question in chosen)
+    """Return the held-out cost of a choice with the noise and the band of the problem `judge`."""
+    loss = problem.judged_by(judge).heldout(problem.search.indices(chosen))
+    return 0.5 * loss + PENALTY * sum(question.penalty for question in chosen)
 
 
 AS_MUCH = 0.5
@@ -178,9 +183,9 @@ def simpler(
     Return findings with no more parameters than the held-out residual supports.
 
     With unexplained misfit, likelihood prefers more parameters: arms of the three accelerometers,
-    where one common arm fits as well. So an effect with fewer parameters replaces a finding when
-    the unweighted residual, in the unit of the sensor, is not sure to fall by `LEAST_REDUCTION`
-    from the one to the other.
+    where one common arm fits as well. So an effect with fewer parameters replaces a finding unless
+    the finding surely (97.5 %) reduces the unweighted residual by more than `LEAST_REDUCTION` of
+    that with the simpler effect.
     """
     kept = list(named)
     for place, question in enumerate(named):
@@ -192,7 +197,7 @@ def simpler(
                 continue
             if explained.share(instead, other) < needed_share(other):
                 continue
-            # The finding stays where the residual surely falls from the simpler one to it.
+            # A finding that surely lowers the residual below that of the simpler one is kept.
             gain = gain_in_turn(problem, instead, kept, sensors=question.effect.sensors)
             if gain.ci95[0] <= LEAST_REDUCTION:
                 kept = instead
@@ -206,20 +211,17 @@ def _fewer(search: Search, kept: Sequence[Question], question: Question) -> list
 
     They are effects of the same sensors with fewer parameters, fewest first.
     """
-    beside = [each for each in kept if each is not question]
-    enough = AS_MUCH * search.score(beside, question).gain
-    fewer = [
-        other
-        for other in search.others(kept)
-        if other.penalty < question.penalty
-        and '@' not in other.label
-        and other.effect.sensors == question.effect.sensors
-    ]
-    scores = [search.score(beside, other) for other in fewer]
-    return sorted(
-        (score.question for score in scores if score.significant and score.gain >= enough),
-        key=lambda other: other.penalty,
-    )
+    remaining = [each for each in kept if each is not question]
+    least_gain = AS_MUCH * search.score(remaining, question).gain
+    fewer = []
+    for other in search.others(kept):
+        is_smaller = other.penalty < question.penalty and '@' not in other.label
+        if not is_smaller or other.effect.sensors != question.effect.sensors:
+            continue
+        score = search.score(remaining, other)
+        if score.significant and score.gain >= least_gain:
+            fewer.append(other)
+    return sorted(fewer, key=lambda other: other.penalty)
 
 
 MIN_UNIQUE_SHARE = 0.05
@@ -238,24 +240,24 @@ def best_pairs(search: Search) -> list[list[Question]]:
     without its mate is tested by the search from the pair (`Search.run`).
     """
     blocks = _Blocks(search)
-    shapes = defaultdict(list)
+    pairs_of_shape = defaultdict(list)
     for one, two in combinations(range(len(search.questions)), 2):
         names = {search.questions[one].name, search.questions[two].name}
         if len(names) == 2 and not names & search.resolved:
-            shapes[blocks.size(one), blocks.size(two)].append((one, two))
+            pairs_of_shape[blocks.size(one), blocks.size(two)].append((one, two))
     scored: list[tuple[float, int, int]] = []
-    for pairs in shapes.values():
+    for pairs in pairs_of_shape.values():
         scored += blocks.score(pairs)
 
     # The best pairs that are possible; of pairs that differ in a time constant only, the best one.
     best: list[list[Question]] = []
-    known: list[set[str]] = []
+    names_of_best: list[set[str]] = []
     for _, one, two in sorted(scored, reverse=True):
         pair = [search.questions[one], search.questions[two]]
         names = {question.name for question in pair}
-        if names not in known and all(search.allowed(pair, each) for each in pair):
+        if names not in names_of_best and all(search.allowed(pair, each) for each in pair):
             best.append(pair)
-            known.append(names)
+            names_of_best.append(names)
         if len(best) == TRIED:
             break
     return best
@@ -263,9 +265,9 @@ def best_pairs(search: Search) -> list[list[Question]]:
 
 class _Blocks:
     """
-    Normal equations of all questions, baseline projected out.
+    Normal equations ``M x = b`` of the parameters of all questions, one question after the other.
 
-    Each question's own block is the unit matrix.
+    The baseline is projected out, and the block of M of each question is the unit matrix.
     """
 
     def __init__(self, search: Search):
@@ -273,7 +275,8 @@ class _Blocks:
         information, right = search.evidence.equations()
         base = list(search.baseline)
         free: list[int] = []
-        self.at = []
+        self.at: list[slice] = []
+        """Place of the parameters of each question in M and b."""
         for question in search.questions:
             start = len(free)
             free += question.parameters
@@ -288,12 +291,13 @@ class _Blocks:
         # Scale rows and columns by L^-1 of each block L L'.
         for at in self.at:
             scale = np.sqrt(np.diag(matrix)[at])
-            own = matrix[at, at] / np.outer(scale, scale)
-            lower = np.linalg.cholesky(own + 1e4 * JITTER * np.eye(len(own))) * scale[:, None]
+            block = matrix[at, at] / np.outer(scale, scale)
+            lower = np.linalg.cholesky(block + 1e4 * JITTER * np.eye(len(block))) * scale[:, None]
             matrix[at] = np.linalg.solve(lower, matrix[at])
             matrix[:, at] = np.linalg.solve(lower, matrix[:, at].T).T
             right[at] = np.linalg.solve(lower, right[at])
-        self.matrix, self.right = matrix, right
+        self.matrix = matrix
+        self.right = right
 
     def size(self, number: int) -> int:
         """Return the number of parameters of a question."""
@@ -301,12 +305,13 @@ class _Blocks:
 
     def score(self, pairs: Sequence[tuple[int, int]]) -> Iterator[tuple[float, int, int]]:
         """
-        Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape.
+        Yield (fall of the loss in nats less the penalty, one, two) of pairs of questions.
 
-        The members of a pair are not collinear.
+        All pairs have the same numbers of parameters. Pairs with a member that its mate imitates
+        are omitted.
         """
         every = np.arange(len(self.right))
-        places = np.array([[*every[self.at[a]], *every[self.at[b]]] for a, b in pairs])
+        places = np.array([[*every[self.at[one]], *every[self.at[two]]] for one, two in pairs])
         n_first = self.size(pairs[0][0])
         systems = self.matrix[places[:, :, None], places[:, None, :]]
         systems = systems + 1e4 * JITTER * np.eye(places.shape[1])
@@ -314,7 +319,7 @@ class _Blocks:
         # The loss falls by x' b at the solution x of M x = b.
         values = np.linalg.solve(systems, self.right[places][:, :, None])[:, :, 0]
         fall = np.einsum('ki,ki->k', values, self.right[places])
-        # Share of the signal of each member that its mate cannot imitate.
+        # Share |M_21 x_1|^2 / |x_1|^2 of the signal of each member that its mate imitates.
         cross = systems[:, :n_first, n_first:]
         first = values[:, :n_first]
         second = values[:, n_first:]

@@ -68,13 +68,12 @@ def testable_effects(
 
 def _vibrates(windows: Sequence[Window]) -> bool:
     """Return whether vibration differs between rests."""
-    rests = [window for window in windows if window.kind == 'static' and len(window) > 3]
-    variances = np.array(
-        [
-            max(window.noise_sd[0] @ window.noise_sd[0], least_variance(window.force_s))
-            for window in rests
-        ]
-    )
+    of_rests = []  # variance of the accelerometer, all axes, at least that of rounding
+    for window in windows:
+        if window.kind == 'static' and len(window) > 3:
+            variance = window.noise_sd[0] @ window.noise_sd[0]
+            of_rests.append(max(variance, least_variance(window.force_s)))
+    variances = np.array(of_rests)
     shaken = variances > VIBRATES * variances.min(initial=np.inf)
     return int(np.count_nonzero(shaken)) >= SHAKEN_RESTS
 
@@ -89,6 +88,25 @@ def _why_not(
     turned: bool,
     shaken: bool,
 ) -> tuple[str, str] | None:
+    """
+    Return (why, needs) of an effect that a recording cannot test; None for a testable one.
+
+    Parameters
+    ----------
+    effect : Effect
+    have : set
+        Keys of the effects of the model.
+    table : Table
+    kinds : set
+        Kinds of the windows of the recording.
+    span : float or None
+        Range of the temperature, K; None where it is not known throughout.
+    turned : bool
+        Whether the temperature reversed.
+    shaken : bool
+        Whether vibration differs between rests.
+
+    """
     moving = kinds & {'spin', 'dynamic'}
     why = lacking_temperature(effect, span)
     if why:

@@ -53,11 +53,12 @@ def gain_in_turn(
     sensors: Sequence[str],
 ) -> Gain:
     """
-    Return the same Gain on the selection windows by cross-validation.
+    Return the Gain of the choice `after` over `before` on the selection windows, cross-validated.
 
-    Returned is the measure with the largest reduction; if that is uncertain, the one with the
-    surest: a small lag may reduce window means by a tenth through noise, and samples by a certain
-    half percent. For a quiet sensor moving windows show the encoder, rests the sensor.
+    Of all `sensors` and measures the one with the largest lower end of the interval, without the
+    rests; if that is not above zero, the one whose squares fall most surely: a small lag may reduce
+    window means by a tenth through noise, and samples by a certain half percent. For a quiet sensor
+    moving windows show the encoder, rests the sensor.
     """
     fold = problem.evidence.fold
     gains = []
@@ -84,12 +85,12 @@ def gain_in_turn(
 
 
 def _squares(
-    space: ParameterSpace, values: np.ndarray, sensor: str
+    space: ParameterSpace, weights: np.ndarray, sensor: str
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """
-    Return measure -> (sums of squares, their numbers) per window, each (k,).
+    Return measure -> (sums of squares of the residual, their numbers) per window, each (k,).
 
-    They are taken at weights (`weights_of`), one or of each window.
+    `weights`: those of the residual (`weights_of`), for all windows (1, q + 1) or each (k, q + 1).
     """
     # Squares of the mean residual and of the residual about it, sums over the axes.
     recording = space.recording
@@ -98,9 +99,9 @@ def _squares(
     about_mean = np.zeros(n_windows)
     for axis in range(3):
         places = space.places(sensor, axis)
-        weights = np.broadcast_to(values[:, places], (n_windows, len(places)))
-        of_mean += np.einsum('kq,kq->k', space.mean[sensor][axis], weights) ** 2
-        about_mean += space.squares_within(sensor, axis, weights)
+        of_axis = np.broadcast_to(weights[:, places], (n_windows, len(places)))
+        of_mean += np.einsum('kq,kq->k', space.mean[sensor][axis], of_axis) ** 2
+        about_mean += space.squares_within(sensor, axis, of_axis)
 
     # At rest the samples about the mean are noise.
     rest = ~recording.moving
@@ -119,6 +120,10 @@ def _squares(
 
 
 def _certainty(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return by how many standard deviations sums of squares fall from window to window."""
+    """
+    Return the fall of the sums of squares over its standard deviation, ``sum f / sqrt(sum f^2)``.
+
+    With the fall f of each window, from (sums of squares, numbers) before and after.
+    """
     fall = pair[0][0] - pair[1][0]
     return float(fall.sum() / max(np.sqrt(fall @ fall), 1e-300))
