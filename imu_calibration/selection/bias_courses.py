@@ -65,15 +65,15 @@ def temperature_courses(time: np.ndarray, temperature: np.ndarray) -> Iterator[T
             return
         earlier = np.interp(time - lag, time, warm)
         yield TemperatureCourse(f'the temperature {lag} s earlier', earlier, known)
-        behind = _behind(time, warm, tau=lag)
-        yield TemperatureCourse(f'the temperature with a lag of {lag} s', behind, known)
+        lagging = _through_thermal_mass(time, warm, tau=lag)
+        yield TemperatureCourse(f'the temperature with a lag of {lag} s', lagging, known)
 
 
 def step_places(windows: np.ndarray, most: int, *, least: int = LEAST_PART) -> np.ndarray:
     """
-    Return up to `most` of the windows, in order, after which a step may lie.
+    Return up to `most` of the numbers `windows`, evenly spread, after which a step is tested.
 
-    The first and last `least` windows are none.
+    At least `least` of the windows are before and after each step.
     """
     places = windows[least - 1 : -least] if least else windows
     if len(places) > most:
@@ -81,8 +81,12 @@ def step_places(windows: np.ndarray, most: int, *, least: int = LEAST_PART) -> n
     return places
 
 
-def _behind(time: np.ndarray, warm: np.ndarray, *, tau: float) -> np.ndarray:
-    """Return the temperature of a thermal mass, for linear changes of `warm` between the times."""
+def _through_thermal_mass(time: np.ndarray, warm: np.ndarray, *, tau: float) -> np.ndarray:
+    """
+    Return the temperature m of a thermal mass at the times, ``tau dm/dt = warm - m``, shape (k,).
+
+    It equals `warm` at the first time; `warm` changes linearly between the times.
+    """
     mass = np.empty_like(warm)
     mass[0] = warm[0]
     for k in range(1, len(time)):

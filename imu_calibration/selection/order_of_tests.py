@@ -14,7 +14,7 @@ class EffectTests(ABC):
     """Tests of a choice of effects on the data of a reference."""
 
     problem: Any
-    """Rows with their `search`."""
+    """Evidence and `search` of a reference: a `RowProblem` or a `LinearisedProblem`."""
     explained: Explained
     """Excess over noise, and the share of it that effects remove."""
 
@@ -49,7 +49,7 @@ class EffectTests(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """Effects of a choice that data support."""
+    """Effects of a choice that the data support."""
 
     named: Sequence[Question]
     """Effects that became findings, in the order found."""

@@ -39,7 +39,7 @@ class Question:
 
 
 def with_exchanged(chosen: Sequence[Question], place: int, other: Question) -> list[Question]:
-    """Return a choice with another question in a place."""
+    """Return a choice with the effect `other` in place of its effect number `place`."""
     return [*chosen[:place], other, *chosen[place + 1 :]]
 
 

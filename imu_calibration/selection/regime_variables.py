@@ -6,7 +6,6 @@ Angles, rates and sides of the joints, speed, force, time, temperature, in range
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -44,7 +43,7 @@ class Variable:
     """Where bins begin, and where the last one ends, shape (k + 1,); none for classes."""
     cyclic: bool
     """Whether it is an angle of an endless joint, in degrees: the last bin adjoins the first."""
-    words: Callable[[Sequence[int], Any], str]
+    words: Callable[..., str]
     """
     ``words(chosen, bounds)`` describes a range from its bins in order and its two bounds (None for
     classes).

@@ -452,7 +452,7 @@ class SelectedEffects:
 
     settings: ClassVar[SelectionSettings] = SelectionSettings()
     problem: Any
-    """Rows, evidence and search."""
+    """Rows, evidence and search: a `RowProblem` or a `LinearisedProblem`."""
     explained: Any
     """Excess over noise, and the share of it that effects remove (`Explained`)."""
     named: Sequence[Question]

@@ -37,9 +37,12 @@ class Changes:
     """Normal matrices of changes of c parameters along m functions, the functions first."""
 
     cross: np.ndarray
-    """With the columns of the parameters and the residual, of each part, (parts, q + 1, m c)."""
+    """
+    Products of ``[columns of all parameters | residual]`` with the columns of the changes, of each
+    part, shape (parts, q + 1, m c).
+    """
     squares: np.ndarray
-    """With one another, shape (parts, m c, m c)."""
+    """Products of the columns of the changes with one another, shape (parts, m c, m c)."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,9 @@ class SignificantExcess:
     """Excess over the expectation from noise, of the parts in which it is significant."""
 
     squares: float
-    """Squares beyond the expectation."""
+    """Sum of squares minus its expectation, over these parts."""
     limit: float
-    """From this on an excess of these parts is significant."""
+    """Least significant excess of these parts together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +126,9 @@ class WindowRows:
         for sensor in self.space.sensors:
             means += mean_rows(self.space, self.noise, sensor, scatter=scatter)
         axes = []
-        for rows, own in zip(self.axes, means):
+        for rows, means_of_axis in zip(self.axes, means):
             within = np.where(clear[:, None, None], rows.within, 0.0)
-            axes.append(replace(rows, means=own, within=within))
+            axes.append(replace(rows, means=means_of_axis, within=within))
         return replace(self, clear=clear, axes=tuple(axes))
 
     @property
