@@ -83,7 +83,9 @@ def test_what_did_not_help_is_not_tried_again_under_another_name():
 
 def test_what_costs_more_than_no_lag_explains_nothing(monkeypatch):
     monkeypatch.setattr(
-        lag_explanations, '_none', lambda told, judges, sensor: option(sensor, (), [], cost=10.0)
+        lag_explanations,
+        '_without_lag',
+        lambda told, judges, sensor: option(sensor, (), [], cost=10.0),
     )
     monkeypatch.setattr(
         lag_explanations,
