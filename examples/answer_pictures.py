@@ -52,7 +52,7 @@ def bars_of_loss(path, names, last=()):
     for axis, sensor in zip(axes, SENSORS):
         values = [
             next(iter(found.values())).raw[sensor],
-            *(loss.left[sensor] for loss in found.values()),
+            *(loss.remaining[sensor] for loss in found.values()),
             *(0.0 for _ in last),
         ]
         axis.barh(

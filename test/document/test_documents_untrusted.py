@@ -13,7 +13,7 @@ from refusal import refused
 from imu_calibration.allan.document import noise_from_text
 from imu_calibration.cli.fleet_run import csv_text
 from imu_calibration.core.errors import DocumentError, InputError
-from imu_calibration.document.exports.affine import undone
+from imu_calibration.document.exports.affine import imu_of_corrections
 from imu_calibration.document.exports.export import find_target
 from imu_calibration.document.exports.loss import import_file
 from imu_calibration.effects.expressions import as_text
@@ -107,7 +107,7 @@ def test_a_px4_temperature_that_is_not_finite_is_refused(tmp_path, name, value):
 
 def test_a_correction_matrix_without_an_inverse_is_refused():
     with refused(InputError, 'matrix_singular', 'gyroscope'):
-        undone({'gyroscope': (np.diag([1.0, 1.0, 0.0]), np.zeros(3))})
+        imu_of_corrections({'gyroscope': (np.diag([1.0, 1.0, 0.0]), np.zeros(3))})
 
 
 @pytest.mark.parametrize('value', [float('inf'), float('nan'), -float('inf')])

@@ -187,10 +187,10 @@ def test_arms_in_kalibr_differ_by_what_is_announced(seed):
     arms = calibration.of('accelerometer', Role.ARMS)
     for sensor, made, read in zip(SENSORS, predicted, readings(calibration, ref), strict=True):
         gain = np.linalg.norm(calibration.of(sensor, Role.LINEAR), 2)
-        assert 0.5 * rms(made - read) < gain * found.loss.left[sensor] < 2.0 * rms(made - read)
+        assert 0.5 * rms(made - read) < gain * found.loss.remaining[sensor] < 2.0 * rms(made - read)
     felt = rms(np.einsum('nij,kj->nki', lever_matrix(ref.rate_s, ref.alpha_s), arms))
     # Of the second order: a matrix 0.02 to 0.05 from the identity.
-    assert found.loss.left['accelerometer'] < 0.3 * felt
+    assert found.loss.remaining['accelerometer'] < 0.3 * felt
 
 
 def test_arms_are_exact_in_kalibr_where_the_matrix_is_diagonal():
@@ -421,7 +421,7 @@ def test_who_takes_no_calibration_is_to_be_fed_compensated_readings():
         line in found.content.decode() for line in loss_lines(find_target('vins'), found.loss)
     )
     # Raw readings: scale factors of some percent at 1 g.
-    assert found.loss.left['accelerometer'] > 0.01
+    assert found.loss.remaining['accelerometer'] > 0.01
 
 
 # What is lost
@@ -459,9 +459,9 @@ def test_what_is_left_is_what_was_announced(name, seed):
     for sensor, m, t in zip(
         SENSORS, made, found.placement.truth(ref.force_s, ref.rate_s, ref.alpha_s), strict=True
     ):
-        assert found.loss.left[sensor] == pytest.approx(rms(m - t), rel=1e-9)
-        printed = error_text(found.loss.left[sensor], UNITS[sensor])
-        assert found.loss.left[sensor] < ROUNDING_LOSS or any(
+        assert found.loss.remaining[sensor] == pytest.approx(rms(m - t), rel=1e-9)
+        printed = error_text(found.loss.remaining[sensor], UNITS[sensor])
+        assert found.loss.remaining[sensor] < ROUNDING_LOSS or any(
             sensor in line and printed in line for line in found.lines
         )
 

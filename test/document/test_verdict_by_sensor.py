@@ -167,7 +167,7 @@ def test_the_loss_of_a_refused_sensor_is_its_whole_error():
     """
     known = harmed('accelerometer')
     whole, found = (export(known, find_target('px4'), anyway=anyway) for anyway in (True, False))
-    assert found.loss.left['accelerometer'] == pytest.approx(
+    assert found.loss.remaining['accelerometer'] == pytest.approx(
         found.loss.raw['accelerometer'], rel=1e-9
     )
     assert (
@@ -175,7 +175,8 @@ def test_the_loss_of_a_refused_sensor_is_its_whole_error():
         and whole.loss.raw['accelerometer'] > 1e-3
     )
     assert (
-        found.loss.left['gyroscope'] == pytest.approx(whole.loss.left['gyroscope'], rel=1e-9)
+        found.loss.remaining['gyroscope']
+        == pytest.approx(whole.loss.remaining['gyroscope'], rel=1e-9)
         and not found.loss.nothing
     )
 

@@ -24,32 +24,29 @@ from imu_calibration.kinematics.rotations import lever_matrix, rotations_from_qu
 
 @dataclass(frozen=True)
 class Capability:
-    """Effects of one kind of one sensor."""
+    """One kind of effect of one sensor that a program can represent."""
 
     sensor: str
     """'accelerometer' or 'gyroscope'."""
     role: Role = Role.TERM
-    """Their place in the sensor's equation."""
+    """Place of the effects in the sensor's equation."""
     groups: tuple[ColumnGroup, ...] = ()
-    """Columns of effects that are terms."""
+    """Columns of the effects, for `Role.TERM`: one role has terms of many kinds."""
     own_axis: bool = False
-    """Whether of a matrix only the diagonal can be held."""
+    """Whether the program has only the diagonal of a matrix."""
 
     def covers(self, effect: Effect) -> bool:
         """Return whether an effect is of this kind."""
-        return (
-            effect.sensor == self.sensor
-            and effect.role is self.role
-            and (self.role is not Role.TERM or effect.groups == self.groups)
-        )
+        if effect.sensor != self.sensor or effect.role is not self.role:
+            return False
+        return self.role is not Role.TERM or effect.groups == self.groups
 
     def held(self, values: np.ndarray) -> np.ndarray:
-        """Return the representable part of an effect's values, shape as given."""
-        return (
-            np.diag(np.diag(values.reshape(3, 3))).reshape(values.shape)
-            if self.own_axis
-            else values
-        )
+        """Return an effect's values as represented: off-diagonal values may become zero."""
+        if not self.own_axis:
+            return values
+        diagonal = np.diag(values.reshape(3, 3))
+        return np.diag(diagonal).reshape(values.shape)
 
     @property
     def effect(self) -> Effect:
@@ -58,6 +55,7 @@ class Capability:
 
 
 def _both(**kind: Any) -> tuple[Capability, ...]:
+    """Return the capability of this kind for each sensor."""
     return tuple(Capability(sensor, **kind) for sensor in SENSORS)
 
 
@@ -72,16 +70,17 @@ SLOW_OFFSETS = OFFSETS + THERMAL_OFFSETS
 
 
 def of(sensor: str, capabilities: Iterable[Capability]) -> tuple[Capability, ...]:
-    """Return the holdings of one sensor."""
+    """Return the capabilities of one sensor."""
     return tuple(capability for capability in capabilities if capability.sensor == sensor)
 
 
 def capability_of(effect: Effect, capabilities: tuple[Capability, ...]) -> Capability | None:
-    """Return the holding that covers an effect, or None."""
+    """Return the first capability that covers an effect, or None."""
     return next((capability for capability in capabilities if capability.covers(effect)), None)
 
 
 def _zeros(*shape: int) -> Any:
+    """Return a dataclass field with the default {sensor: zeros of this shape}."""
     return field(default_factory=lambda: {sensor: np.zeros(shape) for sensor in SENSORS})
 
 
@@ -115,7 +114,7 @@ class AffineImu:
     """Where the thermal part was measured, degrees Celsius; None: not known."""
 
     def value(self, capability: Capability) -> np.ndarray:
-        """Return the values of the effects of one kind."""
+        """Return the array of this IMU (no copy) with the values of one kind of effect."""
         for kinds, part in (
             (OFFSETS, self.bias),
             (MATRICES + SCALES, self.matrix),
@@ -130,19 +129,24 @@ def held_values(
     calibration: Calibration, effect: Effect, capability: Capability | None
 ) -> np.ndarray:
     """
-    Return the values of an effect as the target represents them.
+    Return the values of an effect as a program represents them, shape (size,).
 
-    Its prior where it is not represented, shape (size,).
+    Without a capability the program has no such effect: the values are its prior.
     """
     values = calibration.values[calibration.model.slices[effect.key]]
     return effect.prior_values() if capability is None else capability.held(values)
 
 
-def undone(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineImu:
+def imu_of_corrections(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineImu:
     """
-    Return the IMU whose readings ``matrix @ readings - offset`` corrects.
+    Return the IMU of a program that computes ``corrected = C @ readings - d``.
 
-    From sensor -> (matrix, offset); other sensors are perfect.
+    The inverse is ``readings = C^-1 @ corrected + C^-1 @ d``: matrix C^-1, bias C^-1 d.
+
+    Parameters
+    ----------
+    corrections : dict
+        Sensor -> (C, d), shapes (3, 3) and (3,). A sensor without an entry is perfect.
 
     Raises
     ------
@@ -160,29 +164,30 @@ def undone(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineIm
                 f' {np.asarray(correction).tolist()}; calibrate again',
                 code='matrix_singular',
             ) from error
-    bias = {sensor: matrix[sensor] @ offset for sensor, (_, offset) in corrections.items()}
+    bias = {}
+    for sensor, (_, offset) in corrections.items():
+        bias[sensor] = matrix[sensor] @ offset
     perfect = AffineImu()
     return replace(perfect, matrix=perfect.matrix | matrix, bias=perfect.bias | bias)
 
 
 def affine_of(calibration: Calibration, capabilities: tuple[Capability, ...]) -> AffineImu:
-    """Return that part of a calibration which lies in `capabilities`."""
+    """Return the IMU with those effects of a calibration that `capabilities` cover."""
     limits = calibration.conditions.get('temperature_range_c')
-    found = AffineImu(
+    imu = AffineImu(
         temperature_ref_c=calibration.model.temperature_ref_c,
         temperature_range_c=tuple(limits) if limits else None,
     )
     for capability in capabilities:
         for effect in filter(capability.covers, calibration.model.effects):
-            found.value(capability)[...] = held_values(calibration, effect, capability).reshape(
-                effect.shape
-            )
-    return found
+            values = held_values(calibration, effect, capability)
+            imu.value(capability)[...] = values.reshape(effect.shape)
+    return imu
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Placement:
-    """Frame, origin and axes of readings of a program, against ours."""
+    """Frame, origin and axes of readings of a program, relative to those of the calibration."""
 
     mat_ts: np.ndarray = field(default_factory=lambda: np.eye(3))
     """Turns vectors of our sensor frame into the program's frame."""
@@ -192,7 +197,7 @@ class Placement:
     """Turns our readings into the axes in which the program gets them."""
 
     def inverse(self) -> 'Placement':
-        """Return the placement that undoes this one."""
+        """Return the placement of the calibration relative to the program."""
         return Placement(
             mat_ts=self.mat_ts.T,
             origin_s=-self.mat_ts @ self.origin_s,
@@ -209,28 +214,36 @@ class Placement:
         """
         Return true specific force and rate at the program's origin in its frame, each shape (n, 3).
         """
-        return (
-            force + lever_matrix(rate, alpha) @ self.origin_s
-        ) @ self.mat_ts.T, rate @ self.mat_ts.T
+        force_at_origin = force + lever_matrix(rate, alpha) @ self.origin_s
+        return force_at_origin @ self.mat_ts.T, rate @ self.mat_ts.T
 
 
 def calibration_moved(imu: AffineImu, to: Placement) -> AffineImu:
     """
     Return the same IMU in the frame, origin and axes of another program.
 
-    With ``f = mat_ts' f_t - lever_matrix @ origin_s``; the effect of the change of origin on the
-    gyroscope's response to specific force (a product of two small terms) is omitted.
+    With A = mat_readings, R = mat_ts, and ``f = R' f_t - lever_matrix @ origin_s``::
+
+        bias_t = A bias,  matrix_t = A matrix R',  arms_t = |A| (arms - origin_s) R'
+
+    |A| permutes the axes without their signs: an arm belongs to an axis of either sign. The effect
+    of the change of origin on the gyroscope's response to specific force (a product of two small
+    terms) is omitted.
     """
-    turned = {sensor: to.mat_readings @ imu.matrix[sensor] @ to.mat_ts.T for sensor in SENSORS}
+    bias = {}
+    thermal = {}
+    matrix = {}
+    for sensor in SENSORS:
+        bias[sensor] = to.mat_readings @ imu.bias[sensor]
+        thermal[sensor] = to.mat_readings @ imu.thermal[sensor]
+        matrix[sensor] = to.mat_readings @ imu.matrix[sensor] @ to.mat_ts.T
     arms = imu.arms
-    if np.any(arms):
+    if np.any(arms):  # zero arms are an effect that the model does not have
         arms = np.abs(to.mat_readings) @ ((arms - to.origin_s) @ to.mat_ts.T)
-    bias = {sensor: to.mat_readings @ imu.bias[sensor] for sensor in SENSORS}
-    thermal = {sensor: to.mat_readings @ imu.thermal[sensor] for sensor in SENSORS}
     return replace(
         imu,
         bias=bias,
-        matrix=turned,
+        matrix=matrix,
         thermal=thermal,
         arms=arms,
         cross=to.mat_readings @ imu.cross @ to.mat_ts.T,
@@ -245,30 +258,28 @@ UNNAMED = 'sensor_frame'
 
 
 def pose_line(placement: Placement, parent: str, child: str) -> str:
-    """Return the transform with the arguments of the program of tf2_ros, with all digits."""
+    """Return the command of tf2_ros that publishes the placement as a transform, all digits."""
     from scipy.spatial.transform import Rotation  # here, because its import is slow
 
     values = [*placement.origin_s, *Rotation.from_matrix(placement.mat_ts.T).as_quat()]
-    pose: dict[str, str] = {name: repr(float(value)) for name, value in zip(POSE_NUMBERS, values)}
-    return ' '.join(
-        [
-            PUBLISHER,
-            *(
-                f'--{name} {shlex.quote(value)}'
-                for name, value in (pose | {PARENT: parent, CHILD: child}).items()
-            ),
-        ]
-    )
+    arguments = {name: repr(float(value)) for name, value in zip(POSE_NUMBERS, values)}
+    arguments[PARENT] = parent
+    arguments[CHILD] = child
+    words = [PUBLISHER]
+    for name, argument in arguments.items():
+        words.append(f'--{name} {shlex.quote(argument)}')
+    return ' '.join(words)
 
 
 def find_pose(content: bytes) -> tuple[Placement, str] | None:
     """
-    Return (placement, our frame) of the first such line in a file, None where there is none.
+    Return (placement, name of our frame) from the first `pose_line` of a file.
 
-    In files of other programs.
+    None without such a line, or if it cannot be read.
     """
     line = re.search(rf'{PUBLISHER} (.*)', content.decode(errors='replace'))
     try:
+        # In a JSON file a quotation mark ends the line.
         words = shlex.split(line.group(1).partition('"')[0]) if line else []
         options = {}
         for name, value in zip(words, words[1:], strict=False):
@@ -278,11 +289,14 @@ def find_pose(content: bytes) -> tuple[Placement, str] | None:
         parent = options[PARENT]
     except (KeyError, ValueError):
         return None
-    if not np.all(np.isfinite(values)) or not 0.99 < np.linalg.norm(values[3:]) < 1.01:
+    origin = values[:3]
+    quaternion = values[3:]
+    if not np.all(np.isfinite(values)) or not 0.99 < np.linalg.norm(quaternion) < 1.01:
         return None
-    return Placement(mat_ts=rotations_from_quaternions(values[3:]).T, origin_s=values[:3]), (
-        '' if parent == UNNAMED else parent
-    )
+    if parent == UNNAMED:
+        parent = ''
+    placement = Placement(mat_ts=rotations_from_quaternions(quaternion).T, origin_s=origin)
+    return placement, parent
 
 
 FRD = np.diag([1.0, -1.0, -1.0])
@@ -305,6 +319,7 @@ def lower_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             ' into their mirror image; check for an exchanged axis',
             code='left_handed',
         )
+    # With matrix' = Q_0 R: L = R', Q = Q_0'; the signs make the diagonal of L positive.
     q, r = np.linalg.qr(matrix.T)
     signs = np.sign(np.diag(r))
     return np.tril((r * signs[:, None]).T), (q * signs).T

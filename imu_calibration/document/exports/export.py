@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Any
 
 import numpy as np
 
@@ -54,7 +53,7 @@ class Export:
     content: bytes
     """The file."""
     numbers: Numbers
-    """Its content of the calibration."""
+    """The numbers of the calibration in it."""
     placement: Placement
     """Frame, origin and axes of these numbers."""
     loss: Loss
@@ -62,7 +61,7 @@ class Export:
     lines: tuple[str, ...]
     """Notes: the same in the file and on the terminal."""
     used: Usable
-    """The part of the calibration whose numbers these are."""
+    """The calibration with the sensors that the numbers correct, and those refused."""
 
     @property
     def refused(self) -> Mapping[str, str]:
@@ -126,23 +125,26 @@ def export(
         used = Usable(calibration)
     else:
         used = usable(calibration, anyway=anyway)
+    # Without the corrections of refused sensors; the loss below is against the complete one.
     applied = used.calibration
     if rate is not None and not 0 < rate < np.inf:
         raise InputError(
             f'the rate must be above zero, got {rate:g} Hz; correct it', code='rate_not_positive'
         )
-    found, unknown = _noise_numbers(applied, target, noise, rate)
+    noise_numbers, noise_notes = _noise_numbers(applied, target, noise, rate)
     placement, numbers = placed_numbers(applied, target)
     motion = motion or standard_motion(applied)
     loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
-    trust = [f'of the calibration: {line}' for line in (*used.lines, *caveats(applied))]
+    notes = [f'the {sensor} was not calibrated' for sensor in applied.absent]
+    notes += [f'of the calibration: {line}' for line in (*used.lines, *caveats(applied))]
+    notes += [*target.ignored(numbers), *noise_notes]
+    if target.hint:
+        notes.append(target.hint)
     lines = [
         *_placement_lines(applied, target, placement),
         *_worked_sample(target, numbers, placement, applied),
         *loss_lines(target, loss, applied.sensors),
-        *(f'note: the {sensor} was not calibrated' for sensor in applied.absent),
-        *(f'note: {line}' for line in (*trust, *target.ignored(numbers), *unknown)),
-        *(f'note: {hint}' for hint in [target.hint] if hint),
+        *(f'note: {note}' for note in notes),
     ]
     head = [
         f'{target.title}, written by imu_calibration {imu_calibration.__version__}',
@@ -151,7 +153,7 @@ def export(
     ]
     rate = rate or (noise.rate if noise else None)
     assert target.write is not None  # `find_target` gives no other
-    content = target.write(Page(numbers, found, [*head, *lines], applied, rate))
+    content = target.write(Page(numbers, noise_numbers, [*head, *lines], applied, rate))
     return Export(
         content.encode() if isinstance(content, str) else content,
         numbers,
@@ -166,25 +168,30 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
     """Return the placement of a target for a calibration and the numbers there."""
     if target.whole:
         return Placement(), calibration_mapping(calibration)
-    held = affine_of(calibration, target.holds)
-    # a target with diagonals only chooses its axes by the full matrices too
+    representable = affine_of(calibration, target.holds)
     if target.forward_right_down:
         placement = forward_right_down(calibration.readings)
     else:
-        placement = target.placement(
-            affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES)
-        )
-    return placement, target.numbers(calibration_moved(held, placement))
+        # A target that has only the diagonals chooses its axes by the full matrices too.
+        geometry = MATRICES
+        if np.any(representable.arms):
+            geometry = MATRICES + ARMS
+        placement = target.placement(affine_of(calibration, geometry))
+    return placement, target.numbers(calibration_moved(representable, placement))
 
 
 def _noise_numbers(
     calibration: Calibration, target: Target, figures: NoiseFigures | None, rate: float | None
 ) -> tuple[Numbers | None, list[str]]:
-    """Return (noise in the target's terms or None, notes on unknown figures)."""
+    """
+    Return (noise in the target's terms, notes on unknown figures).
+
+    The noise is None if the target has none, or needs figures that are not known.
+    """
     if target.noise is None:
         return None, []
-    found = _noise_of(calibration, figures, rate)
-    if found is None or (target.needs_walk and not found.walk_known):
+    noise = _noise_of(calibration, figures, rate)
+    if noise is None or (target.needs_walk and not noise.walk_known):
         lacks = (
             'noise with random walks'
             if target.needs_walk
@@ -202,12 +209,13 @@ def _noise_numbers(
         ]
     if target.needs_walk and figures is not None:
         _require_rest_for_walk(figures)
-    bases = {sensor: getattr(found, sensor).basis for sensor in SENSORS if target.needs_walk}
-    return target.noise(found), [
-        f'random walk of the {sensor}: {BASIS[basis]}'
-        for sensor, basis in bases.items()
-        if basis != 'walk'
-    ]
+    notes = []
+    if target.needs_walk:
+        for sensor in SENSORS:
+            basis = getattr(noise, sensor).basis
+            if basis != 'walk':
+                notes.append(f'random walk of the {sensor}: {BASIS[basis]}')
+    return target.noise(noise), notes
 
 
 def _require_rest_for_walk(figures: NoiseFigures) -> None:
@@ -227,6 +235,11 @@ def _require_rest_for_walk(figures: NoiseFigures) -> None:
 def _noise_of(
     calibration: Calibration, figures: NoiseFigures | None, rate: float | None
 ) -> Noise | None:
+    """
+    Return the noise of a noise document, or else the white noise of the calibration.
+
+    The latter needs a rate; None without one, or if the calibration has no noise of a sensor.
+    """
     if figures is not None:
         figures.require_both_sensors('record both sensors, or export without it')
         densities = {sensor: figures.densities(sensor) for sensor in SENSORS}
@@ -239,13 +252,14 @@ def _noise_of(
                 code='walk_unbounded',
             )
         return Noise(densities['accelerometer'], densities['gyroscope'], rate or figures.rate)
-    white = {sensor: float(calibration.noise(sensor)[0].max()) for sensor in SENSORS}
-    if rate is None or not all(white.values()):
+    # Of the noisiest axis.
+    sample_sd = {sensor: float(calibration.noise(sensor)[0].max()) for sensor in SENSORS}
+    if rate is None or not all(sample_sd.values()):
         return None
     # Density of white noise: sd of a sample / sqrt(rate).
     root = float(np.sqrt(rate))
-    accelerometer = Densities(white['accelerometer'] / root, 0.0, 'bound')
-    gyroscope = Densities(white['gyroscope'] / root, 0.0, 'bound')
+    accelerometer = Densities(sample_sd['accelerometer'] / root, 0.0, 'bound')
+    gyroscope = Densities(sample_sd['gyroscope'] / root, 0.0, 'bound')
     return Noise(accelerometer, gyroscope, rate, walk_known=False)
 
 
@@ -254,19 +268,15 @@ def _placement_lines(calibration: Calibration, target: Target, placement: Placem
     name = calibration.frame_id or UNNAMED
     if target.only_noise:
         return []
-    if (
-        np.array_equal(placement.mat_readings, np.eye(3))
-        and np.array_equal(placement.mat_ts, np.eye(3))
-        and not np.any(placement.origin_s)
-    ):
-        if target.forward_right_down:
-            return [f'frame: {name}, forward-right-down as its readings']
-        return [f'frame: {name}, axes as in the calibration']
-    if not np.array_equal(placement.mat_readings, np.eye(3)):
+    if not np.array_equal(placement.mat_readings, np.eye(3)):  # an autopilot
         if np.array_equal(placement.mat_readings, FRD):
             return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
         rows = ', '.join(_axis(row) for row in placement.mat_readings)
         return [f'frame: forward-right-down, the axes {rows} of {name}, readings too']
+    if np.array_equal(placement.mat_ts, np.eye(3)) and not np.any(placement.origin_s):
+        if target.forward_right_down:
+            return [f'frame: {name}, forward-right-down as its readings']
+        return [f'frame: {name}, axes as in the calibration']
     child = f'{name}_{target.name}'
     return [
         (
@@ -286,62 +296,61 @@ def _axis(row: np.ndarray) -> str:
 
 
 def _worked_sample(
-    target: Target, numbers: dict[str, Any], placement: Placement, calibration: Calibration
+    target: Target, numbers: Numbers, placement: Placement, calibration: Calibration
 ) -> list[str]:
     """Show one reading before and after the target's formula."""
     if target.whole or target.only_noise or target.estimates:
         return []
     temperature = np.array([calibration.model.temperature_ref_c])
-    raw = np.array([[0.5, -0.3, 9.7]]), np.array([[0.1, -0.2, 0.3]])
-    force, rate = placement.readings(*raw)
-    made = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
-    shown = []
-    for values in (force, rate, *made):
-        numbers = ', '.join(f'{value:.9g}' for value in values[0])
-        shown.append(f'[{numbers}]')
+    raw_force = np.array([[0.5, -0.3, 9.7]])
+    raw_rate = np.array([[0.1, -0.2, 0.3]])
+    force, rate = placement.readings(raw_force, raw_rate)
+    corrected = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
+    texts = []
+    for vectors in (force, rate, *corrected):  # shape (1, 3)
+        components = ', '.join(f'{value:.9g}' for value in vectors[0])
+        texts.append(f'[{components}]')
     return [
-        f'worked sample: readings {shown[0]} m/s^2, {shown[1]} rad/s become {shown[2]}, {shown[3]}'
+        f'worked sample: readings {texts[0]} m/s^2, {texts[1]} rad/s become {texts[2]}, {texts[3]}'
     ]
 
 
 def loss_lines(target: Target, loss: Loss, sensors: Sequence[str] = SENSORS) -> list[str]:
-    """Return the losses, a line each; the remaining error of the calibrated `sensors`."""
+    """Return a line for each lost effect, and for the remaining error of each of `sensors`."""
     if target.only_noise:
-        left = ', '.join(
-            f'{sensor} {error_text(value, UNITS[sensor])}' for sensor, value in loss.left.items()
+        remaining = ', '.join(
+            f'{sensor} {error_text(rms, UNITS[sensor])}' for sensor, rms in loss.remaining.items()
         )
-        beside = ' in addition to a constant bias' if target.estimates else ''
+        addition = ' in addition to a constant bias' if target.estimates else ''
         return [
             (
                 'accepts no calibration: use compensated readings (compensator_node, or the verb'
                 ' compensate)'
             ),
             (
-                f'fed with raw readings it is left with an error of rms {left}{beside}, on'
+                f'fed with raw readings it is left with an error of rms {remaining}{addition}, on'
                 f' {loss.motion}'
             ),
         ]
     lines = []
     if loss.estimated:
-        lines.append(
-            'not written, because the target estimates it while it runs: '
-            + ', '.join(f'{effect.sensor} {effect.name}' for effect in loss.estimated)
-        )
+        names = ', '.join(f'{effect.sensor} {effect.name}' for effect in loss.estimated)
+        lines.append(f'not written, because the target estimates it while it runs: {names}')
     if loss.nothing:
         return [*lines, 'lost: nothing']
     for lost in loss.effects:
-        what = 'held in part' if lost.in_part else 'lost'
+        extent = 'held in part' if lost.in_part else 'lost'
         lines.append(
-            f'{what}: {lost.effect.sensor} {lost.effect.name},'
+            f'{extent}: {lost.effect.sensor} {lost.effect.name},'
             f' {error_text(lost.rms, UNITS[lost.effect.sensor])} rms'
         )
     for sensor in sensors:
-        left = 'none'
-        if loss.left[sensor] > ROUNDING_LOSS:
-            left = f'{error_text(loss.left[sensor], UNITS[sensor])} rms'
+        remaining = 'none'
+        if loss.remaining[sensor] > ROUNDING_LOSS:
+            remaining = f'{error_text(loss.remaining[sensor], UNITS[sensor])} rms'
         raw = error_text(loss.raw[sensor], UNITS[sensor])
         lines.append(
-            f'remaining error of the {sensor}: {left} (raw readings: {raw}), on {loss.motion}'
+            f'remaining error of the {sensor}: {remaining} (raw readings: {raw}), on {loss.motion}'
         )
     return lines
 
@@ -350,7 +359,7 @@ def holds_in_words(target: Target) -> str:
     """Return a short description of a target's capacity."""
     if target.whole:
         return 'everything'
-    parts: dict[str, list[str]] = {}
+    sensors_of: dict[str, list[str]] = {}  # name of a kind of effect -> sensors
     for capability in target.holds:
         if capability.own_axis:
             name = 'scale factors'
@@ -358,25 +367,22 @@ def holds_in_words(target: Target) -> str:
             name = 'matrix'
         else:
             name = capability.effect.heading
-        name = name.split(' (')[0].split(':')[0]
+        name = name.split(' (')[0].split(':')[0]  # without explanations
         for sensor in SENSORS:  # a heading may begin with its sensor
             name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
-        parts.setdefault(name, []).append(capability.sensor)
-    return (
-        ', '.join(
-            name if len(sensors) == 2 else f'{name} ({sensors[0]})'
-            for name, sensors in parts.items()
-        )
-        or '-'
-    )
+        sensors_of.setdefault(name, []).append(capability.sensor)
+    parts = []
+    for name, sensors in sensors_of.items():
+        parts.append(name if len(sensors) == 2 else f'{name} ({sensors[0]})')
+    return ', '.join(parts) or '-'
 
 
 @cache
 def all_targets() -> dict[str, Target]:
     """Return every target by name, in alphabetical order."""
     by_name = {}
-    for found in iter_modules(targets.__path__):
-        module = import_module(f'{targets.__name__}.{found.name}')
+    for module_info in iter_modules(targets.__path__):
+        module = import_module(f'{targets.__name__}.{module_info.name}')
         by_name |= {target.name: target for target in module.TARGETS}
     return dict(sorted(by_name.items()))
 

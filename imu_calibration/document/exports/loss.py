@@ -25,7 +25,8 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD, WEAK
 from imu_calibration.kinematics.rotations import Reference
 
-SPIRAL_SECONDS, SAMPLES_PER_SECOND = 60.0, 50
+SPIRAL_SECONDS = 60.0
+SAMPLES_PER_SECOND = 50
 RATE_FREQUENCIES = np.array([0.3, 0.4, 0.5])
 """Hz; of the rates about x, y, z."""
 USUAL_RATE = 1.0
@@ -44,7 +45,7 @@ class TrialMotion:
     temperature.
     """
     text: str
-    """Description."""
+    """Description of the motion, for the loss that is printed."""
 
 
 def motion_of(
@@ -60,9 +61,7 @@ def motion_of(
 
 def standard_motion(calibration: Calibration) -> TrialMotion:
     """
-    Return the declared motion of a calibration.
-
-    A minute with gravity in all directions and rates as large as in its recording.
+    Return a minute with gravity in all directions and rates as large as in the recording.
 
     Gravity runs along a spiral from nadir to zenith; each rate swings with the calibration's
     largest rate, or 1 rad/s, at 0.3 to 0.5 Hz; the temperature runs through the calibration's
@@ -73,10 +72,11 @@ def standard_motion(calibration: Calibration) -> TrialMotion:
     gravity = conditions.get('gravity')
     gravity = gravity if isinstance(gravity, float) and gravity > 0 else STANDARD_GRAVITY
     time = np.arange(int(SPIRAL_SECONDS * SAMPLES_PER_SECOND)) / SAMPLES_PER_SECOND
+    # Unit vectors of equal area per height: z from -1 to 1, the azimuth proportional to the time.
     height = np.linspace(-1.0, 1.0, len(time))
-    turn = 2 * np.pi * SPIRAL_TURNS * time / SPIRAL_SECONDS
+    azimuth = 2 * np.pi * SPIRAL_TURNS * time / SPIRAL_SECONDS
     level = np.sqrt(1.0 - height**2)
-    force = gravity * np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
+    force = gravity * np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
     phase = 2 * np.pi * RATE_FREQUENCIES * time[:, None]
     rate = largest * np.sin(phase)
     alpha = largest * 2 * np.pi * RATE_FREQUENCIES * np.cos(phase)
@@ -94,9 +94,9 @@ def recorded_motion(
     calibration: Calibration, imu: ImuSamples, temperature: TemperatureSamples | None, *, name: str
 ) -> TrialMotion:
     """
-    Return the motion of a recording as the calibration sees it: its compensated readings.
+    Return the motion of a recording: its readings, compensated with the calibration.
 
-    Angular acceleration is the slope of the compensated rates, by the filter of the compensation.
+    Angular acceleration is the derivative of the compensated rates by the compensation's filter.
 
     Raises
     ------
@@ -105,25 +105,24 @@ def recorded_motion(
 
     """
     corrected = CompensationStream(calibration, temperature=temperature).correct(imu)
-    kept = (
-        np.isfinite(corrected.force).all(axis=1)
-        & np.isfinite(corrected.rate).all(axis=1)
-        & ~corrected.flagged
-    )
-    if not kept.any():
+    valid = np.isfinite(corrected.force).all(axis=1)
+    valid &= np.isfinite(corrected.rate).all(axis=1)
+    valid &= ~corrected.flagged
+    if not valid.any():
         raise InputError(
             f'{name} must have readings that can be compensated, it has none; give another'
             ' recording'
         )
-    stamps = imu.stamp_ns[kept]
-    slope = StampedDerivative(derivative_for(calibration, typical_period(stamps[:10_000]) or 0.01))
-    alpha = slope.push_block(stamps, corrected.rate[kept])
+    stamps = imu.stamp_ns[valid]
+    period = typical_period(stamps[:10_000]) or 0.01
+    derivative = StampedDerivative(derivative_for(calibration, period))
+    alpha = derivative.push_block(stamps, corrected.rate[valid])
     return motion_of(
-        corrected.force[kept],
-        corrected.rate[kept],
+        corrected.force[valid],
+        corrected.rate[valid],
         alpha,
         temperature_c=measured_temperature(calibration, temperature, stamps),
-        text=f'{name} ({int(kept.sum())} samples)',
+        text=f'{name} ({int(valid.sum())} samples)',
     )
 
 
@@ -131,9 +130,9 @@ def measured_temperature(
     calibration: Calibration, temperature: TemperatureSamples | None, stamp_ns: np.ndarray
 ) -> np.ndarray:
     """
-    Return the temperature at stamps, shape (n,).
+    Return the temperature at stamps, interpolated, degrees Celsius, shape (n,).
 
-    The calibration's reference where none was measured.
+    It is the calibration's reference temperature if none was measured.
     """
     if temperature is None or not len(temperature):
         return np.full(len(stamp_ns), calibration.model.temperature_ref_c)
@@ -154,11 +153,11 @@ class LostEffect:
     """An effect of the calibration that a program cannot hold, or not wholly."""
 
     effect: Effect
-    """Which."""
+    """The effect."""
     in_part: bool
-    """Whether a part of it is held."""
+    """Whether the program can hold a part of its values."""
     rms: float
-    """Root mean square of its contribution to the readings, per component, SI."""
+    """Rms contribution of the values that it cannot hold to the readings, per component, SI."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +168,7 @@ class Loss:
     """Effects that are not represented, in the catalogue's order."""
     estimated: tuple[Effect, ...]
     """Effects that the program finds by itself; they count as known here."""
-    left: dict[str, float]
+    remaining: dict[str, float]
     """
     Sensor -> rms difference per component between the program's readings and the full compensation,
     SI.
@@ -182,7 +181,7 @@ class Loss:
     @property
     def nothing(self) -> bool:
         """Whether the program's readings equal the full compensation."""
-        return not self.effects and max(self.left.values()) < ROUNDING_LOSS
+        return not self.effects and max(self.remaining.values()) < ROUNDING_LOSS
 
 
 def loss_of(
@@ -196,9 +195,9 @@ def loss_of(
     """
     Return the loss of a target on a motion.
 
-    Readings are simulated without noise by the model that compensation inverts. The effects that
-    the target estimates are removed from them; the target's formula is applied; the result is
-    compared with the true motion in its frame, at its origin.
+    Readings are simulated without noise by the model that compensation inverts, with the effects
+    that the target estimates at their priors. The target's formula is applied to them; the result
+    is compared with the true motion in its frame, at its origin.
 
     Parameters
     ----------
@@ -213,62 +212,65 @@ def loss_of(
     """
     model, values = invertible_values(calibration)
     ref = motion.reference
-    effects = {effect.key: effect for effect in model.effects}
-    read = {sensor: sensor_output(model, sensor, values, ref=ref) for sensor in SENSORS}
-    without = values.copy()
-    estimated = tuple(
-        e
-        for e in effects.values()
-        if affine.capability_of(e, target.estimates) and e.key in calibration.model.slices
-    )
-    for effect in estimated:
-        without[model.slices[effect.key]] = effect.prior_values()
-    seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
+    estimated = []
+    values_unestimated = values.copy()
+    for effect in model.effects:
+        if effect.key not in calibration.model.slices:
+            continue
+        if affine.capability_of(effect, target.estimates):
+            estimated.append(effect)
+            values_unestimated[model.slices[effect.key]] = effect.prior_values()
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
-    made, lost = true, ()  # the whole document represents all effects of the full compensation
+    # The whole document represents all effects of the full compensation.
+    corrected = true
+    lost = []
     if not target.whole:
         assert ref.temperature_c is not None  # a trial motion has it
-        force, rate = placement.readings(*seen.values())
-        readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, ref.temperature_c)
-        made = target.corrected(numbers, readings)
-        parts = (
-            _lost(calibration, effect, target.holds, motion)
-            for effect in effects.values()
-            if effect not in estimated
+        force, rate = placement.readings(
+            sensor_output(model, 'accelerometer', values_unestimated, ref=ref),
+            sensor_output(model, 'gyroscope', values_unestimated, ref=ref),
         )
-        lost = tuple(part for part in parts if part is not None)
-    return Loss(
-        lost,
-        estimated,
-        {s: _rms(m - t) for s, m, t in zip(SENSORS, made, true)},
-        {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))},
-        motion.text,
-    )
+        readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, ref.temperature_c)
+        corrected = target.corrected(numbers, readings)
+        for effect in model.effects:
+            if effect not in estimated:
+                lost_effect = _lost_effect(calibration, effect, target.holds, motion)
+                if lost_effect is not None:
+                    lost.append(lost_effect)
+    remaining = {}
+    raw_error = {}
+    for index, sensor in enumerate(SENSORS):
+        remaining[sensor] = _rms(corrected[index] - true[index])
+        raw = sensor_output(model, sensor, values, ref=ref)
+        raw_error[sensor] = _rms(raw - (ref.force_s, ref.rate_s)[index])
+    return Loss(tuple(lost), tuple(estimated), remaining, raw_error, motion.text)
 
 
-def _lost(
+def _lost_effect(
     calibration: Calibration,
     effect: Effect,
     holds: tuple[Capability, ...],
     motion: TrialMotion,
 ) -> LostEffect | None:
     """
-    Return the part of the readings due to the part of an effect that is not represented.
+    Return the loss by an effect: readings with all its values against those with the held values.
 
-    None where the whole effect is.
+    None if the target represents the whole effect.
     """
     capability = affine.capability_of(effect, holds)
     held = affine.held_values(calibration, effect, capability)
     if np.array_equal(held, calibration.values[calibration.model.slices[effect.key]]):
         return None
     model, values = invertible_values(calibration)
-    less = values.copy()
-    less[model.slices[effect.key]] = held
-    change = [sensor_output(model, effect.sensor, v, ref=motion.reference) for v in (values, less)]
-    return LostEffect(effect, capability is not None, _rms(change[0] - change[1]))
+    held_only = values.copy()
+    held_only[model.slices[effect.key]] = held
+    output = sensor_output(model, effect.sensor, values, ref=motion.reference)
+    output_of_held = sensor_output(model, effect.sensor, held_only, ref=motion.reference)
+    return LostEffect(effect, capability is not None, _rms(output - output_of_held))
 
 
 def _rms(values: np.ndarray) -> float:
+    """Return the root mean square of all components."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -299,43 +301,38 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
 
     """
     assert target.read is not None  # `find_target` gives no other
-    found = target.read(content, path)
+    file = target.read(content, path)
     if target.whole:
-        return from_mapping(found.numbers)
+        return from_mapping(file.numbers)
     assert target.imu is not None
-    read = target.imu(found.numbers)
-    own = affine.find_pose(content)
-    if own is None:
-        if target.forward_right_down:
-            back = affine.forward_right_down(IMPORTED_FROM_AUTOPILOT)
-        else:
-            back = target.back(read)
-        return _document(
-            target, found, affine.calibration_moved(read, back), target.axes, path, frame_id
-        )
-    placement, parent = own
-    return _document(
-        target,
-        found,
-        affine.calibration_moved(read, placement.inverse()),
-        'mount',
-        path,
-        frame_id or parent,
-    )
+    imu = target.imu(file.numbers)
+    pose = affine.find_pose(content)
+    if pose is not None:  # a file of an export, which states its placement
+        placement, parent = pose
+        imu = affine.calibration_moved(imu, placement.inverse())
+        return _document(target, file, imu, 'mount', path, frame_id or parent)
+    if target.forward_right_down:
+        back = affine.forward_right_down(IMPORTED_FROM_AUTOPILOT)
+    else:
+        back = target.back(imu)
+    imu = affine.calibration_moved(imu, back)
+    return _document(target, file, imu, target.axes, path, frame_id)
 
 
 def _document(
-    target: Target, found: Read, imu: affine.AffineImu, axes: str, path: Any, frame_id: str
+    target: Target, file: Read, imu: affine.AffineImu, axes: str, path: Any, frame_id: str
 ) -> Calibration:
-    holds = tuple(capability for capability in target.holds if capability not in found.lacks)
+    """
+    Return the calibration of an IMU that was read, in the frame of the calibration.
+
+    `axes` is the convention that fixes its axes, as named by the gauge.
+    """
+    holds = tuple(capability for capability in target.holds if capability not in file.lacks)
     # Bias and matrix always, further effects where the file gives them a value.
-    named = [
-        *affine.OFFSETS,
-        *affine.MATRICES,
-        *(capability for capability in holds if np.any(imu.value(capability))),
-    ]
+    capabilities = [*affine.OFFSETS, *affine.MATRICES]
+    capabilities += [capability for capability in holds if np.any(imu.value(capability))]
     names: dict[str, tuple[str, ...]] = {sensor: () for sensor in SENSORS}
-    for capability in named:  # an effect may hold several capabilities
+    for capability in capabilities:  # several of them may have the same effect
         effect_name = capability.effect.name
         if effect_name not in names[capability.sensor]:
             names[capability.sensor] += (effect_name,)
@@ -349,17 +346,19 @@ def _document(
         part = model.slices[effect.key]
         if capability is not None:
             values[part] = imu.value(capability).ravel()
-            known = np.eye(3).ravel() > 0 if capability.own_axis else np.full(effect.size, True)
-            status[part] = np.where(known, WEAK, HELD)
+            in_file = np.full(effect.size, True)
+            if capability.own_axis:
+                in_file = np.eye(3).ravel() > 0
+            status[part] = np.where(in_file, WEAK, HELD)
     name = getattr(path, 'name', str(path))
     reason = (
         f'imported from {target.title} ({name}) without uncertainties, its error was not measured'
         ' on a recording'
     )
-    statistics = {sensor: {'noise_sd': [value] * 3} for sensor, value in found.sample_sd.items()}
-    conditions = (
-        {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}
-    )
+    statistics = {sensor: {'noise_sd': [sd] * 3} for sensor, sd in file.sample_sd.items()}
+    conditions = {}
+    if imu.temperature_range_c:
+        conditions['temperature_range_c'] = list(imu.temperature_range_c)
     gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN_SD, 'axes': axes}
     provenance = {
         'software': imu_calibration.__version__,

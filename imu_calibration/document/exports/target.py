@@ -27,22 +27,22 @@ def commented(lines: list[str]) -> str:
     return ''.join(f'# {printable(line)}'.rstrip() + '\n' for line in lines)
 
 
-def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:
+def yaml_file(comments: list[str], mapping: dict[str, Any], head: str = '') -> str:
     """Return a YAML file with comments before the content; `head` is a line that must be first."""
     return head + commented(comments) + to_text(plain(mapping))
 
 
-def read_yaml(content: bytes, what: str) -> dict:
+def read_yaml(content: bytes, what: str) -> dict[str, Any]:
     """Return the mapping in a YAML file; the line ``%YAML:1.0`` of OpenCV may precede it."""
     lines = text_of(content, what).splitlines()
-    kept = '\n'.join(line for line in lines if not line.startswith('%YAML'))
-    return from_text(kept, what)
+    body = '\n'.join(line for line in lines if not line.startswith('%YAML'))
+    return from_text(body, what)
 
 
-def read_json(content: bytes, what: str) -> dict:
+def read_json(content: bytes, what: str) -> dict[str, Any]:
     """Return the mapping in a JSON file."""
     try:
-        found = json.loads(
+        mapping = json.loads(
             text_of(content, what),
             parse_int=lambda digits: int(digits) if len(digits) < 100 else float(digits),
         )
@@ -50,11 +50,11 @@ def read_json(content: bytes, what: str) -> dict:
         raise InputError(
             f'the {what} must be JSON: {shortened(str(error))}; give another file'
         ) from error
-    if not isinstance(found, dict):
+    if not isinstance(mapping, dict):
         raise InputError(
-            f'the {what} must hold a mapping, got {type(found).__name__}; give another file'
+            f'the {what} must hold a mapping, got {type(mapping).__name__}; give another file'
         )
-    return found
+    return mapping
 
 
 def text_of(content: bytes, what: str) -> str:
@@ -67,14 +67,16 @@ def text_of(content: bytes, what: str) -> str:
         ) from error
 
 
-def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -> np.ndarray:
+def numbers_at(
+    mapping: dict[str, Any], name: str, shape: tuple[int, ...], *, what: str
+) -> np.ndarray:
     """
-    Return an entry of a mapping as an array.
+    Return an entry of a mapping as an array of a shape.
 
     Raises
     ------
     InputError
-        When it is missing, or not finite numbers of that shape.
+        When it is missing, or not finite numbers, as many as the shape has.
 
     """
     try:
@@ -92,15 +94,15 @@ def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -
     return array.reshape(shape)
 
 
-def section(mapping: dict, name: str, what: str) -> dict:
-    """Return a mapping in a mapping."""
-    found = mapping.get(name)
-    if not isinstance(found, dict):
+def section(mapping: dict[str, Any], name: str, what: str) -> dict[str, Any]:
+    """Return the entry of a mapping that must be a mapping too."""
+    entry = mapping.get(name)
+    if not isinstance(entry, dict):
         raise InputError(
-            f"the {what} must have a section '{name}', got {shortened(repr(found))}; give another"
+            f"the {what} must have a section '{name}', got {shortened(repr(entry))}; give another"
             ' file'
         )
-    return found
+    return entry
 
 
 def read_parameters(content: bytes, what: str) -> dict[str, float]:
@@ -110,37 +112,39 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     The last field of a line is the value in ArduPilot's lists (``NAME,VALUE``), the fourth in
     QGroundControl's (``vehicle component NAME VALUE type``).
     """
-    found = {}
+    parameters = {}
     for line in text_of(content, what).splitlines():
-        words = re.split(r'[\s,=]+', line.partition('#')[0].strip())
-        name = next(
-            (k for k, word in enumerate(words) if re.fullmatch(r'[A-Z][A-Z0-9_]+', word)), None
-        )
-        if name is None or name + 1 >= len(words):
+        fields = re.split(r'[\s,=]+', line.partition('#')[0].strip())
+        # The first field in capitals is the name, the next one the value.
+        for name, value in zip(fields, fields[1:]):
+            if re.fullmatch(r'[A-Z][A-Z0-9_]+', name):
+                break
+        else:
             continue
         try:
-            found[words[name]] = float(words[name + 1])
+            parameters[name] = float(value)
         except ValueError as error:
             raise InputError(
-                f"the {what} must give '{words[name]}' a number, got {shortened(words[name + 1])};"
-                ' correct it'
+                f"the {what} must give '{name}' a number, got {shortened(value)}; correct it"
             ) from error
-    if not found:
+    if not parameters:
         raise InputError(
             f'the {what} must hold parameters, one NAME and value a line, it holds none; give'
             ' another file'
         )
-    return found
+    return parameters
 
 
-def vector_of(found: Mapping[str, float], name: str, missing: float = 0.0) -> np.ndarray:
+def vector_of(parameters: Mapping[str, float], name: str, missing: float = 0.0) -> np.ndarray:
     """
-    Return the parameters of the three axes, whose letter replaces ``*`` in the name, shape (3,).
+    Return the parameters of the three axes, shape (3,); `missing` is the default of each.
+
+    The letter of the axis replaces ``*`` in the name.
     """
-    return np.array([found.get(name.replace('*', axis), missing) for axis in AXIS_LETTERS])
+    return np.array([parameters.get(name.replace('*', axis), missing) for axis in AXIS_LETTERS])
 
 
-def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
+def refuse_curved(parameters: dict[str, float], beginnings: list[str]) -> None:
     """
     Refuse thermal polynomials of an order that the catalogue does not have.
 
@@ -150,11 +154,14 @@ def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
         When a parameter with one of these beginnings is not zero.
 
     """
-    curved = [name for name, value in found.items() if name.startswith(tuple(beginnings)) and value]
+    curved = []
+    for name, value in parameters.items():
+        if name.startswith(tuple(beginnings)) and value:
+            curved.append(name)
     if curved:
         raise InputError(
             f'thermal offsets must be linear in the temperature to be read, got {curved[0]} ='
-            f' {found[curved[0]]:g}; set it to 0, or calibrate with a temperature topic',
+            f' {parameters[curved[0]]:g}; set it to 0, or calibrate with a temperature topic',
             code='not_linear',
         )
 
@@ -204,22 +211,29 @@ Fixed-point steps of the inversion: arms and g-sensitivity couple both sensors b
 
 def inverted(imu: AffineImu, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return true (force, rate), the inverse of `AffineImu`.
+    Return true (force, rate) of readings, the inverse of `AffineImu`.
 
-    Beyond its range of temperature the thermal part is that of the end.
+    With ``c = matrix^-1 (readings - bias - thermal (T - T0))`` of each sensor and the lever matrix
+    L, a fixed-point iteration solves::
+
+        rate = c_gyro - matrix_gyro^-1 cross force
+        force_i = c_accel_i - (L arm_i)_i
+
+    Outside the temperature range the thermal part is that of its nearer end.
     """
     low, high = imu.temperature_range_c or (-np.inf, np.inf)
     warmth = np.clip(readings.temperature_c, low, high) - imu.temperature_ref_c
-    force, turning = (
-        (raw - imu.bias[sensor] - np.outer(warmth, imu.thermal[sensor]))
-        @ np.linalg.inv(imu.matrix[sensor]).T
-        for sensor, raw in zip(SENSORS, (readings.force, readings.rate))
-    )
-    apparent = force
+    linear = []  # c of accelerometer and gyroscope
+    for sensor, raw in zip(SENSORS, (readings.force, readings.rate)):
+        offset_free = raw - imu.bias[sensor] - np.outer(warmth, imu.thermal[sensor])
+        linear.append(offset_free @ np.linalg.inv(imu.matrix[sensor]).T)
+    linear_force, linear_rate = linear
     cross = np.linalg.solve(imu.matrix['gyroscope'], imu.cross)
+    force = linear_force
     for _ in range(EXPORT_INVERSION_STEPS):
-        rate = turning - force @ cross.T
-        force = apparent - np.einsum('nij,ij->ni', lever_matrix(rate, readings.alpha), imu.arms)
+        rate = linear_rate - force @ cross.T
+        at_arms = np.einsum('nij,ij->ni', lever_matrix(rate, readings.alpha), imu.arms)
+        force = linear_force - at_arms
     return force, rate
 
 
@@ -286,7 +300,7 @@ class Target:
     read: Callable[[bytes, Any], Read] | None = None
     """``read(content, path)``; None: its files have no calibration."""
     imu: Callable[[Numbers], AffineImu] | None = None
-    """The IMU of numbers, in the program's placement: the other way of `numbers`."""
+    """The IMU of numbers, in the program's placement: the inverse of `numbers`."""
     back: Callable[[AffineImu], Placement] = as_mounted
     """The placement of our calibration against an IMU that was read."""
     forward_right_down: bool = False
@@ -300,11 +314,9 @@ class Target:
 
     def corrected(self, numbers: Numbers, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
         """Return specific force and rate that the program makes of readings with these numbers."""
-        return (
-            (readings.force, readings.rate)
-            if self.imu is None
-            else inverted(self.imu(numbers), readings)
-        )
+        if self.imu is None:
+            return readings.force, readings.rate
+        return inverted(self.imu(numbers), readings)
 
     @property
     def only_noise(self) -> bool:

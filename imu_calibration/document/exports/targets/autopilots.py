@@ -24,6 +24,7 @@ from imu_calibration.document.exports.affine import (
 )
 from imu_calibration.document.exports.target import (
     AXIS_LETTERS,
+    Numbers,
     Page,
     Read,
     Target,
@@ -40,12 +41,17 @@ def _by_axis(pattern: str, values: Iterable[Any]) -> dict[str, Any]:
     return {pattern.replace('*', axis): value for axis, value in zip(AXIS_LETTERS, values)}
 
 
-def _has(found: Mapping[str, float], pattern: str) -> bool:
-    return any(name in found for name in _by_axis(pattern, AXIS_LETTERS))
+def _has(parameters: Mapping[str, float], pattern: str) -> bool:
+    """Return whether the file has the parameter of at least one axis."""
+    return any(name in parameters for name in _by_axis(pattern, AXIS_LETTERS))
 
 
 def _linear(imu: AffineImu, offset: Mapping[str, str], scale: str) -> dict[str, float]:
-    """Return the offsets of both sensors, and the scale factors of the accelerometer."""
+    """
+    Return the offsets of both sensors, and the scale factors of the accelerometer.
+
+    The programs multiply by their scale factor: it is the inverse of the sensor's.
+    """
     parameters = {}
     for sensor in SENSORS:
         parameters |= _by_axis(offset[sensor], imu.bias[sensor])
@@ -60,7 +66,7 @@ PREFIXES_OF_SENSOR = {
 
 
 def _written(page: Page) -> dict[str, Any]:
-    """Return the parameters without those of a sensor that was not calibrated."""
+    """Return the parameters to write: those of a sensor that was not calibrated are omitted."""
     absent: tuple[str, ...] = ()
     for sensor in page.calibration.absent:
         absent += PREFIXES_OF_SENSOR[sensor]
@@ -69,28 +75,33 @@ def _written(page: Page) -> dict[str, Any]:
     }
 
 
-def _matrix(found: Mapping[str, float], scale: str) -> dict[str, np.ndarray]:
-    return {'accelerometer': np.diag(1.0 / vector_of(found, scale, 1.0)), 'gyroscope': np.eye(3)}
+def _matrix(parameters: Mapping[str, float], scale: str) -> dict[str, np.ndarray]:
+    """Return sensor -> matrix, from the scale factors of the accelerometer."""
+    factors = vector_of(parameters, scale, 1.0)
+    return {'accelerometer': np.diag(1.0 / factors), 'gyroscope': np.eye(3)}
 
 
 OFFSET = {'accelerometer': 'INS_ACCOFFS_*', 'gyroscope': 'INS_GYROFFS_*'}
 SCALE = 'INS_ACCSCAL_*'
 CALTEMP = {'accelerometer': 'INS_ACC1_CALTEMP', 'gyroscope': 'INS_GYR1_CALTEMP'}
-TCAL, TCAL_SENSORS = 'INS_TCAL1', {'accelerometer': 'ACC', 'gyroscope': 'GYR'}
+TCAL = 'INS_TCAL1'
+TCAL_SENSORS = {'accelerometer': 'ACC', 'gyroscope': 'GYR'}
 PER_PARAMETER = 1e-6
 """Unit of the coefficients of the polynomials."""
 ARDUPILOT_RANGE_C = (0.0, 70.0)
+"""Degrees Celsius; defaults of TMIN and TMAX."""
 NO_TEMPERATURE = -300.0
+"""ArduPilot's default of CALTEMP; it is clipped to the range."""
 LARGEST_OFFSET = 3.5
 """m/s^2; ArduPilot refuses to arm with a larger offset of the accelerometer."""
 SCALES_ALLOWED = (0.8, 1.2)
 
 
-def numbers_ardupilot(imu: AffineImu) -> dict:
+def numbers_ardupilot(imu: AffineImu) -> Numbers:
     """
-    Return parameters.
+    Return the parameters of an IMU.
 
-    Offsets count at the temperature CALTEMP, polynomials without constant are about 35 C.
+    Offsets hold at the temperature CALTEMP; the polynomials, without a constant, are about 35 C.
     """
     parameters = _linear(imu, OFFSET, SCALE)
     if not any(np.any(imu.thermal[sensor]) for sensor in SENSORS):
@@ -109,28 +120,30 @@ def numbers_ardupilot(imu: AffineImu) -> dict:
     return parameters
 
 
-def imu_ardupilot(found: dict) -> AffineImu:
-    """Return the IMU of such parameters."""
-    bias, thermal = {}, {}
+def imu_ardupilot(parameters: Numbers) -> AffineImu:
+    """Return the IMU of ArduPilot parameters, as `numbers_ardupilot` makes them."""
+    bias = {}
+    thermal = {}
     for sensor in SENSORS:
-        bias[sensor] = vector_of(found, OFFSET[sensor])
+        bias[sensor] = vector_of(parameters, OFFSET[sensor])
         thermal[sensor] = np.zeros(3)
-    ref, limits = 25.0, None
-    if found.get(f'{TCAL}_ENABLE') == 1:
+    ref = 25.0
+    limits = None
+    if parameters.get(f'{TCAL}_ENABLE') == 1:
         for sensor in SENSORS:
-            linear = vector_of(found, f'{TCAL}_{TCAL_SENSORS[sensor]}1_*')
+            linear = vector_of(parameters, f'{TCAL}_{TCAL_SENSORS[sensor]}1_*')
             thermal[sensor] = linear * PER_PARAMETER
         limits = (
-            found.get(f'{TCAL}_TMIN', ARDUPILOT_RANGE_C[0]),
-            found.get(f'{TCAL}_TMAX', ARDUPILOT_RANGE_C[1]),
+            parameters.get(f'{TCAL}_TMIN', ARDUPILOT_RANGE_C[0]),
+            parameters.get(f'{TCAL}_TMAX', ARDUPILOT_RANGE_C[1]),
         )
-        ref = float(np.clip(found.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits))
+        ref = float(np.clip(parameters.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits))
         # The offsets of the gyroscopes count at another temperature; the document has only one.
-        gyro_ref = float(np.clip(found.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
+        gyro_ref = float(np.clip(parameters.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
         bias['gyroscope'] = bias['gyroscope'] + thermal['gyroscope'] * (ref - gyro_ref)
     return AffineImu(
         bias=bias,
-        matrix=_matrix(found, SCALE),
+        matrix=_matrix(parameters, SCALE),
         thermal=thermal,
         temperature_ref_c=ref,
         temperature_range_c=limits,
@@ -146,8 +159,8 @@ def write_ardupilot(page: Page) -> str:
 
 def read_ardupilot(content: bytes, _path: str | Path) -> Read:
     """Read the parameters of the first IMU."""
-    found = read_parameters(content, 'ArduPilot parameter file')
-    if not any(_has(found, pattern) for pattern in (*OFFSET.values(), SCALE)):
+    parameters = read_parameters(content, 'ArduPilot parameter file')
+    if not any(_has(parameters, pattern) for pattern in (*OFFSET.values(), SCALE)):
         raise InputError(
             'the ArduPilot parameter file must hold INS_ACCOFFS, INS_ACCSCAL or INS_GYROFFS, it'
             ' holds none of them; give another file'
@@ -155,22 +168,22 @@ def read_ardupilot(content: bytes, _path: str | Path) -> Read:
     lacks: tuple[Capability, ...] = ()
     curved = []
     for sensor in SENSORS:
-        if not _has(found, OFFSET[sensor]):
+        if not _has(parameters, OFFSET[sensor]):
             lacks += of(sensor, OFFSETS)
         polynomial = f'{TCAL}_{TCAL_SENSORS[sensor]}'
         curved += [f'{polynomial}2', f'{polynomial}3']
-    if not _has(found, SCALE):
+    if not _has(parameters, SCALE):
         lacks += of('accelerometer', SCALES)
-    if found.get(f'{TCAL}_ENABLE') == 1:
-        refuse_curved(found, curved)
-    return Read(found, lacks)
+    if parameters.get(f'{TCAL}_ENABLE') == 1:
+        refuse_curved(parameters, curved)
+    return Read(parameters, lacks)
 
 
-def ignored_ardupilot(found: dict) -> list[str]:
-    """Return the values outside the ranges of ArduPilot."""
+def ignored_ardupilot(parameters: Numbers) -> list[str]:
+    """Return a line for each kind of value outside its range of ArduPilot, and its limits."""
     lines = []
-    offset = vector_of(found, OFFSET['accelerometer'])
-    scale = vector_of(found, SCALE, 1.0)
+    offset = vector_of(parameters, OFFSET['accelerometer'])
+    scale = vector_of(parameters, SCALE, 1.0)
     if np.any(np.abs(offset) > LARGEST_OFFSET):
         lines.append(
             f'ArduPilot accepts INS_ACCOFFS to {LARGEST_OFFSET:g} m/s^2, here'
@@ -230,14 +243,14 @@ INTEGER, REAL = 6, 9
 """Types of MAVLink."""
 
 
-def numbers_px4(imu: AffineImu) -> dict:
-    """Return parameters; the coefficient of power p of axis a is called ``X{p}_{a}``."""
-    found = _linear(imu, CAL_OFFSET, CAL_SCALE)
+def numbers_px4(imu: AffineImu) -> Numbers:
+    """Return the parameters of an IMU; the coefficient of power p of axis a is ``X{p}_{a}``."""
+    parameters = _linear(imu, CAL_OFFSET, CAL_SCALE)
     low, high = imu.temperature_range_c or PX4_RANGE_C
     for sensor in SENSORS:
         if np.any(imu.thermal[sensor]):
             short = TC[sensor]
-            found |= {
+            parameters |= {
                 f'{short}_ENABLE': 1,
                 f'{short}0_TREF': imu.temperature_ref_c,
                 f'{short}0_TMIN': low,
@@ -246,36 +259,37 @@ def numbers_px4(imu: AffineImu) -> dict:
             # The calibration is linear in temperature: the other powers are zero.
             for power, axis in product(range(4), range(3)):
                 value = float(imu.thermal[sensor][axis]) if power == 1 else 0.0
-                found[f'{short}0_X{power}_{axis}'] = value
-    return found
+                parameters[f'{short}0_X{power}_{axis}'] = value
+    return parameters
 
 
-def imu_px4(found: dict) -> AffineImu:
+def imu_px4(parameters: Numbers) -> AffineImu:
     """
-    Return the IMU of such parameters.
+    Return the IMU of PX4 parameters, as `numbers_px4` makes them.
 
     Thermal offsets beyond the first power are refused by `read_px4`.
     """
-    bias, thermal = {}, {}
+    bias = {}
+    thermal = {}
     ref: float | None = None
     lowest, highest = -math.inf, math.inf
     for sensor in SENSORS:
         short = f'{TC[sensor]}0'
-        bias[sensor] = vector_of(found, CAL_OFFSET[sensor])
+        bias[sensor] = vector_of(parameters, CAL_OFFSET[sensor])
         thermal[sensor] = np.zeros(3)
-        if found.get(f'{TC[sensor]}_ENABLE'):
+        if parameters.get(f'{TC[sensor]}_ENABLE'):
             # Parameter files omit parameters that have the autopilot's default.
-            sensor_ref = found.get(f'{short}_TREF', PX4_REFERENCE_C)
+            sensor_ref = parameters.get(f'{short}_TREF', PX4_REFERENCE_C)
             if ref is None:
                 ref = sensor_ref
             # The reference of each sensor is its own, that of a calibration is common:
             #   X0 + X1 (T - TREF) = X0 + X1 (ref - TREF) + X1 (T - ref)
-            constant = [found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)]
-            linear = np.array([found.get(f'{short}_X1_{axis}', 0.0) for axis in range(3)])
+            constant = [parameters.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)]
+            linear = np.array([parameters.get(f'{short}_X1_{axis}', 0.0) for axis in range(3)])
             bias[sensor] = bias[sensor] + constant + linear * (ref - sensor_ref)
             thermal[sensor] = linear
-            lowest = np.maximum(lowest, found.get(f'{short}_TMIN', PX4_RANGE_C[0]))
-            highest = np.minimum(highest, found.get(f'{short}_TMAX', PX4_RANGE_C[1]))
+            lowest = np.maximum(lowest, parameters.get(f'{short}_TMIN', PX4_RANGE_C[0]))
+            highest = np.minimum(highest, parameters.get(f'{short}_TMAX', PX4_RANGE_C[1]))
     if ref is not None and not -math.inf < lowest < highest < math.inf:
         raise InputError(
             'the temperatures from TMIN to TMAX of a PX4 parameter file must be a range that the'
@@ -283,7 +297,7 @@ def imu_px4(found: dict) -> AffineImu:
         )
     return AffineImu(
         bias=bias,
-        matrix=_matrix(found, CAL_SCALE),
+        matrix=_matrix(parameters, CAL_SCALE),
         thermal=thermal,
         temperature_ref_c=PX4_REFERENCE_C if ref is None else ref,
         temperature_range_c=None if ref is None else (float(lowest), float(highest)),
@@ -305,9 +319,9 @@ def write_px4(page: Page) -> str:
 
 def read_px4(content: bytes, _path: str | Path) -> Read:
     """Read the parameters of the first accelerometer and gyroscope."""
-    found = read_parameters(content, 'PX4 parameter file')
-    present = {sensor: _has(found, CAL_OFFSET[sensor]) for sensor in SENSORS}
-    present['accelerometer'] |= _has(found, CAL_SCALE)
+    parameters = read_parameters(content, 'PX4 parameter file')
+    present = {sensor: _has(parameters, CAL_OFFSET[sensor]) for sensor in SENSORS}
+    present['accelerometer'] |= _has(parameters, CAL_SCALE)
     if not any(present.values()):
         raise InputError(
             'the PX4 parameter file must hold CAL_ACC0 or CAL_GYRO0, it holds none of them; give'
@@ -319,19 +333,19 @@ def read_px4(content: bytes, _path: str | Path) -> Read:
         curved += [f'{TC[sensor]}0_X2', f'{TC[sensor]}0_X3']
         if not present[sensor]:
             lacks += of(sensor, OFFSETS + SCALES)
-    refuse_curved(found, curved)
-    return Read(found, lacks)
+    refuse_curved(parameters, curved)
+    return Read(parameters, lacks)
 
 
-def ignored_px4(found: dict) -> list[str]:
-    """Return the changes that PX4 ignores."""
+def ignored_px4(parameters: Numbers) -> list[str]:
+    """Return a line for each group of three parameters whose change PX4 ignores as small."""
     lines = []
     for pattern, nominal in (
         (CAL_OFFSET['accelerometer'], 0.0),
         (CAL_SCALE, 1.0),
         (CAL_OFFSET['gyroscope'], 0.0),
     ):
-        change = float(np.linalg.norm(vector_of(found, pattern, nominal) - nominal))
+        change = float(np.linalg.norm(vector_of(parameters, pattern, nominal) - nominal))
         if 0 < change <= UNNOTICED:
             lines.append(
                 f'PX4 ignores a change of {pattern} if the three together change by {UNNOTICED:g}'

@@ -10,32 +10,35 @@ import numpy as np
 
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.exports.affine import SLOW_OFFSETS
-from imu_calibration.document.exports.target import Noise, Page, Target, yaml_file
+from imu_calibration.document.exports.target import Noise, Numbers, Page, Target, yaml_file
 
 
 def _gravity(page: Page) -> float:
-    found = page.calibration.conditions.get('gravity')
-    return float(found) if isinstance(found, (int, float)) and found > 0 else STANDARD_GRAVITY
+    """Return the gravity of the calibration's recording, m/s^2, standard gravity without one."""
+    gravity = page.calibration.conditions.get('gravity')
+    if isinstance(gravity, (int, float)) and gravity > 0:
+        return float(gravity)
+    return STANDARD_GRAVITY
 
 
-def vins(found: Noise) -> dict:
+def vins(noise: Noise) -> Numbers:
     """
     Return the noise for the midpoint rule.
 
     The rule weights each of two samples with half a step and multiplies walks by a full one.
     """
-    accel, gyro = found.accelerometer, found.gyroscope
+    accel, gyro = noise.accelerometer, noise.gyroscope
     return {
-        'acc_n': accel.white * (2 * found.rate) ** 0.5,
-        'gyr_n': gyro.white * (2 * found.rate) ** 0.5,
-        'acc_w': accel.walk * found.rate**0.5,
-        'gyr_w': gyro.walk * found.rate**0.5,
+        'acc_n': accel.white * (2 * noise.rate) ** 0.5,
+        'gyr_n': gyro.white * (2 * noise.rate) ** 0.5,
+        'acc_w': accel.walk * noise.rate**0.5,
+        'gyr_w': gyro.walk * noise.rate**0.5,
     }
 
 
-def lio_sam(found: Noise) -> dict:
+def lio_sam(noise: Noise) -> Numbers:
     """Return continuous densities, as used by gtsam's preintegration."""
-    accel, gyro = found.accelerometer, found.gyroscope
+    accel, gyro = noise.accelerometer, noise.gyroscope
     return {
         'imuAccNoise': accel.white,
         'imuGyrNoise': gyro.white,
@@ -44,32 +47,32 @@ def lio_sam(found: Noise) -> dict:
     }
 
 
-def fast_lio(found: Noise) -> dict:
+def fast_lio(noise: Noise) -> Numbers:
     """Return variances that the filter multiplies with the square of the step."""
-    accel, gyro = found.accelerometer, found.gyroscope
+    accel, gyro = noise.accelerometer, noise.gyroscope
     return {
-        'acc_cov': accel.white**2 * found.rate,
-        'gyr_cov': gyro.white**2 * found.rate,
-        'b_acc_cov': accel.walk**2 * found.rate,
-        'b_gyr_cov': gyro.walk**2 * found.rate,
+        'acc_cov': accel.white**2 * noise.rate,
+        'gyr_cov': gyro.white**2 * noise.rate,
+        'b_acc_cov': accel.walk**2 * noise.rate,
+        'b_gyr_cov': gyro.walk**2 * noise.rate,
     }
 
 
-def orb_slam3(found: Noise) -> dict:
+def orb_slam3(noise: Noise) -> Numbers:
     """Return continuous densities and the rate with which the program makes them discrete."""
     return {
-        'IMU.NoiseGyro': found.gyroscope.white,
-        'IMU.NoiseAcc': found.accelerometer.white,
-        'IMU.GyroWalk': found.gyroscope.walk,
-        'IMU.AccWalk': found.accelerometer.walk,
-        'IMU.Frequency': found.rate,
+        'IMU.NoiseGyro': noise.gyroscope.white,
+        'IMU.NoiseAcc': noise.accelerometer.white,
+        'IMU.GyroWalk': noise.gyroscope.walk,
+        'IMU.AccWalk': noise.accelerometer.walk,
+        'IMU.Frequency': noise.rate,
     }
 
 
-def covariances(found: Noise) -> dict:
+def covariances(noise: Noise) -> Numbers:
     """Return the covariances of messages, by rows."""
-    gyro = found.gyroscope.sample_sd(found.rate) ** 2
-    accel = found.accelerometer.sample_sd(found.rate) ** 2
+    gyro = noise.gyroscope.sample_sd(noise.rate) ** 2
+    accel = noise.accelerometer.sample_sd(noise.rate) ** 2
     return {
         'angular_velocity_covariance': np.diag([gyro] * 3).ravel().tolist(),
         'linear_acceleration_covariance': np.diag([accel] * 3).ravel().tolist(),
@@ -77,9 +80,17 @@ def covariances(found: Noise) -> dict:
 
 
 def write(page: Page, inside: str = '', gravity: str = '', *, head: str = '') -> str:
-    """Return YAML, inside a section where the program has one."""
-    values = {**(page.noise or {}), **({gravity: _gravity(page)} if gravity else {})}
-    return yaml_file(page.comments, {inside: values} if inside else values, head)
+    """
+    Return YAML with the noise.
+
+    `inside` is the section of the program, `gravity` its key of gravity, '' where it has none.
+    """
+    values = dict(page.noise or {})
+    if gravity:
+        values[gravity] = _gravity(page)
+    if inside:
+        values = {inside: values}
+    return yaml_file(page.comments, values, head)
 
 
 def _target(
@@ -90,8 +101,9 @@ def _target(
     noise: Callable,
     noise_is: str,
     writer: Callable,
-    **more: Any,
+    **fields: Any,
 ) -> Target:
+    """Return a target with noise only; it estimates slow offsets unless `fields` deny it."""
     return Target(
         name=name,
         title=title,
@@ -100,7 +112,7 @@ def _target(
         noise=noise,
         noise_is=noise_is,
         write=writer,
-        **{'estimates': SLOW_OFFSETS, **more},
+        **{'estimates': SLOW_OFFSETS, **fields},
     )
 
 

@@ -16,11 +16,12 @@ from imu_calibration.document.exports.affine import (
     SCALES,
     AffineImu,
     Capability,
+    imu_of_corrections,
     of,
-    undone,
 )
 from imu_calibration.document.exports.target import (
     Noise,
+    Numbers,
     Page,
     Read,
     Target,
@@ -33,15 +34,16 @@ from imu_calibration.document.exports.target import (
 from imu_calibration.effects.base import AXES
 
 
-def numbers_imu_calib(imu: AffineImu) -> dict:
+def numbers_imu_calib(imu: AffineImu) -> Numbers:
     """Return SM by rows and the bias, which is subtracted after the matrix."""
     inverse = np.linalg.inv(imu.matrix['accelerometer'])
     return {'SM': inverse.ravel(), 'bias': inverse @ imu.bias['accelerometer']}
 
 
-def imu_imu_calib(found: dict) -> AffineImu:
-    """Return the IMU of such numbers."""
-    return undone({'accelerometer': (np.reshape(found['SM'], (3, 3)), np.asarray(found['bias']))})
+def imu_imu_calib(numbers: Numbers) -> AffineImu:
+    """Return the IMU of SM and bias."""
+    matrix = np.reshape(numbers['SM'], (3, 3))
+    return imu_of_corrections({'accelerometer': (matrix, np.asarray(numbers['bias']))})
 
 
 def write_imu_calib(page: Page) -> str:
@@ -86,36 +88,38 @@ COUNT = 21
 """Numbers in a file: misalignment and scale matrices by rows, bias."""
 
 
-def imu_imu_tk(found: dict) -> AffineImu:
-    """Return the IMU of such numbers; a sensor without a file is perfect."""
-    # calibrated = T K raw - T K B.
+def imu_imu_tk(numbers: Numbers) -> AffineImu:
+    """Return the IMU of {sensor: T, K by rows and B}; a sensor without a file is perfect."""
     corrections = {}
-    for sensor, values in found.items():
-        numbers = np.asarray(values, float)
-        matrix = numbers[:9].reshape(3, 3) @ numbers[9:18].reshape(3, 3)
-        corrections[sensor] = (matrix, matrix @ numbers[18:])
-    return undone(corrections)
+    for sensor, entries in numbers.items():
+        values = np.asarray(entries, float)
+        misalignment = values[:9].reshape(3, 3)
+        scale = values[9:18].reshape(3, 3)
+        # calibrated = T K raw - T K B.
+        matrix = misalignment @ scale
+        corrections[sensor] = (matrix, matrix @ values[18:])
+    return imu_of_corrections(corrections)
 
 
 def read_imu_tk(content: bytes, path: str | Path) -> Read:
     """Read the named file and, if present, that of the other sensor in the same folder."""
     path = Path(path)
-    own = next(
-        (sensor for sensor, ending in ENDINGS.items() if path.suffix == ending), 'accelerometer'
-    )
-    found = {own: _numbers(content)}
+    sensor_of_ending = {ending: sensor for sensor, ending in ENDINGS.items()}
+    named_sensor = sensor_of_ending.get(path.suffix, 'accelerometer')
+    numbers = {named_sensor: _numbers(content)}
     for sensor, ending in ENDINGS.items():
-        beside = path.with_suffix(ending)
-        if sensor != own and beside.is_file():
-            found[sensor] = _numbers(beside.read_bytes())
+        other_file = path.with_suffix(ending)
+        if sensor != named_sensor and other_file.is_file():
+            numbers[sensor] = _numbers(other_file.read_bytes())
     lacks: tuple[Capability, ...] = ()
     for sensor in ENDINGS:
-        if sensor not in found:
+        if sensor not in numbers:
             lacks += of(sensor, OFFSETS + MATRICES)
-    return Read(found, lacks)
+    return Read(numbers, lacks)
 
 
-def _numbers(content: bytes) -> list[float] | None:
+def _numbers(content: bytes) -> list[float]:
+    """Return the 21 numbers of a file; both matrices in them must have an inverse."""
     words = text_of(content, 'imu_tk file').split()
     try:
         values = [float(word) for word in words]
@@ -124,7 +128,7 @@ def _numbers(content: bytes) -> list[float] | None:
     usable = len(values) == COUNT and bool(np.all(np.isfinite(values)))
     if usable:
         misalignment, scale = np.reshape(values[:18], (2, 3, 3))
-        usable = all(abs(np.linalg.det(matrix)) > 0 for matrix in (misalignment, scale))
+        usable = abs(np.linalg.det(misalignment)) > 0 and abs(np.linalg.det(scale)) > 0
     if not usable:
         raise InputError(
             f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be'
@@ -150,7 +154,7 @@ IMU_TK = (
 SCALE_KEY = 'gyro_scale_input'
 
 
-def numbers_autoware(imu: AffineImu) -> dict:
+def numbers_autoware(imu: AffineImu) -> Numbers:
     """
     Return offsets and scale factors of the gyroscopes: the same model as ours on the diagonal.
     """
@@ -160,23 +164,23 @@ def numbers_autoware(imu: AffineImu) -> dict:
     return {**offsets, SCALE_KEY: np.diag(imu.matrix['gyroscope'])}
 
 
-def imu_autoware(found: dict) -> AffineImu:
-    """Return the IMU of such numbers."""
-    offset = np.array([found[f'angular_velocity_offset_{a}'] for a in AXES])
+def imu_autoware(numbers: Numbers) -> AffineImu:
+    """Return the IMU of offsets and scale factors of the gyroscopes."""
+    offset = np.array([numbers[f'angular_velocity_offset_{a}'] for a in AXES])
     return AffineImu(
         bias={'accelerometer': np.zeros(3), 'gyroscope': offset},
-        matrix={'accelerometer': np.eye(3), 'gyroscope': np.diag(found[SCALE_KEY])},
+        matrix={'accelerometer': np.eye(3), 'gyroscope': np.diag(numbers[SCALE_KEY])},
     )
 
 
-def noise_autoware(found: Noise) -> dict:
+def noise_autoware(noise: Noise) -> Numbers:
     """
     Return standard deviations of samples, the square roots of the covariances in its messages.
     """
-    rate = found.gyroscope.sample_sd(found.rate)
+    rate_sd = noise.gyroscope.sample_sd(noise.rate)
     return {
-        **{f'angular_velocity_stddev_{a}{a}': rate for a in AXES},
-        'acceleration_stddev': found.accelerometer.sample_sd(found.rate),
+        **{f'angular_velocity_stddev_{a}{a}': rate_sd for a in AXES},
+        'acceleration_stddev': noise.accelerometer.sample_sd(noise.rate),
     }
 
 
@@ -193,9 +197,8 @@ def write_autoware(page: Page) -> str:
             f' {x!r}, y: {y!r}, z: {z!r}}}}}"'
         ),
     ]
-    parameters = {name: value for name, value in page.numbers.items() if name != SCALE_KEY} | (
-        page.noise or {}
-    )
+    parameters = {name: value for name, value in page.numbers.items() if name != SCALE_KEY}
+    parameters |= page.noise or {}
     switches = {
         'correct_for_static_bias': True,
         'correct_for_dynamic_bias': False,
@@ -210,11 +213,12 @@ def write_autoware(page: Page) -> str:
 def read_autoware(content: bytes, _path: str | Path) -> Read:
     """Read a parameter file; scale factors only from the comment that `write_autoware` makes."""
     what = 'imu_corrector parameter file'
-    found = section(section(read_yaml(content, what), '/**', what), 'ros__parameters', what)
+    nodes = section(read_yaml(content, what), '/**', what)
+    parameters = section(nodes, 'ros__parameters', what)
     offsets = {}
     for axis in AXES:
         name = f'angular_velocity_offset_{axis}'
-        offsets[name] = float(numbers_at(found, name, (), what=what))
+        offsets[name] = float(numbers_at(parameters, name, (), what=what))
     scale = re.search(
         rf'^#.*{SCALE_KEY} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M
     )
@@ -225,7 +229,8 @@ def read_autoware(content: bytes, _path: str | Path) -> Read:
             f'the {what} must repeat three numbers in its comment on {SCALE_KEY}:'
             f' {shortened(str(error))}; correct it'
         ) from error
-    return Read({**offsets, SCALE_KEY: values}, () if scale else of('gyroscope', SCALES))
+    lacks = () if scale else of('gyroscope', SCALES)
+    return Read({**offsets, SCALE_KEY: values}, lacks)
 
 
 AUTOWARE = (

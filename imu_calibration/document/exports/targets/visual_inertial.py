@@ -22,11 +22,12 @@ from imu_calibration.document.exports.affine import (
     THERMAL_OFFSETS,
     AffineImu,
     Placement,
+    imu_of_corrections,
     lower_times_rotation,
-    undone,
 )
 from imu_calibration.document.exports.target import (
     Noise,
+    Numbers,
     Page,
     Read,
     Target,
@@ -39,69 +40,65 @@ from imu_calibration.document.exports.target import (
 from imu_calibration.effects.base import SENSORS
 
 LEVERS = ('rx_i', 'ry_i', 'rz_i')
+"""Keys of the lever arms of the accelerometers x, y and z."""
 
 
-def numbers_kalibr(imu: AffineImu) -> dict:
+def numbers_kalibr(imu: AffineImu) -> Numbers:
     """
-    Return M, C_gyro_i, A and lever arms of an IMU in its accelerometer's axes.
+    Return M, C_gyro_i, A and lever arms of an IMU in the placement `accelerometer_lower_at_x`.
 
-    The origin is at the x accelerometer of the IMU.
-
-    ``matrix_g = M C`` and ``A C = cross``: Kalibr's A acts on specific force in the gyroscope's
-    axes.
+    With the gyroscope's ``matrix = M C`` and ``cross = A C``: Kalibr's A acts on specific force in
+    the gyroscope's axes.
     """
-    gyro, turn = lower_times_rotation(imu.matrix['gyroscope'])
-    arms = (
-        {'model': 'scale-misalignment-size-effect'}
-        if np.any(imu.arms)
-        else {'model': 'scale-misalignment'}
-    )
-    levers = dict(zip(LEVERS, imu.arms)) if np.any(imu.arms) else {}
+    gyro_matrix, rotation = lower_times_rotation(imu.matrix['gyroscope'])
+    model = 'scale-misalignment'
+    accelerometers = {'M': np.tril(imu.matrix['accelerometer'])}
+    if np.any(imu.arms):
+        model = 'scale-misalignment-size-effect'
+        accelerometers |= dict(zip(LEVERS, imu.arms))
     return {
-        **arms,
-        'accelerometers': {'M': np.tril(imu.matrix['accelerometer']), **levers},
-        'gyroscopes': {'M': gyro, 'C_gyro_i': turn, 'A': imu.cross @ turn.T},
+        'model': model,
+        'accelerometers': accelerometers,
+        'gyroscopes': {'M': gyro_matrix, 'C_gyro_i': rotation, 'A': imu.cross @ rotation.T},
     }
 
 
-def imu_kalibr(found: dict) -> AffineImu:
-    """Return the IMU of such numbers."""
-    accelerometers = found['accelerometers']
-    gyroscopes = found['gyroscopes']
-    turn = np.asarray(gyroscopes['C_gyro_i'])
-    arms = (
-        np.array([accelerometers[name] for name in LEVERS])
-        if LEVERS[0] in accelerometers
-        else np.zeros((3, 3))
-    )
+def imu_kalibr(numbers: Numbers) -> AffineImu:
+    """Return the IMU of M, C_gyro_i, A and lever arms."""
+    accelerometers = numbers['accelerometers']
+    gyroscopes = numbers['gyroscopes']
+    rotation = np.asarray(gyroscopes['C_gyro_i'])
+    arms = np.zeros((3, 3))
+    if LEVERS[0] in accelerometers:
+        arms = np.array([accelerometers[name] for name in LEVERS])
     return AffineImu(
         matrix={
             'accelerometer': np.asarray(accelerometers['M']),
-            'gyroscope': np.asarray(gyroscopes['M']) @ turn,
+            'gyroscope': np.asarray(gyroscopes['M']) @ rotation,
         },
-        cross=np.asarray(gyroscopes['A']) @ turn,
+        cross=np.asarray(gyroscopes['A']) @ rotation,
         arms=arms,
     )
 
 
-def noise_kalibr(found: Noise) -> dict:
+def noise_kalibr(noise: Noise) -> Numbers:
     """Return continuous densities."""
-    accel, gyro = found.accelerometer, found.gyroscope
+    accel, gyro = noise.accelerometer, noise.gyroscope
     return {
         'accelerometer_noise_density': accel.white,
         'accelerometer_random_walk': accel.walk,
         'gyroscope_noise_density': gyro.white,
         'gyroscope_random_walk': gyro.walk,
-        'update_rate': found.rate,
+        'update_rate': noise.rate,
     }
 
 
 def _sensor_entries(page: Page) -> dict[str, float | np.ndarray | str]:
     """Return the entries of an IMU in addition to its intrinsics."""
-    known = {'update_rate': page.rate} if page.rate else {}
+    rate_and_noise = {'update_rate': page.rate} if page.rate else {}
     if page.noise is not None:
-        known = page.noise
-    return {'rostopic': '/imu/data_raw', **known, 'T_i_b': np.eye(4), 'time_offset': 0.0}
+        rate_and_noise = page.noise
+    return {'rostopic': '/imu/data_raw', **rate_and_noise, 'T_i_b': np.eye(4), 'time_offset': 0.0}
 
 
 def write_kalibr(page: Page) -> str:
@@ -110,7 +107,7 @@ def write_kalibr(page: Page) -> str:
 
 
 def read_densities(mapping: dict[str, Any]) -> dict[str, float]:
-    """Return {sensor: sd of a sample} from noise densities and the rate."""
+    """Return {sensor: sd of a sample}, density * sqrt(rate); empty if one of them is missing."""
     rate: Any = mapping.get('update_rate')
     values: dict[str, Any] = {sensor: mapping.get(f'{sensor}_noise_density') for sensor in SENSORS}
     if not all(isinstance(v, (int, float)) and v > 0 for v in (rate, *values.values())):
@@ -122,41 +119,45 @@ def read_kalibr(content: bytes, _path: str | Path) -> Read:
     """Read files of kalibr_calibrate_imu_camera (``imu0: ...``) and of `write_kalibr`."""
     what = 'Kalibr result'
     mapping = read_yaml(content, what)
-    mapping = section(mapping, 'imu0', what) if 'imu0' in mapping else mapping
+    if 'imu0' in mapping:
+        mapping = section(mapping, 'imu0', what)
     if 'accelerometers' not in mapping:
         model = shortened(str(mapping.get('model', 'calibrated')))
         raise InputError(
             f"the {what} must come of a model with intrinsics, its model is '{model}'; run Kalibr"
             ' with scale-misalignment'
         )
-    a = section(mapping, 'accelerometers', what)
-    g = section(mapping, 'gyroscopes', what)
-    arms = {name: numbers_at(a, name, (3,), what=what) for name in LEVERS if name in a}
-    found = {
+    accelerometers = section(mapping, 'accelerometers', what)
+    gyroscopes = section(mapping, 'gyroscopes', what)
+    arms = {}
+    for name in LEVERS:
+        if name in accelerometers:
+            arms[name] = numbers_at(accelerometers, name, (3,), what=what)
+    accel_matrix = numbers_at(accelerometers, 'M', (3, 3), what=what)
+    gyro_matrices = {}
+    for name in ('M', 'C_gyro_i', 'A'):
+        gyro_matrices[name] = numbers_at(gyroscopes, name, (3, 3), what=what)
+    numbers = {
         'model': mapping.get('model'),
-        'accelerometers': {'M': numbers_at(a, 'M', (3, 3), what=what), **arms},
-        'gyroscopes': {
-            name: numbers_at(g, name, (3, 3), what=what) for name in ('M', 'C_gyro_i', 'A')
-        },
+        'accelerometers': {'M': accel_matrix, **arms},
+        'gyroscopes': gyro_matrices,
     }
-    return Read(found, () if arms else ARMS, read_densities(mapping))
+    return Read(numbers, () if arms else ARMS, read_densities(mapping))
 
 
 def accelerometer_lower_at_x(imu: AffineImu) -> Placement:
     """
-    Return the placement in the axes and at the origin of the accelerometer.
+    Return the placement with a lower triangular accelerometer matrix.
 
-    The accelerometer matrix is lower triangular, and the origin is in the sensitive point of the x
-    accelerometer.
+    Its origin is the sensitive point of the x accelerometer.
     """
-    return Placement(
-        mat_ts=lower_times_rotation(imu.matrix['accelerometer'])[1], origin_s=imu.arms[0]
-    )
+    _, rotation = lower_times_rotation(imu.matrix['accelerometer'])
+    return Placement(mat_ts=rotation, origin_s=imu.arms[0])
 
 
-def at_the_mean(found: AffineImu) -> Placement:
+def at_the_mean(imu: AffineImu) -> Placement:
     """Return our placement: the same axes, the origin in the mean of the sensitive points."""
-    return Placement(origin_s=found.arms.mean(axis=0))
+    return Placement(origin_s=imu.arms.mean(axis=0))
 
 
 KALIBR = (
@@ -193,38 +194,40 @@ KALIBR = (
 )
 
 
-_TURNED_ROUND = np.eye(3)[::-1]
+_REVERSAL = np.eye(3)[::-1]
+"""Reverses the order of rows (from the left) or columns (from the right)."""
 
 
 def upper_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (U, Q) with ``matrix = U @ Q``: U upper triangular with positive diagonal, Q a rotation.
     """
-    lower, rotation = lower_times_rotation(_TURNED_ROUND @ matrix @ _TURNED_ROUND)
-    return _TURNED_ROUND @ lower @ _TURNED_ROUND, _TURNED_ROUND @ rotation @ _TURNED_ROUND
+    lower, rotation = lower_times_rotation(_REVERSAL @ matrix @ _REVERSAL)
+    upper = _REVERSAL @ lower @ _REVERSAL
+    return upper, _REVERSAL @ rotation @ _REVERSAL
 
 
 SHAPES = {'lower': lower_times_rotation, 'upper': upper_times_rotation}
+"""Shape of a triangular matrix -> factorisation (matrix) -> (triangular matrix, rotation)."""
 MATRIX_KEYS = ('Tw', 'R_IMUtoGYRO', 'Ta', 'R_IMUtoACC', 'Tg')
 
 
-def numbers_openvins(imu: AffineImu, shape: str) -> dict:
+def numbers_openvins(imu: AffineImu, shape: str) -> Numbers:
     """
-    Return triangular matrices and the rotations to them.
+    Return triangular matrices and the rotations to them; `shape` is a key of `SHAPES`.
 
     The IMU's axes are unchanged, so that no extrinsic changes.
     """
-    (ta, to_acc), (tw, to_gyro) = (
-        SHAPES[shape](imu.matrix[sensor]) for sensor in ('accelerometer', 'gyroscope')
-    )
+    ta, to_acc = SHAPES[shape](imu.matrix['accelerometer'])
+    tw, to_gyro = SHAPES[shape](imu.matrix['gyroscope'])
     return {'Tw': tw, 'R_IMUtoGYRO': to_gyro, 'Ta': ta, 'R_IMUtoACC': to_acc, 'Tg': imu.cross}
 
 
-def imu_openvins(found: dict) -> AffineImu:
+def imu_openvins(numbers: Numbers) -> AffineImu:
     """
-    Return the IMU of such numbers: ``a_m = Ta R_IMUtoACC f``, ``w_m = Tw R_IMUtoGYRO w + Tg f``.
+    Return the IMU of a chain: ``a_m = Ta R_IMUtoACC f``, ``w_m = Tw R_IMUtoGYRO w + Tg f``.
     """
-    tw, to_gyro, ta, to_acc, tg = (np.asarray(found[name]) for name in MATRIX_KEYS)
+    tw, to_gyro, ta, to_acc, tg = (np.asarray(numbers[name]) for name in MATRIX_KEYS)
     return AffineImu(matrix={'accelerometer': ta @ to_acc, 'gyroscope': tw @ to_gyro}, cross=tg)
 
 
@@ -241,14 +244,17 @@ def read_openvins(content: bytes, _path: str | Path) -> Read:
     """Read a chain; missing entries are the identity, or zero, as in OpenVINS."""
     what = 'OpenVINS chain'
     chain = section(read_yaml(content, what), 'imu0', what)
-    found = {name: np.zeros((3, 3)) if name == 'Tg' else np.eye(3) for name in MATRIX_KEYS}
-    found |= {
-        name: numbers_at(chain, name, (3, 3), what=what) for name in MATRIX_KEYS if name in chain
-    }
-    return Read(found, (), read_densities(chain))
+    numbers = {}
+    for name in MATRIX_KEYS:
+        if name in chain:
+            numbers[name] = numbers_at(chain, name, (3, 3), what=what)
+        else:
+            numbers[name] = np.zeros((3, 3)) if name == 'Tg' else np.eye(3)
+    return Read(numbers, (), read_densities(chain))
 
 
 def _target(name: str, model: str, shape: str) -> Target:
+    """Return the target for a model of OpenVINS, whose matrices have a shape of `SHAPES`."""
     return Target(
         name=name,
         title=f'OpenVINS kalibr_imu_chain.yaml, model {model}',
@@ -279,45 +285,47 @@ OPENVINS = (_target('openvins', 'kalibr', 'lower'), _target('openvins-rpng', 'rp
 
 
 LOWER_BY_COLUMNS = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
+"""(row, column) of the entries of a lower triangle, in the order of the file."""
 
 
-def numbers_basalt(imu: AffineImu) -> dict:
+def numbers_basalt(imu: AffineImu) -> Numbers:
     """
-    Return biases (after the matrix) and matrices minus identity, by columns: a lower triangle.
+    Return b and S of both sensors, with ``calibrated = (I + S) raw - b``.
 
-    The full matrix for the gyroscope.
+    Hence ``I + S = matrix^-1`` and ``b = matrix^-1 @ bias``. The file has S by columns: for the
+    accelerometer its lower triangle (6 numbers), for the gyroscope all of it (9).
     """
-    inverse = {sensor: np.linalg.inv(matrix) for sensor, matrix in imu.matrix.items()}
-    bias = {sensor: inverse[sensor] @ imu.bias[sensor] for sensor in inverse}
-    extra = {sensor: matrix - np.eye(3) for sensor, matrix in inverse.items()}
+    b = {}
+    s = {}
+    for sensor in SENSORS:
+        inverse = np.linalg.inv(imu.matrix[sensor])
+        b[sensor] = inverse @ imu.bias[sensor]
+        s[sensor] = inverse - np.eye(3)
+    lower_triangle = [s['accelerometer'][entry] for entry in LOWER_BY_COLUMNS]
     return {
-        'calib_accel_bias': np.array(
-            [*bias['accelerometer'], *(extra['accelerometer'][at] for at in LOWER_BY_COLUMNS)]
-        ),
-        'calib_gyro_bias': np.array([*bias['gyroscope'], *extra['gyroscope'].T.ravel()]),
+        'calib_accel_bias': np.array([*b['accelerometer'], *lower_triangle]),
+        'calib_gyro_bias': np.array([*b['gyroscope'], *s['gyroscope'].T.ravel()]),
     }
 
 
-def imu_basalt(found: dict) -> AffineImu:
-    """Return the IMU of such numbers."""
-    accel = np.asarray(found['calib_accel_bias'])
-    gyro = np.asarray(found['calib_gyro_bias'])
-    lower = np.eye(3)
-    for at, value in zip(LOWER_BY_COLUMNS, accel[3:]):
-        lower[at] += value
-    return undone(
-        {
-            'accelerometer': (lower, accel[:3]),
-            'gyroscope': (np.eye(3) + gyro[3:].reshape(3, 3).T, gyro[:3]),
-        }
+def imu_basalt(numbers: Numbers) -> AffineImu:
+    """Return the IMU of b and S, as `numbers_basalt` makes them."""
+    accel = np.asarray(numbers['calib_accel_bias'])
+    gyro = np.asarray(numbers['calib_gyro_bias'])
+    accel_matrix = np.eye(3)
+    for entry, value in zip(LOWER_BY_COLUMNS, accel[3:]):
+        accel_matrix[entry] += value
+    gyro_matrix = np.eye(3) + gyro[3:].reshape(3, 3).T
+    return imu_of_corrections(
+        {'accelerometer': (accel_matrix, accel[:3]), 'gyroscope': (gyro_matrix, gyro[:3])}
     )
 
 
-def noise_basalt(found: Noise) -> dict:
+def noise_basalt(noise: Noise) -> Numbers:
     """Return continuous standard deviations, one for each axis."""
-    accel, gyro = found.accelerometer, found.gyroscope
+    accel, gyro = noise.accelerometer, noise.gyroscope
     return {
-        'imu_update_rate': found.rate,
+        'imu_update_rate': noise.rate,
         'accel_noise_std': [accel.white] * 3,
         'gyro_noise_std': [gyro.white] * 3,
         'accel_bias_std': [accel.walk] * 3,
@@ -327,37 +335,33 @@ def noise_basalt(found: Noise) -> dict:
 
 def accelerometer_lower(imu: AffineImu) -> Placement:
     """Return the placement in which the accelerometer's matrix is lower triangular."""
-    return Placement(mat_ts=lower_times_rotation(imu.matrix['accelerometer'])[1])
+    _, rotation = lower_times_rotation(imu.matrix['accelerometer'])
+    return Placement(mat_ts=rotation)
 
 
 def write_basalt(page: Page) -> str:
     """Return the JSON; comments follow the content, where basalt does not read."""
-    return (
-        json.dumps(
-            plain({'value0': {**page.numbers, **(page.noise or {})}, 'comments': page.comments}),
-            indent=2,
-        )
-        + '\n'
-    )
+    values = {**page.numbers, **(page.noise or {})}
+    document = plain({'value0': values, 'comments': page.comments})
+    return json.dumps(document, indent=2) + '\n'
 
 
 def read_basalt(content: bytes, _path: str | Path) -> Read:
     """Read a calibration JSON of basalt."""
     what = 'basalt calibration'
     values = section(read_json(content, what), 'value0', what)
-    found = {
-        name: numbers_at(values, name, (size,), what=what)
-        for name, size in (('calib_accel_bias', 9), ('calib_gyro_bias', 12))
+    numbers = {
+        'calib_accel_bias': numbers_at(values, 'calib_accel_bias', (9,), what=what),
+        'calib_gyro_bias': numbers_at(values, 'calib_gyro_bias', (12,), what=what),
     }
     rate = values.get('imu_update_rate')
     sample_sd = {}
     if isinstance(rate, (int, float)) and rate > 0:
         for sensor, name in (('accelerometer', 'accel_noise_std'), ('gyroscope', 'gyro_noise_std')):
             if name in values:
-                sample_sd[sensor] = float(
-                    np.max(numbers_at(values, name, (3,), what=what)) * np.sqrt(rate)
-                )
-    return Read(found, (), sample_sd)
+                densities = numbers_at(values, name, (3,), what=what)
+                sample_sd[sensor] = float(np.max(densities) * np.sqrt(rate))
+    return Read(numbers, (), sample_sd)
 
 
 BASALT = (

@@ -20,7 +20,9 @@ Beginning of a .mat file; the rest of its text, which holds the time, is made bl
 gives the same bytes.
 """
 MAT_TEXT_BYTES = 116
+"""Length of that text."""
 DOCUMENT = 'document_json'
+"""Variable with the calibration document."""
 
 
 def write_json(page: Page) -> str:
@@ -69,8 +71,9 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
 
     what = 'MATLAB calibration'
     try:
-        # Damaged structs crash scipy.
-        text = str(loadmat(io.BytesIO(content), variable_names=[DOCUMENT])[DOCUMENT][0])
+        # Only the text is read: damaged structs crash scipy.
+        variables = loadmat(io.BytesIO(content), variable_names=[DOCUMENT])
+        text = str(variables[DOCUMENT][0])
     except (
         MatReadError,
         ValueError,
@@ -90,6 +93,7 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
 
 
 def _target(name: str, title: str, writer: Callable, reader: Callable, suffix: str) -> Target:
+    """Return a target that has the complete document."""
     return Target(
         name=name,
         title=title,
