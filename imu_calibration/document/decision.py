@@ -74,33 +74,31 @@ def most_cautious(decisions: Iterable[SensorDecision]) -> SensorDecision:
 
 def decisions_text(decisions: Mapping[str, SensorDecision]) -> str:
     """Return the decisions on the sensors in one phrase; '' without any."""
-    words = set(decisions.values())
-    return (
-        str(*words)
-        if len(words) == 1
-        else ', '.join(f'{sensor} {word}' for sensor, word in decisions.items())
-    )
+    distinct = set(decisions.values())
+    if len(distinct) == 1:
+        return str(*distinct)
+    return ', '.join(f'{sensor} {decision}' for sensor, decision in decisions.items())
 
 
 def reason_of(entry: ProofEntry | None) -> str:
     """
-    Return the reason for `decide`.
+    Return the reason for the decision of `decide`.
 
-    Errors before and after, the interval of their ratio, the regimes that are excepted where it
-    helps, and the likely cause where it does not.
+    It has the errors before and after, the interval of their ratio, and the regimes with a larger
+    error if the calibration helps, or the likely cause if it does not.
     """
     if entry is None or not entry.windows:
         return NO_PROOF
-    more = ''
+    comparison = ''
     if entry.earlier is not None:
         error = error_text(entry.earlier.after, entry.unit)
-        more = f', {error} with the earlier calibration'
-    cause = same_directions(entry)
-    if not cause:
-        cause = _exceptions(entry) if decide(entry) is HELPS else _cause(entry)
+        comparison = f', {error} with the earlier calibration'
+    restriction = same_directions(entry)
+    if not restriction:
+        restriction = _exceptions(entry) if decide(entry) is HELPS else _cause(entry)
     return (
         f'{_errors(entry)} on held-out data ({entry.windows} windows, after /'
-        f' before {ratio_text(entry)}){more}{cause}'
+        f' before {ratio_text(entry)}){comparison}{restriction}'
     )
 
 
@@ -117,11 +115,11 @@ def worse_regimes(entry: ProofEntry) -> list[str]:
 
 def harmed(entry: ProofEntry) -> dict[str, RegimeErrors]:
     """Return the regimes of a proof in which the error grows, with their errors."""
-    found = {}
-    for name, part in entry.regimes.items():
-        if part.after > HARM * part.before and part.ci95[0] > 1.0:
-            found[name] = part
-    return found
+    regimes = {}
+    for name, errors in entry.regimes.items():
+        if errors.after > HARM * errors.before and errors.ci95[0] > 1.0:
+            regimes[name] = errors
+    return regimes
 
 
 def _exceptions(entry: ProofEntry) -> str:
@@ -131,7 +129,9 @@ def _exceptions(entry: ProofEntry) -> str:
 
 
 def _errors(entry: RegimeErrors) -> str:
-    before, after = (error_text(size, entry.unit) for size in (entry.before, entry.after))
+    """Return the errors before and after compensation as a phrase."""
+    before = error_text(entry.before, entry.unit)
+    after = error_text(entry.after, entry.unit)
     return f'error {before} to {after}'
 
 
@@ -143,19 +143,19 @@ def ratio_text(entry: RegimeErrors) -> str:
 
 def _cause(entry: ProofEntry) -> str:
     """Return the most likely cause as the end of a sentence."""
-    late = entry.delay_s or 0.0
+    delay = entry.delay_s or 0.0
     share = entry.delay_explains or 0.0
-    if abs(late) > MIN_NAMED_DELAY and share > DELAY_SHARE:
-        side = 'late' if late > 0 else 'early'
+    if abs(delay) > MIN_NAMED_DELAY and share > DELAY_SHARE:
+        side = 'late' if delay > 0 else 'early'
         return (
-            f'; likely cause: the readings are {abs(late) * 1e3:.0f} ms {side}, which the model'
+            f'; likely cause: the readings are {abs(delay) * 1e3:.0f} ms {side}, which the model'
             ' does not include'
         )
     rest = entry.regimes.get('rest')
-    at_rest = 0.0
+    error_at_rest = 0.0
     if rest is not None and rest.unit == entry.unit:
-        at_rest = rest.after
-    if 'rest' in harmed(entry) or at_rest > REST_SHARE * entry.after > 0.0:
+        error_at_rest = rest.after
+    if 'rest' in harmed(entry) or error_at_rest > REST_SHARE * entry.after > 0.0:
         return '; likely cause: the bias has changed'
     if entry.regimes and set(harmed(entry)) == {'angular acceleration'}:
         return (
@@ -250,8 +250,10 @@ def lines_of(reasons: Iterable[Reason], hints: dict[str, str] | None = None) -> 
     """Return statements and next steps, a line each; `hints` as for `errors.with_hint`."""
     lines = []
     for reason in reasons:
-        lines.append(
-            f'{reason.word}: {reason.what}' if reason.word in (WARNING, NOTE) else reason.what
-        )
-        lines += [f'next: {reason.advice(hints)}'] if reason.next else []
-    return list(dict.fromkeys(lines))
+        if reason.word in (WARNING, NOTE):
+            lines.append(f'{reason.word}: {reason.what}')
+        else:
+            lines.append(reason.what)
+        if reason.next:
+            lines.append(f'next: {reason.advice(hints)}')
+    return list(dict.fromkeys(lines))  # each line once

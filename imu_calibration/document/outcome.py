@@ -1,5 +1,5 @@
 """
-Outcome of a calibration: parameters that count, samples left out, and the exit code.
+Outcome of a calibration: determined parameters, dropped samples, and the exit code.
 
 Verbs, nodes, exports and reports use these functions, so that they agree.
 """
@@ -66,10 +66,10 @@ def dropped_of(calibration: Calibration) -> tuple[dict[str, int], int]:
     unusable = statistics.get('unusable')
     if unusable:
         dropped['unusable'] = unusable
-    # samples between windows have no fault: they count as kept
-    kept = sum((statistics.get('samples_used') or {}).values())
-    kept += sum((statistics.get('stream') or {}).values())
-    return dropped, kept
+    # Samples between windows have no fault.
+    n_valid = sum((statistics.get('samples_used') or {}).values())
+    n_valid += sum((statistics.get('stream') or {}).values())
+    return dropped, n_valid
 
 
 @dataclass(frozen=True)
@@ -88,19 +88,21 @@ def decision_limits(
     """
     Return sensor -> limit of the decision on it.
 
-    On the recording of the calibration its decision is the limit: the errors of the same readings
-    are no further evidence. On others only the values count that compensation refuses.
+    On the recording of the calibration (`own_recording`) its decision is the limit: the errors of
+    the same readings are no further evidence. On a different one, only values that compensation
+    never applies limit the decision.
     """
     limits = {}
     for sensor, decision in calibration.decisions.items():
-        refused = never_applied(calibration, sensor)
-        if decision is HELPS or not (refused or own_recording):
+        if decision is HELPS:
             continue
-        why = refused or calibration.decision_reasons.get(sensor)
-        limits[sensor] = DecisionLimit(
-            decision if own_recording else UNPROVEN,
-            why or reason_of(calibration.proof.get(sensor)),
-        )
+        refusal = never_applied(calibration, sensor)
+        if not own_recording:
+            if refusal:
+                limits[sensor] = DecisionLimit(UNPROVEN, refusal)
+            continue
+        why = refusal or calibration.decision_reasons.get(sensor)
+        limits[sensor] = DecisionLimit(decision, why or reason_of(calibration.proof.get(sensor)))
     return limits
 
 

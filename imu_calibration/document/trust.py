@@ -27,7 +27,9 @@ from imu_calibration.kinematics.rotations import Reference
 if TYPE_CHECKING:  # the import needs 1 MB of the compensator node
     from imu_calibration.allan.figures import NoiseFigures
 
-END, MEAN = 'end of the recording', 'mean of the recording'
+END = 'end of the recording'
+MEAN = 'mean of the recording'
+"""Which value of an effect in time is applied."""
 AGAIN = (
     '; it is proven for its last third only, and the error returns where the effect starts again'
 )
@@ -47,14 +49,14 @@ PROBABLE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Uncorrected:
-    """Constant values that compensation applies instead of effects that it cannot undo."""
+    """Constant values that compensation applies instead of effects that it cannot invert."""
 
     centre: Centre = field(default_factory=dict)
     """The part of the effects that the applied bias and matrix contain."""
     sizes: tuple[dict[str, Any], ...] = ()
     """
-    Entries of the statistics: effect, sensor, 'applied' (`END` or `MEAN`), rms of the rest on each
-    axis and its unit.
+    Entries of the statistics: effect, sensor, 'applied' (`END` or `MEAN`), rms of the uncorrected
+    part on each axis and its unit.
     """
 
     def to_mapping(self) -> dict[str, Any]:
@@ -63,7 +65,7 @@ class Uncorrected:
 
 
 def constant_part(effect: Effect, columns: np.ndarray) -> ColumnCentre:
-    """Return the part of columns, shape (width,), that are constant."""
+    """Return the centre of an effect with constant columns, shape (width,)."""
     return ColumnCentre(columns, np.zeros((len(columns), 3)), INPUT_OF[effect.sensor])
 
 
@@ -78,7 +80,10 @@ def uncorrected_in_time(
     """
     Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`.
 
-    `latest` as for `uncorrected_on_table`.
+    An effect that has settled by the model `latest` (`latest_settling`, default `model`) is applied
+    with its value at the end, any other with its mean. The uncorrected part is the remainder::
+
+        (columns(t) - applied columns) @ coefficients
     """
     latest = latest or model
     centre: dict[str, ColumnCentre] = {}
@@ -90,18 +95,18 @@ def uncorrected_in_time(
         for name, columns in applied.items():
             centre[name] = constant_part(effect, columns.mean(axis=0))
         rows = model.layout(effect.sensor).rows
-        rest = sum(
-            (at_times[name] - centre[name].constant)
-            @ coefficients(model, effect.sensor, values)[rows[name]]
-            for name in at_times
-        )
-        sizes.append(uncorrected_size(effect, np.sqrt(np.mean(np.square(rest), axis=0)), at_end))
+        uncorrected = 0.0
+        for name, columns in at_times.items():
+            column_coefficients = coefficients(model, effect.sensor, values)[rows[name]]
+            uncorrected = uncorrected + (columns - centre[name].constant) @ column_coefficients
+        rms = np.sqrt(np.mean(np.square(uncorrected), axis=0))
+        sizes.append(uncorrected_size(effect, rms, at_end))
     return Uncorrected(centre, tuple(sizes))
 
 
 def latest_settling(model: SensorModel, values: np.ndarray, sd: np.ndarray) -> SensorModel:
     """
-    Return the model at the largest probable time constants, to test what has settled.
+    Return the model at the largest probable time constants, for `has_settled`.
 
     A cause that only resembles a warm-up has an uncertain time constant, and its value at the end
     of a recording is no value of another recording.
@@ -116,22 +121,21 @@ def latest_settling(model: SensorModel, values: np.ndarray, sd: np.ndarray) -> S
 
 def judged_from_of(model: SensorModel, end: float) -> float:
     """
-    Return the time from which windows are judged, s.
+    Return the time from which the windows of a recording until `end` are judged, s.
 
-    The last third until `end` where an effect of the model has settled.
+    It is 0, or the beginning of the last third if an effect of the model has settled.
     """
-    return (
-        LAST_SHARE * end
-        if any(has_settled(model, effect, end) for effect in not_applied(model))
-        else 0.0
-    )
+    if any(has_settled(model, effect, end) for effect in not_applied(model)):
+        return LAST_SHARE * end
+    return 0.0
 
 
 def has_settled(model: SensorModel, effect: Effect, end: float) -> bool:
     """
     Return whether an effect in time has settled at the end of a recording, s.
 
-    The effect is evaluated at the point of the model.
+    It has, with its columns c at the point of the model, if each of them changes in a second
+    recording by at most ``|c(2 end) - c(end)| = SETTLED |c(end) - c(0)|``.
 
     Then its value at the end is applied: it holds until the next start. Otherwise the mean is
     applied, with the least error in a recording that repeats the drift; a drift that continues
@@ -139,23 +143,23 @@ def has_settled(model: SensorModel, effect: Effect, end: float) -> bool:
     """
     if not in_time(effect):
         return False
-    columns = [*columns_at(model, effect, [0.0, end, 2.0 * end]).values()]
-    start, at_end, later = (
-        np.split(columns[0], 2, axis=1)[0]
-        if effect.time_constant
-        else np.concatenate(columns, axis=1)
-    )
+    columns = list(columns_at(model, effect, [0.0, end, 2.0 * end]).values())
+    if effect.time_constant:
+        # The second half is the derivative by the time constant.
+        tested, _ = np.split(columns[0], 2, axis=1)
+    else:
+        tested = np.concatenate(columns, axis=1)
+    start, at_end, later = tested
     return bool(np.all(np.abs(later - at_end) <= SETTLED * np.abs(at_end - start)))
 
 
 def columns_at(
     model: SensorModel, effect: Effect, times: Sequence[float] | np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the columns of an effect in time at some times, s: group -> shape (n, width)."""
-    nothing = np.zeros((len(times), 3))
-    ref = Reference(
-        np.asarray(times, float), np.zeros((len(times), 3, 3)), nothing, nothing, nothing, 0.0
-    )
+    """Return the columns of an effect in time at `times`, s: group -> shape (n, width)."""
+    # Such an effect depends on no motion.
+    zero = np.zeros((len(times), 3))
+    ref = Reference(np.asarray(times, float), np.zeros((len(times), 3, 3)), zero, zero, zero, 0.0)
     return {group.name: group.columns(ref, model.full_point()) for group in effect.groups}
 
 
@@ -232,49 +236,48 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
         would change that.
 
     """
-    words = calibration.decisions
     refused = refused_sensors(calibration, anyway=anyway, live=live)
     if refused.keys() == set(calibration.sensors):
-        first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
-        consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(
-            calibration.sensors
-        )
+        # A sensor that the calibration harms is named before an unproven one.
+        first = min(refused, key=lambda sensor: calibration.decisions[sensor] is not HARMS)
+        refused_anyway = refused_sensors(calibration, anyway=True, live=live)
+        consent_helps = refused_anyway.keys() != set(calibration.sensors)
         text = (
             'a calibration must help a sensor on held-out data to be applied, this one does not: '
             f'{first} {refused[first]}; calibrate again'
         )
-        raise DocumentError(text, key='anyway' if consent else None, code='no_sensor_helps')
+        raise DocumentError(text, key='anyway' if consent_helps else None, code='no_sensor_helps')
     applied = with_nominal(calibration, list(refused)) if refused else calibration
     return Usable(applied, refused, cautions_of(calibration, refused))
 
 
 def cautions_of(calibration: Calibration, refused: Collection[str]) -> tuple[str, ...]:
     """Return a line for each sensor, except those refused, on which the decision is not `helps`."""
-    return tuple(
-        f'{sensor} {_text(calibration, sensor)}'
-        for sensor, word in calibration.decisions.items()
-        if sensor not in refused and word is not HELPS
-    )
+    cautions = []
+    for sensor, decision in calibration.decisions.items():
+        if sensor not in refused and decision is not HELPS:
+            cautions.append(f'{sensor} {_text(calibration, sensor)}')
+    return tuple(cautions)
 
 
 def refused_sensors(
     calibration: Calibration, *, anyway: bool = False, live: bool = False
 ) -> dict[str, str]:
     """Return sensor -> why it is not corrected; arguments as in `usable`."""
-    accepted = (
-        {HELPS}
-        | ({UNPROVEN} if anyway or not live else set())
-        | ({HARMS} if anyway and not live else set())
-    )
-    refused = {
-        sensor: _text(calibration, sensor)
-        for sensor in calibration.sensors
-        if calibration.decisions[sensor] not in accepted
-    }
+    accepted = {HELPS}
+    if anyway or not live:
+        accepted.add(UNPROVEN)
+    if anyway and not live:
+        accepted.add(HARMS)
+    refused = {}
     for sensor in calibration.sensors:
-        why = beyond_instruments(calibration, sensor) or (
-            live and _mostly_undetermined(calibration, sensor)
-        )
+        if calibration.decisions[sensor] not in accepted:
+            refused[sensor] = _text(calibration, sensor)
+    # Reasons that no decision or consent changes.
+    for sensor in calibration.sensors:
+        why = beyond_instruments(calibration, sensor)
+        if not why and live:
+            why = _mostly_undetermined(calibration, sensor)
         if why:
             refused[sensor] = why
     if calibration.gyroscope_in_accelerometer_axes and 'accelerometer' in refused:
@@ -290,18 +293,17 @@ def _mostly_undetermined(calibration: Calibration, sensor: str) -> str:
     for effect in calibration.model.effects:
         if effect.sensor == sensor and (effect.role is Role.OFFSET or not only_bias):
             status += calibration.status[calibration.model.slices[effect.key]]
-    missing = sum(each in LACKING for each in status)
-    if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status):
-        return f'unproven, and {missing} of {len(status)} parameters are not determined'
+    n_undetermined = sum(state in LACKING for state in status)
+    if calibration.decisions[sensor] is UNPROVEN and 2 * n_undetermined > len(status):
+        return f'unproven, and {n_undetermined} of {len(status)} parameters are not determined'
     return ''
 
 
 def _text(calibration: Calibration, sensor: str) -> str:
     """Return the decision on a sensor with its reason."""
-    return (
-        f'{calibration.decisions[sensor]}:'
-        f' {calibration.decision_reasons.get(sensor) or reason_of(calibration.proof.get(sensor))}'
-    )
+    reason = calibration.decision_reasons.get(sensor)
+    reason = reason or reason_of(calibration.proof.get(sensor))
+    return f'{calibration.decisions[sensor]}: {reason}'
 
 
 def usage(calibration: Calibration) -> str:

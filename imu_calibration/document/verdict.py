@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -94,9 +93,9 @@ LOST_SHARE = 0.05
 
 def _doubtful_scales(calibration: Calibration) -> list[Reason]:
     """Return a warning for each sensor with a scale factor that a wrong unit may explain."""
-    found = []
+    reasons = []
     for sensor, question in scale_questions(calibration).items():
-        found.append(
+        reasons.append(
             Reason(
                 WARNING,
                 question,
@@ -105,10 +104,11 @@ def _doubtful_scales(calibration: Calibration) -> list[Reason]:
                 sensors=(sensor,),
             )
         )
-    return found
+    return reasons
 
 
-def _worse(calibration: Calibration) -> list[Reason]:
+def _harmed_regimes(calibration: Calibration) -> list[Reason]:
+    """Return a warning for each regime of motion in which the error grows on held-out data."""
     reasons = []
     for sensor, entry in calibration.proof.items():
         for line in worse_regimes(entry):
@@ -121,24 +121,26 @@ def _worse(calibration: Calibration) -> list[Reason]:
 
 def _unused_rests(calibration: Calibration) -> list[Reason]:
     """
-    Return a warning about rests without any static window.
+    Return a warning if a recording has many samples at rest, but no static window.
 
     Noise and sds are then estimated only from motion.
     """
     counts = calibration.statistics.get('stream') or {}
-    unused = {
-        reason: counts.get(reason, 0)
-        for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET)
-    }
-    total = sum(unused.values())
-    used = sum((calibration.statistics.get('samples_used') or {}).values())
-    if rested(calibration.statistics) or total <= LOST_SHARE * used:
+    n_unused = 0
+    parts = []
+    for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET):
+        count = counts.get(reason, 0)
+        n_unused += count
+        if count:
+            parts.append(f'{count} {reason}')
+    n_used = sum((calibration.statistics.get('samples_used') or {}).values())
+    if rested(calibration.statistics) or n_unused <= LOST_SHARE * n_used:
         return []
     return [
         Reason(
             WARNING,
-            f'the recording has {total} samples at rest, but no static window is used'
-            f' ({", ".join(f"{count} {reason}" for reason, count in unused.items() if count)}):'
+            f'the recording has {n_unused} samples at rest, but no static window is used'
+            f' ({", ".join(parts)}):'
             ' noise and bias changes come from motion only, and the standard deviations of the'
             ' biases may be too small',
             'reduce static_minimum, or increase quiet_ratio',
@@ -181,47 +183,40 @@ recording.
 """
 
 
-def _adopted(calibration: Calibration) -> list[Reason]:
-    """Return notes on the changes of the model by the recording."""
-    names: dict[str, Any] = {}
-    for change in CHANGES:
-        names[change] = calibration.statistics.get(change) or []
-    names['added'] = [_with_size(calibration, name) for name in names['added']]
-    held = names['not_believed']
-    if held:
-        names['not_believed'] = [f'{name} ({value:.3g})' for name, value in held.items()][
-            :SHOWN_NAMES
-        ]
-        if len(held) > SHOWN_NAMES:
-            names['not_believed'].append('...')
+def _model_changes(calibration: Calibration) -> list[Reason]:
+    """Return a note for each change of the model by the recording, a key of `CHANGES`."""
+    statistics = calibration.statistics
     reasons = []
     for change, (text, step, key) in CHANGES.items():
+        names = list(statistics.get(change) or [])
+        if not names:
+            continue
+        if change == 'added':
+            names = [_with_size(calibration, name) for name in names]
         if change == 'not_believed':
-            # Where the motions determine them, the misfit has another cause.
-            remedies = [need for need in _by_need(calibration, held) if need in REMEDY_KEYS]
+            # The motions suffice where the remedy is no motion: the misfit has another cause.
+            remedies = [need for need in _by_need(calibration, names) if need in REMEDY_KEYS]
             if remedies:
                 step = remedies[0]
                 key = REMEDY_KEYS[remedies[0]]
-        if names[change]:
-            reasons.append(Reason(NOTE, text.format(', '.join(names[change])), step, key=key))
+            values = statistics[change]
+            n_names = len(names)
+            names = [f'{name} ({values[name]:.3g})' for name in names[:SHOWN_NAMES]]
+            if n_names > SHOWN_NAMES:
+                names.append('...')
+        reasons.append(Reason(NOTE, text.format(', '.join(names)), step, key=key))
     return reasons
 
 
 def _unexplained(calibration: Calibration) -> list[Reason]:
-    """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
-    found = []
-    for sensor, rest in (calibration.statistics.get('unexplained') or {}).items():
-        found.append(
-            Reason(
-                NOTE,
-                unexplained_text(sensor, rest['rms'], rest.get('unit'))
-                + (f' ({", ".join(rest["axes"])})' if rest['axes'] else ''),
-                'find the cause',
-                key='diagnose',
-                sensors=(sensor,),
-            )
-        )
-    return found
+    """Return a note for each sensor with an unexplained residual, by the test of diagnoses."""
+    reasons = []
+    for sensor, residual in (calibration.statistics.get('unexplained') or {}).items():
+        text = unexplained_text(sensor, residual['rms'], residual.get('unit'))
+        if residual['axes']:
+            text += f' ({", ".join(residual["axes"])})'
+        reasons.append(Reason(NOTE, text, 'find the cause', key='diagnose', sensors=(sensor,)))
+    return reasons
 
 
 def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
@@ -235,16 +230,15 @@ def _least_squares(calibration: Calibration) -> list[Reason]:
     """Return a note for each sensor with values by plain least squares."""
     reasons = []
     for sensor, entry in (calibration.statistics.get('least_squares') or {}).items():
-        error, of_model = (
-            error_text(entry[name], entry.get('unit') or UNITS[sensor])
-            for name in ('error', 'error_of_model')
-        )
+        unit = entry.get('unit') or UNITS[sensor]
+        error = error_text(entry['error'], unit)
+        error_of_model = error_text(entry['error_of_model'], unit)
         reasons.append(
             Reason(
                 NOTE,
                 f'{sensor}: bias and matrix are those of plain least squares without other effects,'
-                f' because the residual is unexplained (held-out error {error}, {of_model} with the'
-                ' model)',
+                f' because the residual is unexplained (held-out error {error}, {error_of_model}'
+                ' with the model)',
                 'find the cause',
                 key='diagnose',
                 sensors=(sensor,),
@@ -253,38 +247,31 @@ def _least_squares(calibration: Calibration) -> list[Reason]:
     return reasons
 
 
-def _jitter(calibration: Calibration) -> list[Reason]:
+def _stamp_jitter(calibration: Calibration) -> list[Reason]:
     """Return a note on independent errors of the stamps."""
-    found = calibration.statistics.get('stamp_jitter')
-    return (
-        [Reason(NOTE, jitter_text(found['sd_s']), "use stamps of the sensor's own clock")]
-        if found
-        else []
-    )
+    jitter = calibration.statistics.get('stamp_jitter')
+    if not jitter:
+        return []
+    return [Reason(NOTE, jitter_text(jitter['sd_s']), "use stamps of the sensor's own clock")]
 
 
 def _with_size(calibration: Calibration, name: str) -> str:
-    """Return an effect with its most significant parameter, in common units."""
+    """Return the name of an effect with its most significant parameter, in common units."""
     effect = next((effect for effect in calibration.model.effects if effect.name == name), None)
     if effect is None:
         return name
     part = calibration.model.slices[effect.key]
-    best = part.start + int(
-        np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300))
-    )
-    factor, unit = for_people(effect.unit_of(best - part.start), calibration.param_names[best])
-    return (
-        f'{name} ({significant(calibration.values[best] * factor)} ±'
-        f' {significant(calibration.sd[best] * factor, 2)} {unit})'
-    )
+    values = calibration.values[part]
+    sd = calibration.sd[part]
+    best = int(np.argmax(np.abs(values) / np.maximum(sd, 1e-300)))
+    factor, unit = for_people(effect.unit_of(best), calibration.param_names[part.start + best])
+    value = significant(values[best] * factor)
+    return f'{name} ({value} ± {significant(sd[best] * factor, 2)} {unit})'
 
 
 def misfit_ratios(statistics: Mapping, sensor: str) -> dict[str, float]:
     """
-    Return kind of window -> ratio of residual variance to expected variance.
-
-    It is the ratio of the residual variance of the sensor to that of its noise and of errors of the
-    stamps.
+    Return kind of window -> residual variance / variance of the noise and of errors of the stamps.
 
     Parameters
     ----------
@@ -297,6 +284,7 @@ def misfit_ratios(statistics: Mapping, sensor: str) -> dict[str, float]:
     of_stamps = (statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
     ratios = {}
     for kind, ratio in chi2.items():
+        # 'means' is the entry of the window means, the others are of samples within windows.
         if kind != 'means' and ratio is not None:
             ratios[kind] = ratio / of_stamps.get(kind, 1.0)
     return ratios
@@ -314,16 +302,16 @@ def incomplete_windows(statistics: Mapping, sensor: str) -> dict[str, float]:
     """
     slow_over_fast = statistics.get(sensor, {}).get('slow_over_fast') or {}
     at_rest = rested(statistics)
-    found = {}
+    incomplete = {}
     for kind, ratio in misfit_ratios(statistics, sensor).items():
         has_structure = slow_over_fast.get(kind, np.inf) > MIN_STRUCTURE
         if ratio > NOTED_MISFIT and (has_structure or not at_rest):
-            found[kind] = ratio
+            incomplete[kind] = ratio
     attitude = statistics.get(sensor, {}).get('attitude')
     is_significant = bool(attitude) and attitude['p_value'] < ATTITUDE_P_VALUE
     if is_significant and attitude['variance_ratio'] > NOTED_MISFIT:
-        found['static'] = attitude['variance_ratio']
-    return found
+        incomplete['static'] = attitude['variance_ratio']
+    return incomplete
 
 
 def rested(statistics: Mapping) -> bool:
@@ -341,24 +329,22 @@ def helps_everywhere(entry: ProofEntry | None) -> bool:
 
 def motion_misfits(calibration: Calibration) -> list[Reason]:
     """
-    Return the residuals in motion above the noise at rest, and means at rest that are not noise.
+    Return notes on residuals in motion above the noise at rest, and on means at rest beyond noise.
 
-    Notes, or warnings where residuals with structure in time are far above; diagnoses use the same
-    test. Residuals without structure are noise or vibration, which no effect of a model explains.
+    A residual with structure in time that is far above is a warning; diagnoses use the same test.
+    Residuals without structure are noise or vibration, which no effect of a model explains.
 
     Without a rest they are compared with their slow part; lags are visible in the fast part.
     """
     at_rest = rested(calibration.statistics)
-    reference = (
-        'the noise at rest' if at_rest else 'their slow part (as after a lag or a late clock)'
-    )
+    reference = 'their slow part (as after a lag or a late clock)'
+    if at_rest:
+        reference = 'the noise at rest'
     reasons = []
     for sensor in SENSORS:
-        more = (
-            ', although the calibration helps in each regime'
-            if at_rest and helps_everywhere(calibration.proof.get(sensor))
-            else ''
-        )
+        exception = ''
+        if at_rest and helps_everywhere(calibration.proof.get(sensor)):
+            exception = ', although the calibration helps in each regime'
         incomplete = incomplete_windows(calibration.statistics, sensor)
         for kind, ratio in misfit_ratios(calibration.statistics, sensor).items():
             if ratio <= NOTED_MISFIT:
@@ -375,7 +361,7 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
             reasons.append(
                 Reason(
                     WARNING if ratio > MAX_MISFIT_RATIO else NOTE,
-                    f'{size}: the model is incomplete{more}',
+                    f'{size}: the model is incomplete{exception}',
                     'find the cause',
                     key='diagnose',
                     sensors=(sensor,),
@@ -389,7 +375,7 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
             reasons.append(
                 Reason(
                     NOTE,
-                    f'{size}: the model is incomplete{more}',
+                    f'{size}: the model is incomplete{exception}',
                     'find the cause',
                     key='diagnose',
                     sensors=(sensor,),
@@ -398,19 +384,23 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
     return reasons
 
 
-def _misfit(calibration: Calibration, sensor: str) -> float:
-    """Return the scatter of window means that the model may cause, in the unit of the sensor."""
-    if any(sensor in reason.sensors for reason in _strange_causes(calibration)):
+def _misfit_scatter(calibration: Calibration, sensor: str) -> float:
+    """
+    Return the scatter of window means that errors of the model may cause, in the sensor's unit.
+
+    It is infinite for an incomplete model, whose error is not known.
+    """
+    if any(sensor in reason.sensors for reason in _implausible_causes(calibration)):
         return np.inf
     if incomplete_windows(calibration.statistics, sensor):
         return np.inf
     # Parameters that are weak because of an error of the model.
     if REMEDIES[MODEL_ERROR, DRIFT, REJECTED] in _needs_of(calibration, sensor):
         return np.inf
-    left = (calibration.statistics.get('unexplained') or {}).get(sensor)
-    if left is None or left.get('unit', UNITS[sensor]) != UNITS[sensor]:
+    residual = (calibration.statistics.get('unexplained') or {}).get(sensor)
+    if residual is None or residual.get('unit', UNITS[sensor]) != UNITS[sensor]:
         return 0.0
-    return MISFIT_FACTOR * left['rms']
+    return MISFIT_FACTOR * residual['rms']
 
 
 def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
@@ -422,12 +412,12 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """
     reasons = []
     for sensor in calibration.sensors:
-        part = calibration.model.part(sensor, Role.OFFSET)
+        bias = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
-        certain = scatter * _smallest_share(calibration, sensor)
+        lower_limit = scatter * _smallest_share(calibration, sensor)
         if motions_at_rest(calibration.by_hand, (sensor,)):
             continue
-        if certain > tolerances[part][0] and scatter > _misfit(calibration, sensor):
+        if lower_limit > tolerances[bias][0] and scatter > _misfit_scatter(calibration, sensor):
             factor, unit = for_people(UNITS[sensor])
             reasons.append(
                 Reason(
@@ -462,32 +452,27 @@ def _left_out(calibration: Calibration) -> list[Reason]:
     for sensor in SENSORS:
         times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []
         if times:
-            windows = (
-                'a window, whose mean is an outlier'
-                if len(times) == 1
-                else f'{len(times)} windows, whose means are outliers'
-            )
-            notes.append(
-                Reason(
-                    NOTE,
-                    f'left out of the {sensor}: {windows}, '
-                    f'at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
-                    + (' ...' if len(times) > SHOWN_NAMES else ''),
-                    'the table or the IMU may have been touched',
-                )
-            )
+            windows = f'{len(times)} windows, whose means are outliers'
+            if len(times) == 1:
+                windows = 'a window, whose mean is an outlier'
+            shown = ', '.join(f'{time:.0f} s' for time in times[:SHOWN_NAMES])
+            if len(times) > SHOWN_NAMES:
+                shown += ' ...'
+            text = f'left out of the {sensor}: {windows}, at {shown}'
+            notes.append(Reason(NOTE, text, 'the table or the IMU may have been touched'))
     return notes
 
 
-def _lost(calibration: Calibration) -> list[Reason]:
-    dropped = dropped_of(calibration)[0]
+def _dropped(calibration: Calibration) -> list[Reason]:
+    """Return a note on dropped samples, or a warning if they make the result incomplete."""
+    dropped, n_valid = dropped_of(calibration)
     if not dropped:
         return []
-    text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
-    many = dropped_text(*dropped_of(calibration))
-    if many:
-        return [Reason(WARNING, many, 'find the cause', key='inspect')]
-    return [Reason(NOTE, text, '')]
+    warning = dropped_text(dropped, n_valid)  # '' up to `DROPPED_SHARE`
+    if warning:
+        return [Reason(WARNING, warning, 'find the cause', key='inspect')]
+    counts = ', '.join(f'{count} {reason}' for reason, count in dropped.items())
+    return [Reason(NOTE, f'dropped: {counts}', '')]
 
 
 def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
@@ -507,43 +492,47 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
 
     """
     decisions = _decisions(calibration)
-    decided = replace(calibration, decision={each: str(word) for each, word in decisions.items()})
-    complete = not shortcomings(decided)
+    texts = {sensor: str(decision) for sensor, decision in decisions.items()}
+    complete = not shortcomings(replace(calibration, decision=texts))
+
+    # The requested parameter with the largest sd relative to its tolerance.
     count = parameter_count(calibration)
-    counted = np.array([name in calibration.requested for name in calibration.param_names])
-    share = np.where(counted, calibration.own_sd / tolerances, 0.0)
+    requested = np.array([name in calibration.requested for name in calibration.param_names])
+    share = np.where(requested, calibration.own_sd / tolerances, 0.0)
     worst = int(np.argmax(share))
     limiting = ('', 0.0)
     if count.requested:
         limiting = (calibration.param_names[worst], float(share[worst]))
     common = calibration.common_scale
     if common:
-        limiting = max(
-            limiting, (COMMON_SCALE, common['sd'] / common['tolerance']), key=lambda pair: pair[1]
-        )
-    reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
+        common_share = common['sd'] / common['tolerance']
+        if common_share > limiting[1]:
+            limiting = (COMMON_SCALE, common_share)
+
+    # The order of the statements is that of their importance.
+    reasons = [_decided(calibration, *entry) for entry in decisions.items()]
     reasons += _absent(calibration)
     reasons.append(_parameters(count, limiting, complete=complete))
     reasons += (
         _undetermined(calibration)
-        + _blind(calibration)
-        + _moved(calibration)
+        + _undetermined_sensors(calibration)
+        + _moved_sensors(calibration)
         + _implausible(calibration)
         + motion_misfits(calibration)
     )
-    reasons += _doubtful_scales(calibration) + _strange_causes(calibration)
-    reasons += _worse(calibration) + _unused_rests(calibration)
+    reasons += _doubtful_scales(calibration) + _implausible_causes(calibration)
+    reasons += _harmed_regimes(calibration) + _unused_rests(calibration)
     reasons += [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
     reasons += (
-        _adopted(calibration)
+        _model_changes(calibration)
         + _unexplained(calibration)
         + _least_squares(calibration)
-        + _jitter(calibration)
+        + _stamp_jitter(calibration)
         + unsteady(calibration, tolerances)
     )
     return Verdict(
         decisions,
-        (*reasons, *_left_out(calibration), *_lost(calibration)),
+        (*reasons, *_left_out(calibration), *_dropped(calibration)),
         count.determined,
         count.requested,
         limiting,
@@ -555,24 +544,27 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
     """
     Return the calibration with its verdict, which its document contains; arguments as in `judge`.
     """
-    found = judge(calibration, tolerances)
+    verdict = judge(calibration, tolerances)
     counts = {
-        'requested': found.requested,
-        'determined': found.within,
-        'limiting': found.limiting[0],
-        'sd_over_tolerance': found.limiting[1],
+        'requested': verdict.requested,
+        'determined': verdict.within,
+        'limiting': verdict.limiting[0],
+        'sd_over_tolerance': verdict.limiting[1],
     }
+    # The decisions have their own entry of the document.
+    notes = [reason for reason in verdict.reasons if reason.word is not DECISION]
     return replace(
         calibration,
-        decision={sensor: str(word) for sensor, word in found.decisions.items()},
+        decision={sensor: str(decision) for sensor, decision in verdict.decisions.items()},
         decision_reasons={sensor: _reason(calibration, sensor) for sensor in calibration.sensors},
-        notes=tuple(lines_of(reason for reason in found.reasons if reason.word is not DECISION)),
-        judgement=found,
+        notes=tuple(lines_of(notes)),
+        judgement=verdict,
         statistics=calibration.statistics | {'parameters': counts},
     )
 
 
 def _absent(calibration: Calibration) -> list[Reason]:
+    """Return a statement for each sensor that is not calibrated: unusable, or not recorded."""
     unusable = calibration.statistics.get('unusable_sensors') or {}
     reasons = []
     for sensor in calibration.absent:
@@ -584,21 +576,23 @@ def _absent(calibration: Calibration) -> list[Reason]:
                 f'the recording has no readings of the {sensor}: it is not calibrated, and its'
                 ' readings are not corrected'
             )
-            lacking = []
+            # Effects of the other sensor whose input are the missing readings.
+            uncorrected = []
             for effect in without_input(calibration.model, [sensor]):
                 if effect.sensor != sensor and effect.compensation == 'exact':
-                    lacking.append(effect.name)
-            if lacking:
-                text += f'; without its readings {", ".join(lacking)} cannot be corrected'
+                    uncorrected.append(effect.name)
+            if uncorrected:
+                text += f'; without its readings {", ".join(uncorrected)} cannot be corrected'
             reasons.append(Reason(NOTE, text, '', sensors=(sensor,)))
     return reasons
 
 
-def _decided(calibration: Calibration, sensor: str, word: SensorDecision) -> Reason:
-    step, key = ('', None) if word is HELPS else _step_of(calibration, sensor)
+def _decided(calibration: Calibration, sensor: str, decision: SensorDecision) -> Reason:
+    """Return the statement of the decision on a sensor."""
+    step, key = ('', None) if decision is HELPS else _step_of(calibration, sensor)
     return Reason(
         DECISION,
-        f'{sensor} {word}: {_reason(calibration, sensor)}',
+        f'{sensor} {decision}: {_reason(calibration, sensor)}',
         step,
         key=key,
         sensors=(sensor,),
@@ -634,13 +628,14 @@ def _step_of(calibration: Calibration, sensor: str) -> tuple[str, str | None]:
 
 def _decisions(calibration: Calibration) -> dict[str, SensorDecision]:
     """Return sensor -> decision; at best UNPROVEN for an uncertain clock or motion."""
-    found = dict(calibration.decisions)
-    for sensor, decision in found.items():
+    decisions = {}
+    for sensor, decision in calibration.decisions.items():
         if _periodic(calibration, sensor) or _undecided_motion(calibration, sensor):
-            found[sensor] = most_cautious([decision, UNPROVEN])
-    if needs_accelerometer(calibration, found):
-        found['gyroscope'] = most_cautious([found['gyroscope'], UNPROVEN])
-    return found
+            decision = most_cautious([decision, UNPROVEN])
+        decisions[sensor] = decision
+    if needs_accelerometer(calibration, decisions):
+        decisions['gyroscope'] = most_cautious([decisions['gyroscope'], UNPROVEN])
+    return decisions
 
 
 def _undecided_motion(calibration: Calibration, sensor: str) -> str:
@@ -653,10 +648,19 @@ def _undecided_motion(calibration: Calibration, sensor: str) -> str:
     moved = moved_at_rest(calibration.by_hand, sensor)
     if moved:
         return moved
-    own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
-    if own and DETERMINED not in own:
-        return f'none of its {len(own)} parameters is determined'
+    requested = _requested_of(calibration, sensor)
+    if requested and DETERMINED not in requested.values():
+        return f'none of its {len(requested)} parameters is determined'
     return ''
+
+
+def _requested_of(calibration: Calibration, sensor: str) -> dict[str, str]:
+    """Return name -> status of the requested parameters of a sensor."""
+    requested = {}
+    for name, status in calibration.requested.items():
+        if name.startswith(sensor):
+            requested[name] = status
+    return requested
 
 
 def _held_out_motions(calibration: Calibration, sensor: str) -> str:
@@ -666,29 +670,33 @@ def _held_out_motions(calibration: Calibration, sensor: str) -> str:
     A parameter that is held and needs a motion is shown by no motion of the recording, held-out
     data included. One that is held because of an error of the model is.
     """
-    own = {name: state for name, state in calibration.requested.items() if name.startswith(sensor)}
-    held = [name for name, state in own.items() if state == HELD]
+    requested = _requested_of(calibration, sensor)
+    held = [name for name, status in requested.items() if status == HELD]
     n_unseen = 0
     for need, names in _by_need(calibration, held).items():
-        if need not in REMEDY_KEYS:
+        if need not in REMEDY_KEYS:  # a remedy with a key is not a motion
             n_unseen += len(names)
     if not n_unseen:
         return ''
-    return f'; in motions as recorded, which do not show {n_unseen} of its {len(own)} parameters'
+    return (
+        f'; in motions as recorded, which do not show {n_unseen} of its {len(requested)} parameters'
+    )
 
 
 def _reason(calibration: Calibration, sensor: str) -> str:
-    more = (
-        '; unproven, because stamps that are late by a period of this motion without rests would'
-        ' give the same errors'
-    )
-    reason = reason_of(calibration.proof.get(sensor)) + more * _periodic(calibration, sensor)
+    """Return the reason for the decision on a sensor: that of its proof, and its limits."""
+    reason = reason_of(calibration.proof.get(sensor))
+    if _periodic(calibration, sensor):
+        reason += (
+            '; unproven, because stamps that are late by a period of this motion without rests'
+            ' would give the same errors'
+        )
     if decide(calibration.proof.get(sensor)) is HELPS:
         why = _undecided_motion(calibration, sensor)
         reason += f'; unproven, because {why}' if why else _held_out_motions(calibration, sensor)
-    why = never_applied(calibration, sensor)
-    if why:
-        reason += f'; not applied: {why}'
+    refusal = never_applied(calibration, sensor)
+    if refusal:
+        reason += f'; not applied: {refusal}'
     return reason
 
 
@@ -696,14 +704,16 @@ def _periodic(calibration: Calibration, sensor: str) -> bool:
     """
     Return whether held-out windows may repeat an error of the clock.
 
-    No rests, and residuals far above the noise.
+    That is so without rests and with residuals far above the noise.
     """
-    return not rested(calibration.statistics) and any(
-        ratio > MAX_MISFIT_RATIO for ratio in misfit_ratios(calibration.statistics, sensor).values()
-    )
+    if rested(calibration.statistics):
+        return False
+    ratios = misfit_ratios(calibration.statistics, sensor)
+    return any(ratio > MAX_MISFIT_RATIO for ratio in ratios.values())
 
 
 def _parameters(count: ParameterCount, limiting: tuple[str, float], *, complete: bool) -> Reason:
+    """Return how many parameters are within their tolerance; `limiting` as in `Verdict`."""
     name, share = limiting
     limit = f'; limiting: {name}, its sd is {share:.2g} of its tolerance' if name else ''
     return Reason(
@@ -714,54 +724,58 @@ def _parameters(count: ParameterCount, limiting: tuple[str, float], *, complete:
 
 
 def _implausible(calibration: Calibration) -> list[Reason]:
+    """Return a warning for each value beyond any known instrument."""
     check = 'check the units of the recording and the axes in the table description'
     reasons = []
     for section in SECTIONS:
         for line in implausible(calibration, section):
             text, _, _ = line.partition(': check')
-            reasons.append(Reason(WARNING, text, check, sensors=_whose([section])))
+            reasons.append(Reason(WARNING, text, check, sensors=_concerned_sensors([section])))
     return reasons
 
 
-def _whose(sections: Iterable[str]) -> tuple[str, ...]:
+def _concerned_sensors(sections: Iterable[str]) -> tuple[str, ...]:
     """
-    Return the sensors that something of these sections concerns; table and clock concern both.
+    Return the sensors that parameters of these sections concern.
+
+    Sections of table and clock, or '' for an unknown one, concern both.
     """
-    found = set(sections)
-    return (
-        tuple(sensor for sensor in SENSORS if sensor in found) if found <= set(SENSORS) else SENSORS
-    )
+    concerned = set(sections)
+    if concerned <= set(SENSORS):
+        return tuple(sensor for sensor in SENSORS if sensor in concerned)
+    return SENSORS
 
 
-def _strange_causes(calibration: Calibration) -> list[Reason]:
-    """Return reasons why a known cause is not in the model."""
-    found = calibration.statistics.get('implausible') or {}
-    catalogue = {
-        effect.name: effect.sensor
-        for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()
-    }
-    return [
-        Reason(
-            WARNING,
-            f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
-            'it is not in the model, and the standard deviations allow for it',
-            f'see the evidence; if {name} is expected, name it in the model',
-            key='diagnose',
-            sensors=_whose([catalogue.get(name, '')]),
+def _implausible_causes(calibration: Calibration) -> list[Reason]:
+    """Return a warning for each effect that was not added, because its size is implausible."""
+    model = calibration.model
+    sensor_of = {}  # name of an effect -> its sensor
+    for effect in model.catalogue.effects(model.joint_names).values():
+        sensor_of[effect.name] = effect.sensor
+    reasons = []
+    for name, share in (calibration.statistics.get('implausible') or {}).items():
+        sensor = sensor_of.get(name, '')
+        reasons.append(
+            Reason(
+                WARNING,
+                f'{name} {beyond_known(share, sensor)}; '
+                'it is not in the model, and the standard deviations allow for it',
+                f'see the evidence; if {name} is expected, name it in the model',
+                key='diagnose',
+                sensors=_concerned_sensors([sensor]),
+            )
         )
-        for name, share in found.items()
-    ]
+    return reasons
 
 
-def _blind(calibration: Calibration) -> list[Reason]:
+def _undetermined_sensors(calibration: Calibration) -> list[Reason]:
+    """Return a warning for each sensor without a determined parameter and with a held matrix."""
     reasons = []
     for sensor in calibration.sensors:
-        own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
-        matrix_held = all(
-            status == HELD
-            for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)]
-        )
-        if own and matrix_held and DETERMINED not in own:
+        requested = _requested_of(calibration, sensor)
+        matrix = calibration.model.part(sensor, Role.LINEAR)
+        matrix_held = all(status == HELD for status in calibration.status[matrix])
+        if requested and matrix_held and DETERMINED not in requested.values():
             needs = _needs_of(calibration, sensor)
             step = needs[0] if needs else 'record static poses and turns about all three axes'
             reasons.append(
@@ -777,7 +791,7 @@ def _blind(calibration: Calibration) -> list[Reason]:
 
 
 def _needs_of(calibration: Calibration, sensor: str) -> list[str]:
-    """Return what the undetermined parameters of a sensor need."""
+    """Return the motions or remedies that the undetermined parameters of a sensor need."""
     needs = []
     for direction in calibration.undetermined:
         if any(name.startswith(sensor) for name in direction['parameters']):
@@ -785,7 +799,7 @@ def _needs_of(calibration: Calibration, sensor: str) -> list[str]:
     return needs
 
 
-def _moved(calibration: Calibration) -> list[Reason]:
+def _moved_sensors(calibration: Calibration) -> list[Reason]:
     """Return a warning for each motion of an IMU that was held still."""
     motions = motions_at_rest(calibration.by_hand, calibration.sensors)
     return [
@@ -794,20 +808,23 @@ def _moved(calibration: Calibration) -> list[Reason]:
 
 
 def _undetermined(calibration: Calibration) -> list[Reason]:
+    """Return the parameters that are weak or held, one statement for each next step."""
     reasons = []
     for status, text in (
         (Status.WEAK, 'sd above the tolerance'),
         (HELD, 'held at the prior value'),
     ):
-        names = [name for name, found in calibration.requested.items() if found == status]
+        names = [name for name, state in calibration.requested.items() if state == status]
         if COMMON_SCALE in names:
             names.remove(COMMON_SCALE)
-            what = (
+            statement = (
                 f'{COMMON_SCALE}: sd {100 * calibration.common_scale["sd"]:.2g} %, that of gravity;'
                 ' it is not part of the other sds'
             )
             reasons.append(
-                Reason(PARAMETERS, what, REMEDIES[GRAVITY,], key='gravity', sensors=SENSORS[:1])
+                Reason(
+                    PARAMETERS, statement, REMEDIES[GRAVITY,], key='gravity', sensors=SENSORS[:1]
+                )
             )
         for next_step, members in _by_need(calibration, names).items():
             reasons.append(
@@ -816,7 +833,7 @@ def _undetermined(calibration: Calibration) -> list[Reason]:
                     f'{listed(members)}: {text}',
                     next_step,
                     key=REMEDY_KEYS.get(next_step),
-                    sensors=_whose(name.partition('.')[0] for name in members),
+                    sensors=_concerned_sensors(name.partition('.')[0] for name in members),
                 )
             )
     return reasons
@@ -824,24 +841,25 @@ def _undetermined(calibration: Calibration) -> list[Reason]:
 
 def _by_need(calibration: Calibration, names: Sequence[str]) -> dict[str, list[str]]:
     """
-    Return {motion: names}: each name with the motion of the weak direction in which it weighs most.
+    Return {motion or remedy: names}, by the weak direction with the largest weight of each name.
     """
     by_need: dict[str, list[str]] = {}
     for name in names:
-        need, largest_weight = '', 0.0
+        need = ''
+        largest_weight = 0.0
         for direction in calibration.undetermined:
             weight = abs(direction['parameters'].get(name, 0.0))
             if weight > largest_weight:
                 need = direction['needs']
                 largest_weight = weight
-        if largest_weight == 0.0:  # in no direction: that of another component of its effect
+        if largest_weight == 0.0:  # in no direction: the need of another component of its effect
             need = _need_of_effect(calibration, name.rpartition('.')[0])
         by_need.setdefault(need, []).append(name)
     return by_need
 
 
 def _need_of_effect(calibration: Calibration, effect: str) -> str:
-    """Return the motion of the first weak direction that contains a component of an effect."""
+    """Return the need of the first weak direction that contains a component of an effect."""
     for direction in calibration.undetermined:
         if any(name.rpartition('.')[0] == effect for name in direction['parameters']):
             return direction['needs']
