@@ -59,7 +59,7 @@ class Calibration:
     """Parameters with covariance and status, and the conditions under which they were found."""
 
     model: SensorModel
-    """Effects and their order."""
+    """Effects, in the order of their parameters."""
     values: np.ndarray
     """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
     covariance: np.ndarray
@@ -165,18 +165,18 @@ class Calibration:
     @property
     def status_by_name(self) -> dict[str, str]:
         """Status of each parameter of the sensors with readings, and of the common scale."""
-        found = {}
+        status_by_name = {}
         for name, status in zip(self.param_names, self.status):
             if name.partition('.')[0] not in self.absent:
-                found[name] = status
+                status_by_name[name] = status
         if self.common_scale:
-            found[COMMON_SCALE] = self.common_scale['status']
-        return found
+            status_by_name[COMMON_SCALE] = self.common_scale['status']
+        return status_by_name
 
     def value(self, sensor: str, effect: str) -> np.ndarray:
         """Return the value of one effect in its documented shape."""
-        found = self.model.catalogue.find(sensor, effect, self.model.joint_names)
-        return self.values[self.model.slices[sensor, effect]].reshape(found.shape)
+        shape = self.model.catalogue.find(sensor, effect, self.model.joint_names).shape
+        return self.values[self.model.slices[sensor, effect]].reshape(shape)
 
     def of(self, sensor: str, role: Role) -> Any:
         """
@@ -195,22 +195,20 @@ class Calibration:
         """Whether the noise of a sensor is known at any sampling rate."""
         return any('noise_density' in self.statistics.get(sensor, {}) for sensor in SENSORS)
 
-    def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, float]:
         """
-        Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,).
-
-        From the statistics.
+        Return (sd of a sample, shape (3,); sd of window offsets and wander).
 
         With a noise density and a `period` (s), the sample sd is for that rate; else for the rate
-        of the recording.
+        of the recording. Zero where the statistics have none.
         """
-        found = self.statistics.get(sensor, {})
-        white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
-        if period is not None and 'noise_density' in found:
-            white = np.asarray(found['noise_density'], float) / np.sqrt(period)
-        return white, np.hypot(
-            float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0))
-        )
+        statistics = self.statistics.get(sensor, {})
+        white = np.asarray(statistics.get('noise_sd', [0.0] * 3), float)
+        if period is not None and 'noise_density' in statistics:
+            white = np.asarray(statistics['noise_density'], float) / np.sqrt(period)
+        offset_sd = float(statistics.get('between_window_sd', 0.0))
+        wander_sd = float(statistics.get('wander_sd', 0.0))
+        return white, np.hypot(offset_sd, wander_sd)
 
     @property
     def uncertainty_known(self) -> bool:
@@ -225,17 +223,19 @@ class Calibration:
         UNPROVEN without both, and at best UNPROVEN where compensation refuses the values. An absent
         sensor has none.
         """
-        found = {}
+        decisions = {}
         for sensor in self.sensors:
-            known = [SensorDecision(self.decision[sensor])] if sensor in self.decision else []
-            if self.proof.get(sensor) or not known:
-                known.append(decide(self.proof.get(sensor)))
+            limits = []
+            if sensor in self.decision:
+                limits.append(SensorDecision(self.decision[sensor]))
+            if self.proof.get(sensor) or not limits:
+                limits.append(decide(self.proof.get(sensor)))
             if beyond_instruments(self, sensor):
-                known.append(UNPROVEN)
-            found[sensor] = most_cautious(known)
-        if needs_accelerometer(self, found):
-            found['gyroscope'] = most_cautious([found['gyroscope'], UNPROVEN])
-        return found
+                limits.append(UNPROVEN)
+            decisions[sensor] = most_cautious(limits)
+        if needs_accelerometer(self, decisions):
+            decisions['gyroscope'] = most_cautious([decisions['gyroscope'], UNPROVEN])
+        return decisions
 
     @property
     def requested(self) -> dict[str, str]:
@@ -245,11 +245,11 @@ class Calibration:
         Table, clock and the common arm are nuisances: they belong to the reference.
         """
         nuisances = set(np.array(self.param_names)[~self.model.requested])
-        found = {}
+        requested = {}
         for name, status in self.status_by_name.items():
             if name not in nuisances and status != FIXED and name.partition('.')[0] in SENSORS:
-                found[name] = status
-        return found
+                requested[name] = status
+        return requested
 
     @overload
     def compensate(self, samples: ImuSamples, *, temperature_c: Any = None) -> ImuSamples: ...
@@ -304,9 +304,9 @@ class Calibration:
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
     def __repr__(self) -> str:
-        known = list(self.requested.values())
+        statuses = list(self.requested.values())
         counts = ', '.join(
-            f'{known.count(status)} {status}' for status in Status if status in known
+            f'{statuses.count(status)} {status}' for status in Status if status in statuses
         )
         return (
             f'<Calibration of {self.frame_id or "an IMU"}: {decisions_text(self.decisions)},'
@@ -325,16 +325,19 @@ class Calibration:
         return '\n'.join(lines)
 
     def _repr_html_(self) -> str:
-        def row(cells: tuple[str, ...], tag: str) -> str:
-            row_html = ''
-            for cell, heading in zip(cells, PARAMETER_HEADINGS, strict=True):
-                side = 'right' if heading in NUMBER_COLUMNS else 'left'
-                row_html += f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
-            return f'<tr>{row_html}</tr>'
+        rows = _html_row(PARAMETER_HEADINGS, 'th')
+        for cells in parameter_rows(self):
+            rows += _html_row(cells, 'td')
+        return f'<table><caption>{escape(repr(self))}</caption>{rows}</table>'
 
-        body = ''.join(row(cells, 'td') for cells in parameter_rows(self))
-        head = row(PARAMETER_HEADINGS, 'th')
-        return f'<table><caption>{escape(repr(self))}</caption>{head}{body}</table>'
+
+def _html_row(cells: tuple[str, ...], tag: str) -> str:
+    """Return a row of the table of parameters; `tag` is that of its cells."""
+    row = ''
+    for cell, heading in zip(cells, PARAMETER_HEADINGS, strict=True):
+        side = 'right' if heading in NUMBER_COLUMNS else 'left'
+        row += f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
+    return f'<tr>{row}</tr>'
 
 
 PARAMETER_HEADINGS = ('parameter', 'value', 'sd', 'unit', 'status')
@@ -348,7 +351,7 @@ def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
         if effect.sensor in calibration.absent:
             continue
         part = calibration.model.slices[effect.key]
-        for k, index in enumerate(range(part.start, part.stop)):
+        for k, index in enumerate(range(part.start, part.stop)):  # of the effect, of the model
             factor, unit = for_people(effect.unit_of(k), calibration.param_names[index])
             value, sd = with_sd(
                 calibration.values[index] * factor, calibration.own_sd[index] * factor
@@ -378,29 +381,30 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     model = calibration.model
     names: dict[str, tuple[str, ...]] = {section: () for section in SECTIONS}
     for effect in model.effects:
-        if _stays(effect, sensors):
+        if _is_kept(effect, sensors):
             names[effect.sensor] += (effect.name,)
-    small = replace(
+    reduced = replace(
         model,
         accelerometer=names['accelerometer'],
         gyroscope=names['gyroscope'],
         reference=names['reference'],
     )
-    places = np.concatenate(
-        [np.arange(part.start, part.stop) for part in map(model.slices.__getitem__, small.slices)]
-    )
-    values = calibration.values[places]
-    covariance = calibration.covariance[np.ix_(places, places)]
-    status = [calibration.status[place] for place in places]
-    for effect in small.effects:
+    # Of the parameters that remain: their indices in the complete model, in the reduced order.
+    all_indices = np.arange(len(calibration.values))
+    indices = np.concatenate([all_indices[model.slices[key]] for key in reduced.slices])
+    values = calibration.values[indices]
+    covariance = calibration.covariance[np.ix_(indices, indices)]
+    status = [calibration.status[index] for index in indices]
+    for effect in reduced.effects:
         if effect.sensor in sensors and effect.role is not Role.LIMIT:
-            part = small.slices[effect.key]
-            values[part], status[part] = effect.prior_values(), [HELD] * effect.size
+            part = reduced.slices[effect.key]
+            values[part] = effect.prior_values()
+            status[part] = [HELD] * effect.size
             covariance[part, :] = covariance[:, part] = 0.0
             covariance[part, part] = np.diag(effect.prior_sds() ** 2)
     return replace(
         calibration,
-        model=small,
+        model=reduced,
         values=values,
         covariance=covariance,
         status=tuple(status),
@@ -409,30 +413,33 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     )
 
 
-def _stays(effect: Effect, sensors: Sequence[str]) -> bool:
+def _is_kept(effect: Effect, sensors: Sequence[str]) -> bool:
+    """Return whether an effect remains when `sensors` are not corrected."""
     if effect.sensor in sensors:
         return effect.role in (Role.OFFSET, Role.LINEAR, Role.LIMIT)
     if effect.sensor == 'reference':
         return True
     # A correction that needs readings of a sensor without correction is removed too.
-    used = frozenset().union(*(group.uses for group in effect.groups))
-    return not any(used & READINGS[sensor] for sensor in sensors)
+    inputs = frozenset().union(*(group.uses for group in effect.groups))
+    return not any(inputs & READINGS[sensor] for sensor in sensors)
 
 
 SHOWN_NAMES = 6
-"""Names listed one by one; of more, the groups are named."""
+"""Largest number of names that are listed one by one; more are listed by group."""
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in a sentence; of many, the groups with their numbers."""
+    """Return names in a sentence; many as ``SENSOR.EFFECT (number: components)``."""
     if len(names) <= SHOWN_NAMES:
         return ', '.join(names)
-    groups = {}
+    groups: dict[str, list[str]] = {}
     for name in names:
-        groups.setdefault(name.rpartition('.')[0], []).append(name.rpartition('.')[2])
-    return ', '.join(
-        f'{group} ({len(members)}: {", ".join(members)})' for group, members in groups.items()
-    )
+        group, _, component = name.rpartition('.')
+        groups.setdefault(group, []).append(component)
+    parts = []
+    for group, components in groups.items():
+        parts.append(f'{group} ({len(components)}: {", ".join(components)})')
+    return ', '.join(parts)
 
 
 MIN_COEFFICIENT_SDS = 3.0
@@ -446,7 +453,7 @@ def one_significant(distance: np.ndarray, sd: np.ndarray) -> bool:
     """
     Return whether one of several coefficients differs from its prior.
 
-    It must differ by more than MIN_COEFFICIENT_SDS standard deviations.
+    Its `distance` must be more than MIN_COEFFICIENT_SDS standard deviations; shapes (n,).
     """
     return bool(np.any(np.abs(distance) > MIN_COEFFICIENT_SDS * sd))
 
@@ -475,18 +482,18 @@ def worst_scale(calibration: Calibration, sensor: str) -> float:
 
 def scale_supported(calibration: Calibration, sensor: str) -> bool:
     """
-    Return whether the data support scale factors far from one.
+    Return whether the data support scale factors that are far from 1.
 
     All are determined, and the corrected readings have smaller errors on held-out data.
     """
-    model, names = calibration.model, calibration.param_names
-    part = model.part(sensor, Role.LINEAR)
-    diagonal = range(part.start, part.stop, 4)  # entries 0, 4 and 8 of nine
-    states = {calibration.status_by_name[names[index]] for index in diagonal}
+    matrix = calibration.model.part(sensor, Role.LINEAR)
+    diagonal = range(matrix.start, matrix.stop, 4)  # entries 0, 4 and 8 of nine
+    names = calibration.param_names
+    statuses = {calibration.status_by_name[names[index]] for index in diagonal}
     entry = calibration.proof.get(sensor)
-    # without a proof the file states the decision: the true parameters of a simulation
-    word = decide(entry) if entry else calibration.decision.get(sensor)
-    return states == {DETERMINED} and word == HELPS
+    # Without a proof the file states the decision: the true parameters of a simulation.
+    decision = decide(entry) if entry else calibration.decision.get(sensor)
+    return statuses == {DETERMINED} and decision == HELPS
 
 
 def scale_questions(calibration: Calibration) -> dict[str, str]:
@@ -522,8 +529,9 @@ def surpassed_limit(calibration: Calibration, sensor: str) -> InstrumentLimit | 
 
     A scale factor that is possible but not usual (`core.scales`) needs the support of the data.
     """
-    matrix, bias = (np.asarray(calibration.of(sensor, role)) for role in (Role.LINEAR, Role.OFFSET))
-    off = np.abs(matrix - np.diag(np.diag(matrix))).max()
+    matrix = np.asarray(calibration.of(sensor, Role.LINEAR))
+    bias = np.asarray(calibration.of(sensor, Role.OFFSET))
+    off_diagonal = np.abs(matrix - np.diag(np.diag(matrix))).max()
     factor = worst_scale(calibration, sensor)
     if scale_range(factor) is IMPOSSIBLE:
         low, high = POSSIBLE_SCALE
@@ -540,10 +548,10 @@ def surpassed_limit(calibration: Calibration, sensor: str) -> InstrumentLimit | 
             CONVERT,
             f'{sensor}_unit',
         )
-    if off > OFF_DIAGONAL:
+    if off_diagonal > OFF_DIAGONAL:
         return InstrumentLimit(
             f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is'
-            f' {significant(off)}',
+            f' {significant(off_diagonal)}',
             calibration.texts.off_diagonal,
         )
     if np.abs(bias).max() > LARGEST_BIAS[sensor]:
@@ -562,10 +570,12 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
 
 
 def needs_accelerometer(calibration: Calibration, decisions: Mapping[str, SensorDecision]) -> bool:
-    """Return whether the gyroscope cannot be corrected: its axes by hand are not available."""
-    return calibration.gyroscope_in_accelerometer_axes and bool(
-        decisions['accelerometer'] is HARMS or beyond_instruments(calibration, 'accelerometer')
-    )
+    """Return whether the gyroscope lacks its axes: those of an accelerometer that is refused."""
+    if not calibration.gyroscope_in_accelerometer_axes:
+        return False
+    if decisions['accelerometer'] is HARMS:
+        return True
+    return bool(beyond_instruments(calibration, 'accelerometer'))
 
 
 ABSENT = 'the recording of the calibration has no readings of it'
@@ -610,24 +620,23 @@ def beyond_known(share: float, section: str) -> str:
     """
     Return the message for an effect of a size that no known instrument has.
 
-    The effect explains a share of the excess variance with this size.
+    With this size the effect explains `share` of the excess variance; `section` is its sensor or
+    'reference'.
     """
-    of_what = (
-        'of tables: check the description of the table, the mount, the stamps'
-        if section == 'reference'
-        else 'of such sensors: check saturation, the mount, the scale'
-    )
+    instruments = 'of such sensors: check saturation, the mount, the scale'
+    if section == 'reference':
+        instruments = 'of tables: check the description of the table, the mount, the stamps'
     return (
         f'explains {100 * share:.0f} % of the residual, but its size exceeds the literature values'
-        f' {of_what}'
+        f' {instruments}'
     )
 
 
 def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:
     """
-    Return one line for each parameter group that is out of range.
+    Return a line for each effect with a value beyond those of all grades of instruments.
 
-    The groups are of one sensor or of all, and outside the range of all grades of instruments.
+    The effects are those of one section of the document, or of all.
     """
     lines = []
     for effect in calibration.model.effects:

@@ -127,7 +127,7 @@ CALIBRATION = Document(
 
 def _entries_of(model: SensorModel, names: Collection[str]) -> Requirement:
     """
-    Return the requirement of what depends on the effects of a document.
+    Return the requirement of the parts that depend on the effects of a document.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def _entries_of(model: SensorModel, names: Collection[str]) -> Requirement:
 
 
 def _entry_of(effect: Effect, with_sd: bool) -> Requirement:
-    """Return the requirement of the entry of an effect."""
+    """Return the requirement of the entry of an effect; `with_sd`: its sd must be there."""
     # Saturation levels may be infinite; `check_numbers` checks the values.
     values = array(effect.shape, number(finite=False, code='document_parts'))
     centre = {group.name: array((group.width,), number(code='centre')) for group in effect.groups}
@@ -202,54 +202,56 @@ def check_numbers(calibration: Calibration) -> Calibration:
             'a saturation level must be larger than zero, one is not; calibrate again',
             code='saturation_level',
         )
-    if max(np.max(np.abs(values[~levels])), math.sqrt(np.max(np.abs(covariance)))) > MAX_VALUE:
+    largest_value = np.max(np.abs(values[~levels]))
+    largest_sd = math.sqrt(np.max(np.abs(covariance)))
+    if max(largest_value, largest_sd) > MAX_VALUE:
         raise DocumentError(
             f'values and standard deviations must be below {MAX_VALUE:g}, some are not; calibrate'
             ' again',
             code='too_large',
         )
     _check_covariance(covariance)
-    terms = calibration.covariance_terms
-    variance = np.diag(covariance)
-    parts = np.array(list(terms.values()))
-    if terms and not np.all(
-        np.abs(parts.sum(axis=0) - variance) <= COVARIANCE_ROUNDING * np.abs(parts).sum(axis=0)
-    ):
-        raise DocumentError(
-            'the terms of each variance must sum to it, some do not; calibrate again',
-            code='covariance_terms',
-        )
+    if calibration.covariance_terms:
+        variances = np.array(list(calibration.covariance_terms.values()))  # (n_terms, n_params)
+        residual = np.abs(variances.sum(axis=0) - np.diag(covariance))
+        if not np.all(residual <= COVARIANCE_ROUNDING * np.abs(variances).sum(axis=0)):
+            raise DocumentError(
+                'the terms of each variance must sum to it, some do not; calibrate again',
+                code='covariance_terms',
+            )
     for sensor in SENSORS:
-        for needed in BASE:
-            if not calibration.has(sensor, needed):
+        for effect in BASE:
+            if not calibration.has(sensor, effect):
                 raise DocumentError(
-                    f"the {sensor} must have '{needed}', it is missing; calibrate again",
+                    f"the {sensor} must have '{effect}', it is missing; calibrate again",
                     code='effect_missing',
                 )
     return _without_ill_conditioned(calibration)
 
 
 def _without_ill_conditioned(calibration: Calibration) -> Calibration:
-    wrong = {}
+    """Return the calibration with nominal parameters of a sensor with an ill-conditioned matrix."""
+    reasons = {}  # sensor -> why its matrix is refused
     for sensor in SENSORS:
         condition = float(np.linalg.cond(calibration.of(sensor, Role.LINEAR)))
         if not condition < CONDITION_LIMIT:
-            wrong[sensor] = (
+            reasons[sensor] = (
                 f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its'
                 f' condition number is {condition:.3g}; calibrate again with more attitudes'
             )
-    if len(wrong) == len(SENSORS):
-        raise DocumentError(next(iter(wrong.values())), code='ill_conditioned')
-    if not wrong:
+    if len(reasons) == len(SENSORS):
+        raise DocumentError(next(iter(reasons.values())), code='ill_conditioned')
+    if not reasons:
         return calibration
     return replace(
-        with_nominal(calibration, list(wrong)),
-        decision=calibration.decision | dict.fromkeys(wrong, str(HARMS)),
-        decision_reasons=calibration.decision_reasons | wrong,
+        with_nominal(calibration, list(reasons)),
+        decision=calibration.decision | dict.fromkeys(reasons, str(HARMS)),
+        decision_reasons=calibration.decision_reasons | reasons,
     )
 
 
 def _check_covariance(covariance: np.ndarray) -> None:
+    """Refuse a matrix that is not symmetric and positive semidefinite, up to rounding."""
     variance = np.diag(covariance)
     if np.any(variance < 0):
         raise DocumentError(
@@ -257,10 +259,10 @@ def _check_covariance(covariance: np.ndarray) -> None:
         )
     scale = np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = covariance / np.outer(scale, scale)
-    if (
-        np.max(np.abs(correlation - correlation.T)) > COVARIANCE_ROUNDING
-        or np.linalg.eigvalsh(correlation)[0] < -COVARIANCE_ROUNDING
-    ):
+    refused = np.max(np.abs(correlation - correlation.T)) > COVARIANCE_ROUNDING
+    if not refused:
+        refused = np.linalg.eigvalsh(correlation)[0] < -COVARIANCE_ROUNDING
+    if refused:
         raise DocumentError(
             'the covariance must be symmetric and positive semidefinite, it is not; calibrate'
             ' again',
@@ -270,7 +272,7 @@ def _check_covariance(covariance: np.ndarray) -> None:
 
 def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return {field of a Calibration: value} from the mapping of its document.
+    Return {field of a `Calibration`: value} from the mapping of its document.
 
     Raises
     ------
@@ -279,6 +281,7 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
 
     """
     require(document, CALIBRATION)
+    # The form of the entries depends on the effects: the other parts are checked first.
     model = _model(document)
     covariance = document.get('covariance') or {}
     names = covariance.get('names') or []
@@ -295,7 +298,8 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
         matrix = np.diag(_joined(entry['sd'] for entry in entries) ** 2)
 
     # Reasons of held parameters, and centres of columns, are entries of their effects.
-    held_reason, centre = {}, {}
+    held_reason = {}
+    centre = {}
     for effect, entry in zip(model.effects, entries):
         reasons = np.ravel(np.array(entry.get('held_reason', ''), dtype=object)).tolist()
         for name, reason in zip(effect.param_names(), reasons):
@@ -316,8 +320,8 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
         if sensor in SENSORS:
             proof[sensor] = ProofEntry.from_mapping(entry)
 
-    # The fields; some are copied without change.
-    found: dict[str, Any] = {
+    # Some fields are copied without change.
+    parts: dict[str, Any] = {
         'model': replace(model.at(values), centre=centre),
         'values': values,
         'covariance': matrix,
@@ -332,12 +336,12 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
         'proof': proof,
     }
     for name in _COPIED:
-        found[name] = dict(document.get(name) or {})
-    return found
+        parts[name] = dict(document.get(name) or {})
+    return parts
 
 
 def _joined(values: Iterable[Any], kind: type = float) -> np.ndarray:
-    """Return the items of nested lists, one after the other."""
+    """Return the items of nested lists in one array, shape (n,)."""
     return np.concatenate([np.ravel(np.asarray(value, kind)) for value in values])
 
 
@@ -345,17 +349,17 @@ def _model(document: Mapping[str, Any]) -> SensorModel:
     """Return the SensorModel of the effects that a document lists."""
     joint_names = JointNames.of(document.get('joint_names', JOINTS), document.get('joint_errors'))
     catalogue = CATALOGUE.with_definitions(document.get('effects') or {})
-    owners = {}
+    sensor_of = {}  # effect of a sensor that the document lists in its section 'reference'
     for effect in catalogue.effects(joint_names).values():
         if effect.in_reference:
-            owners[effect.name] = effect.sensor
+            sensor_of[effect.name] = effect.sensor
     members: dict[str, list[str]] = {section: [] for section in SECTIONS}
     for section in SECTIONS:
         names = (document.get(section) or {'effects': []})['effects']
         listed_entries = mapping(dict.fromkeys(names, mapping()))
         require(document, CALIBRATION, mapping(optional={section: listed_entries}))
         for name in names:
-            sensor = owners.get(name, section)
+            sensor = sensor_of.get(name, section)
             if name in members[sensor]:
                 raise DocumentError(
                     f"an effect must be listed once, '{name}' is listed twice; remove one",
@@ -373,7 +377,7 @@ def _model(document: Mapping[str, Any]) -> SensorModel:
 
 
 _COPIED = ('gauge', 'statistics', 'conditions', 'decision', 'decision_reasons', 'provenance')
-"""Parts that a Calibration has as the document has them."""
+"""Parts that a `Calibration` has in the form of the document."""
 CALIBRATION_FORMAT = 'imu_calibration/1'
 _WHERE_KNOWN = ('decision', 'decision_reasons', 'notes', 'proof')
 """Parts of a document that are omitted while unknown."""
@@ -409,7 +413,7 @@ def checked_tolerances(
     return mapping_of_file
 
 
-def calibration_mapping(calibration: Calibration) -> dict:
+def calibration_mapping(calibration: Calibration) -> dict[str, Any]:
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
     document: dict[str, Any] = {
         'format': CALIBRATION_FORMAT,
@@ -440,9 +444,7 @@ def calibration_mapping(calibration: Calibration) -> dict:
     }
     if calibration.covariance_terms:
         document['covariance_terms'] = plain(calibration.covariance_terms)
-    document['undetermined_directions'] = [
-        dict(direction) for direction in calibration.undetermined
-    ]
+    document['undetermined_directions'] = list(map(dict, calibration.undetermined))
 
     # Statistics, conditions and provenance; empty parts are omitted.
     for name in ('statistics', 'conditions', *_WHERE_KNOWN, 'provenance'):
@@ -455,33 +457,34 @@ def calibration_mapping(calibration: Calibration) -> dict:
 
 
 def _section(calibration: Calibration, section: str) -> dict[str, Any]:
+    """Return the names of the effects of a section, and the entry of each."""
     effects = [effect for effect in calibration.model.effects if effect.section == section]
     entries: dict[str, Any] = {'effects': [effect.name for effect in effects]}
     for effect in effects:
         part = calibration.model.slices[effect.key]
         status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)
-        entries[effect.name] = {
+        entry: dict[str, Any] = {
             'value': plain(calibration.values[part].reshape(effect.shape)),
             'sd': plain(calibration.own_sd[part].reshape(effect.shape)),
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit),
             'status': status.tolist(),
         }
-        centre = {}
+        constants = {}
+        slopes = {}
         for group in effect.groups:
-            if group.name in calibration.model.centre:
-                centre[group.name] = calibration.model.centre[group.name]
-        if centre:
-            entries[effect.name]['centre'] = plain(
-                {name: part.constant for name, part in centre.items()}
-            )
-        slopes = {name: part.slope for name, part in centre.items() if np.any(part.slope)}
+            centre = calibration.model.centre.get(group.name)
+            if centre is not None:
+                constants[group.name] = centre.constant
+                if np.any(centre.slope):
+                    slopes[group.name] = centre.slope
+        if constants:
+            entry['centre'] = plain(constants)
         if slopes:
-            entries[effect.name]['centre_slope'] = plain(slopes)
+            entry['centre_slope'] = plain(slopes)
         reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]
         if any(reasons):
-            entries[effect.name]['held_reason'] = (
-                np.array(reasons, dtype=object).reshape(effect.shape).tolist()
-            )
+            entry['held_reason'] = np.array(reasons, dtype=object).reshape(effect.shape).tolist()
+        entries[effect.name] = entry
     return entries
 
 
@@ -508,18 +511,19 @@ def from_mapping(document: Any) -> Calibration:
     return check_numbers(calibration)
 
 
-def _check_format(found: Any) -> None:
-    name, _, number = str(found).partition('/')
+def _check_format(stated: Any) -> None:
+    """Refuse a document whose 'format' is unknown or newer."""
+    name, _, number = str(stated).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
         raise DocumentError(
             f"a calibration document must have 'format: {CALIBRATION_FORMAT}', got"
-            f" {shortened(repr(found))}; give a file written by 'imu_calibration calibrate'",
+            f" {shortened(repr(stated))}; give a file written by 'imu_calibration calibrate'",
             code='document_format',
         )
     if int(number) > int(CALIBRATION_FORMAT.partition('/')[2]):
         raise DocumentError(
             f"a calibration document must not be newer than '{CALIBRATION_FORMAT}', got"
-            f' {shortened(repr(found))}; update imu_calibration',
+            f' {shortened(repr(stated))}; update imu_calibration',
             code='document_newer',
         )
 

@@ -8,7 +8,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.document.proof_entry import Proof, RegimeErrors
 
 QUANTILE = 1.96
-"""Of the normal distribution, for 95 %."""
+"""Half width of the central 95 % of the normal distribution, in standard deviations."""
 SMALLEST_SHARE = 1e-3
 """Smallest lower end of an interval as a share of its upper end: its logarithm is finite."""
 KIND_BY_HAND = {'accelerometer': 'rest', 'gyroscope': 'turns'}
@@ -61,7 +61,7 @@ def checked_limit(limit: float) -> float:
 
 def with_kinds_by_hand(stored: Proof) -> Proof:
     """
-    Return the proof of a file with the kind of motion of its entries by hand, which have none.
+    Return the proof of a file in which the entries by hand have their kind of motion as regime.
 
     Parameters
     ----------
@@ -69,12 +69,12 @@ def with_kinds_by_hand(stored: Proof) -> Proof:
         Sensor -> entry of the file.
 
     """
-    found = {}
+    proof = {}
     for sensor, entry in stored.items():
-        found[sensor] = entry
+        proof[sensor] = entry
         if not entry.regimes:
-            found[sensor] = replace(entry, regimes={KIND_BY_HAND[sensor]: entry})
-    return found
+            proof[sensor] = replace(entry, regimes={KIND_BY_HAND[sensor]: entry})
+    return proof
 
 
 def changes_since(stored: Proof, proof: Proof) -> tuple[RegimeChange, ...]:
@@ -91,35 +91,39 @@ def changes_since(stored: Proof, proof: Proof) -> tuple[RegimeChange, ...]:
         Sensor -> entry (`calibration.proof.prove`): of the file, and of the new recording.
 
     """
-    found = []
+    changes = []
     for sensor, entry in proof.items():
         if sensor not in stored:
             continue
-        for regime, part in entry.regimes.items():
+        for regime, errors in entry.regimes.items():
             earlier = stored[sensor].regimes.get(regime)
-            if earlier is None or not earlier.after > 0.0 or not part.after > 0.0:
+            if earlier is None or earlier.unit != errors.unit:
                 continue
-            if earlier.unit != part.unit:
+            if not earlier.after > 0.0 or not errors.after > 0.0:
                 continue
-            ratio = part.after / earlier.after
-            spread = np.exp(QUANTILE * np.hypot(_log_sd(earlier), _log_sd(part)))
-            found.append(
+            ratio = errors.after / earlier.after
+            spread = np.exp(QUANTILE * np.hypot(_log_sd(earlier), _log_sd(errors)))
+            changes.append(
                 RegimeChange(
                     sensor,
                     regime,
-                    part.unit,
+                    errors.unit,
                     stored=earlier.after,
-                    now=part.after,
+                    now=errors.after,
                     low=float(ratio / spread),
                     high=float(ratio * spread),
                 )
             )
-    return tuple(found)
+    return tuple(changes)
 
 
-def _log_sd(part: RegimeErrors) -> float:
-    """Return the standard deviation of the logarithm of an error, from its interval."""
-    low, high = part.ci95
+def _log_sd(errors: RegimeErrors) -> float:
+    """
+    Return the standard deviation of the logarithm of after / before, from its 95 % interval.
+
+    That interval is ``exp(m +- 1.96 s)``, so that ``s = log(high / low) / (2 * 1.96)``.
+    """
+    low, high = errors.ci95
     if not high > 0.0:
         return 0.0
     return float(np.log(high / max(low, SMALLEST_SHARE * high)) / (2.0 * QUANTILE))

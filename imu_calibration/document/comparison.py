@@ -7,6 +7,7 @@ The IMU is judged apart from table and clock, in one convention of axes and orig
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
@@ -25,13 +26,23 @@ COMPARISON_P_VALUE = 0.01
 MOTION_COLUMNS = {'force', 'rate', 'angular acceleration', 'joint rate', 'vibration'}
 """Quantities with components along the axes of the sensor (`ColumnGroup.uses`)."""
 
-Group = tuple[str, float, int, float]
-"""SENSOR.EFFECT, chi-square, degrees of freedom, probability by chance."""
+
+class Group(NamedTuple):
+    """Test of the difference of the parameters of one effect."""
+
+    name: str
+    """SENSOR.EFFECT."""
+    chi2: float
+    """Squared distance ``d' (P1 + P2)^-1 d``."""
+    dof: int
+    """Degrees of freedom."""
+    p_value: float
+    """Probability of such a distance by chance."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter of both."""
+    """One parameter that both calibrations have."""
 
     name: str
     """Parameter name."""
@@ -81,9 +92,9 @@ class Comparison:
 
 def moved_beyond_sd(first: Calibration, second: Calibration) -> bool:
     """
-    Return whether a later calibration differs.
+    Return whether a later calibration has other parameters, or a value that moved by over an sd.
 
-    In its parameters, or in a value by more than the sd of the first.
+    The sd is that of the first.
     """
     if first.param_names != second.param_names:
         return True
@@ -119,10 +130,10 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     mat_flu_first = first.readings.mat_flu_source()
     mat_flu_second = second.readings.mat_flu_source()
     if mat_flu_first is not None and mat_flu_second is not None:
-        turn = mat_flu_first.T @ mat_flu_second
-        if not np.array_equal(turn, np.eye(3)):
+        mat_first_second = mat_flu_first.T @ mat_flu_second
+        if not np.array_equal(mat_first_second, np.eye(3)):
             notes.append(f'both are compared in the axes {first.readings.axes} of the first one')
-            second = _in_other_readings(second, turn)
+            second = _in_other_readings(second, mat_first_second)
     axes = {first.gauge.get('axes'), second.gauge.get('axes')}
     if axes == {MOUNT_AXES, ACCELEROMETER_AXES}:
         note = 'both are compared in the axes of the accelerometer'
@@ -174,8 +185,9 @@ def _in_other_readings(calibration: Calibration, mat_ts: np.ndarray) -> Calibrat
     """
     Return the same calibration of readings in other axes, ``mat_ts reading`` (signed permutation).
 
-    A bias b becomes ``P b``, a matrix M ``P M P'``, arms A (a row per output) ``|P| A P'``: linear
-    in the values.
+    With P = `mat_ts` a bias b becomes ``P b``, a matrix M ``P M P'``, arms A (a row per output)
+    ``|P| A P'``: linear in the values, with the Kronecker product of the two factors for values by
+    rows.
 
     Raises
     ------
@@ -201,18 +213,19 @@ def _in_other_readings(calibration: Calibration, mat_ts: np.ndarray) -> Calibrat
                 key='axes',
                 code='other_axes',
             )
+    # The status of a parameter moves with it: each row of a signed permutation has one entry.
     order = np.argmax(np.abs(slope), axis=1)
     return replace(
         calibration,
         values=slope @ calibration.values,
         covariance=slope @ calibration.covariance @ slope.T,
-        status=tuple(calibration.status[place] for place in order),
+        status=tuple(calibration.status[index] for index in order),
         covariance_terms={},
     )
 
 
 def _turned(model: SensorModel, values: np.ndarray) -> np.ndarray:
-    """Return the values in the axes of the accelerometer."""
+    """Return the values in the axes of the accelerometer, as `in_accelerometer_axes` states."""
     turned = values.copy()
     matrix = model.matrix('accelerometer', values)
     _, rotation = lower_times_rotation(matrix)
@@ -230,13 +243,10 @@ def _compared_turned(
     first: Calibration, second: Calibration, common: Sequence[str], notes: list[str]
 ) -> Comparison:
     """Compare the common parameters of two calibrations in the axes of the accelerometer."""
-    rotations = []
-    for calibration in (first, second):
-        matrix = calibration.model.matrix('accelerometer', calibration.values)
-        _, rotation = lower_times_rotation(matrix)
-        rotations.append(rotation)
-    # From the axes of the second to those of the first; cos(angle) = (trace(turn) - 1) / 2.
-    turn = rotations[0].T @ rotations[1]
+    _, rotation_first = lower_times_rotation(first.model.matrix('accelerometer', first.values))
+    _, rotation_second = lower_times_rotation(second.model.matrix('accelerometer', second.values))
+    # From the axes of the second file to those of the first, by cos(angle) = (trace(turn) - 1) / 2.
+    turn = rotation_first.T @ rotation_second
     angle = float(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0)))
     errors = _errors_of_turn(first, turn.T, angle)
     for name, error in _errors_of_turn(second, turn, angle).items():
@@ -257,6 +267,7 @@ def _with_parts_turned(calibration: Calibration, turn: np.ndarray) -> Calibratio
     for effect in calibration.model.effects:
         if effect.input_places:
             part = calibration.model.slices[effect.key]
+            # The map is linear: its columns are the images of the unit vectors.
             columns = [effect.in_other_axes(unit, turn) for unit in np.eye(effect.size)]
             slope[part, part] = np.transpose(columns)
     return replace(
@@ -275,20 +286,20 @@ def _errors_of_turn(calibration: Calibration, turn: np.ndarray, angle: float) ->
     have them either, is in error by ``angle c``. All other effects remain in the axes of their
     file: a coefficient changes by up to the angle times the largest.
     """
-    found = {}
+    errors = {}
     for effect in calibration.model.effects:
         if effect.role is not Role.TERM or effect.sensor not in SENSORS:
             continue
         values = calibration.values[calibration.model.slices[effect.key]]
-        uses_motion = bool(set().union(*(group.uses for group in effect.groups)) & MOTION_COLUMNS)
+        uses_motion = any(group.uses & MOTION_COLUMNS for group in effect.groups)
         if effect.input_places:
             size = effect.lost_in_other_axes(values, turn)
         elif effect.input_order is None and uses_motion:
             size = float(np.max(np.abs(values)))
         else:
             continue
-        found |= dict.fromkeys(effect.param_names(), angle * size)
-    return found
+        errors |= dict.fromkeys(effect.param_names(), angle * size)
+    return errors
 
 
 def _compared(
@@ -307,59 +318,66 @@ def _compared(
     parameters that cannot be turned (`_errors_of_turn`); those in error by a standard deviation
     are not compared.
     """
-    a = [first.param_names.index(name) for name in common]
-    b = [second.param_names.index(name) for name in common]
-    difference = second.values[b] - first.values[a]
-    parts = [
-        c.covariance[np.ix_(at, at)] for c, at in ((first, a), (second, b)) if c.uncertainty_known
-    ]
-    covariance = sum(parts, np.zeros((len(common), len(common))))
-    held = np.array(
-        [bool({first.status[i], second.status[j]} & {HELD, FIXED}) for i, j in zip(a, b)]
-    )
+    # 1. Differences with their covariance, to which an unknown uncertainty contributes nothing.
+    index_first = [first.param_names.index(name) for name in common]
+    index_second = [second.param_names.index(name) for name in common]
+    difference = second.values[index_second] - first.values[index_first]
+    covariance = np.zeros((len(common), len(common)))
+    n_known = 0
+    for calibration, index in ((first, index_first), (second, index_second)):
+        if calibration.uncertainty_known:
+            covariance = covariance + calibration.covariance[np.ix_(index, index)]
+            n_known += 1
     sd = np.sqrt(np.diag(covariance))
 
+    # 2. Parameters that are not compared: not estimated in one of both, or in other axes.
+    not_estimated = np.zeros(len(common), bool)
+    for k, (i, j) in enumerate(zip(index_first, index_second)):
+        not_estimated[k] = first.status[i] in (HELD, FIXED) or second.status[j] in (HELD, FIXED)
     in_other_axes = np.array([errors.get(name, 0.0) for name in common]) > sd
-    held |= in_other_axes
+    excluded = not_estimated | in_other_axes
+
+    # 3. A row for each parameter.
     units = {}
     for effect in first.model.effects:
         for k, name in enumerate(effect.param_names()):
             units[name] = effect.unit_of(k)
-    rows = tuple(
-        Row(
-            name,
-            float(first.values[i]),
-            float(second.values[j]),
-            float(s),
-            units[name],
-            None if h or not parts else _ratio(d, s),
+    rows = []
+    for k, name in enumerate(common):
+        rows.append(
+            Row(
+                name,
+                first=float(first.values[index_first[k]]),
+                second=float(second.values[index_second[k]]),
+                sd=float(sd[k]),
+                unit=units[name],
+                ratio=None if excluded[k] or not n_known else _ratio(difference[k], sd[k]),
+            )
         )
-        for name, i, j, s, h, d in zip(common, a, b, sd, held, difference)
-    )
-    groups = _groups(common, difference, covariance, held) if len(parts) == 2 else []
-    # Table and clock are judged separately: they are no property of the IMU.
-    keys_of_reference = set()
+
+    # 4. Tests. Table and clock are judged separately: they are no property of the IMU.
+    groups = _groups(common, difference, covariance, ~excluded) if n_known == 2 else []
+    names_of_reference = set()
     for effect in first.model.effects:
         if effect.section == 'reference':
-            keys_of_reference |= {name.rpartition('.')[0] for name in effect.param_names()}
-    of_reference, of_imu = [], []
-    for group in groups:
-        if group[0] in keys_of_reference:
-            of_reference.append(group)
-        else:
-            of_imu.append(group)
+            names_of_reference |= {name.rpartition('.')[0] for name in effect.param_names()}
+    of_reference = [group for group in groups if group.name in names_of_reference]
+    of_imu = [group for group in groups if group.name not in names_of_reference]
     rejected_reference = _holm(of_reference)
     rejected = _holm(of_imu)
+
+    # 5. The verdict as text.
     lines = list(notes)
     differences = []
-    for name, chi2, k, p in groups:
-        if name not in rejected | rejected_reference:
+    for group in groups:
+        if group.name not in rejected | rejected_reference:
             continue
         text = (
-            f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}'
+            f'{group.name}: differs by {np.sqrt(group.chi2 / group.dof):.1f} combined sd'
+            f' (rms of {group.dof}), chance {group.p_value:.1g}'
         )
         lines.append(text)
-        if name in rejected:
+        if group.name in rejected:
             differences.append(text)
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
     if rejected & linear and MOUNT_AXES in (first.gauge.get('axes'), second.gauge.get('axes')):
@@ -367,21 +385,23 @@ def _compared(
             'off-diagonal terms of a matrix include how the IMU was mounted on the table: '
             'they differ after remounting without a change of the IMU'
         )
-    fixed = int(np.count_nonzero(held & ~in_other_axes))
-    if fixed:
-        lines.append(f'{fixed} parameters are held or fixed in one of them and were not compared')
+    n_not_estimated = int(np.count_nonzero(not_estimated & ~in_other_axes))
+    if n_not_estimated:
+        lines.append(
+            f'{n_not_estimated} parameters are held or fixed in one of them and were not compared'
+        )
     if in_other_axes.any():
-        names = [name for name, other in zip(common, in_other_axes) if other]
+        names = [common[k] for k in np.flatnonzero(in_other_axes)]
         lines.append(
             f'not compared, because their axes differ by {np.degrees(angle):.2g} deg:'
             f' {listed(names)}'
         )
-    if len(parts) < 2:
+    if n_known < 2:
         lines.append(
             'agreement of the calibrations cannot be tested: the uncertainties of imported values'
             ' are unknown'
         )
-        return Comparison(rows, None, tuple(lines))
+        return Comparison(tuple(rows), None, tuple(lines))
     reference_agree = None
     if of_reference:
         reference_agree = not rejected_reference
@@ -392,12 +412,12 @@ def _compared(
             'agreement of the calibrations cannot be tested: no parameter of the IMU is determined'
             ' in both'
         )
-        return Comparison(rows, None, tuple(lines), reference_agree)
+        return Comparison(tuple(rows), None, tuple(lines), reference_agree)
     verdict = 'the calibrations disagree' if rejected else 'the calibrations agree'
     if in_other_axes.any():
         verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'
     lines.append(verdict)
-    return Comparison(rows, not rejected, tuple(lines), reference_agree, tuple(differences))
+    return Comparison(tuple(rows), not rejected, tuple(lines), reference_agree, tuple(differences))
 
 
 def _ratio(difference: float, sd: float) -> float:
@@ -416,42 +436,43 @@ def _notes(first: Calibration, second: Calibration) -> list[str]:
         notes.append(
             f'note: the conventions of origin or axes differ: {first.gauge} and {second.gauge}'
         )
-    if (
-        first.model.temperature_ref_c != second.model.temperature_ref_c
-        and first.model.needs_temperature
-    ):
+    same_temperature = first.model.temperature_ref_c == second.model.temperature_ref_c
+    if not same_temperature and first.model.needs_temperature:
         notes.append('note: the reference temperatures differ, so the biases need not agree')
     return notes
 
 
 def _groups(
-    names: Sequence[str], difference: np.ndarray, covariance: np.ndarray, held: np.ndarray
+    names: Sequence[str], difference: np.ndarray, covariance: np.ndarray, compared: np.ndarray
 ) -> list[Group]:
-    """Return (group, chi-square, number, probability) for each SENSOR.EFFECT."""
-    keys = [name.rpartition('.')[0] for name in names]
-    found = []
-    for key in dict.fromkeys(keys):
-        index = np.array([k == key for k in keys]) & ~held
+    """
+    Return the test of each SENSOR.EFFECT with a parameter that is compared.
+
+    The distance is computed with the correlations C and the differences e in standard deviations:
+    ``d' P^-1 d = e' C^-1 e``. C may be singular; its rank is then the degrees of freedom.
+    """
+    effects = [name.rpartition('.')[0] for name in names]
+    groups = []
+    for name in dict.fromkeys(effects):
+        index = np.array([effect == name for effect in effects]) & compared
         if not index.any():
             continue
         block = covariance[np.ix_(index, index)]
-        d = difference[index]
         scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
         correlation = block / np.outer(scale, scale)
-        chi2 = float(
-            (d / scale) @ np.linalg.pinv(correlation, rcond=1e-9, hermitian=True) @ (d / scale)
-        )
+        in_sds = difference[index] / scale
+        chi2 = float(in_sds @ np.linalg.pinv(correlation, rcond=1e-9, hermitian=True) @ in_sds)
         rank = max(int(np.linalg.matrix_rank(correlation, tol=1e-9, hermitian=True)), 1)
-        found.append((key, chi2, rank, float(chdtrc(rank, chi2))))
-    return found
+        groups.append(Group(name, chi2, rank, float(chdtrc(rank, chi2))))
+    return groups
 
 
 def _holm(groups: Sequence[Group]) -> set[str]:
-    """Return the groups that are rejected at COMPARISON_P_VALUE, all groups accounted for."""
+    """Return the names of the groups that Holm's step-down test rejects at COMPARISON_P_VALUE."""
     rejected = set()
-    ordered = sorted(groups, key=lambda g: g[3])
-    for k, (name, _, _, probability) in enumerate(ordered):
-        if probability > COMPARISON_P_VALUE / (len(ordered) - k):
+    ordered = sorted(groups, key=lambda group: group.p_value)
+    for k, group in enumerate(ordered):
+        if group.p_value > COMPARISON_P_VALUE / (len(ordered) - k):
             break
-        rejected.add(name)
+        rejected.add(group.name)
     return rejected

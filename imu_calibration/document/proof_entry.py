@@ -33,9 +33,12 @@ class RegimeErrors:
     @classmethod
     def from_mapping(cls: type[Entry], entry: Mapping[str, Any]) -> Entry:
         """Return the errors that an entry of a document describes; further keys are ignored."""
-        known = {each.name: entry[each.name] for each in fields(cls) if each.name in entry}
-        known['ci95'] = tuple(known['ci95'])
-        return cls(**known)
+        arguments = {}
+        for part in fields(cls):
+            if part.name in entry:
+                arguments[part.name] = entry[part.name]
+        arguments['ci95'] = tuple(arguments['ci95'])
+        return cls(**arguments)
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class ProofEntry(RegimeErrors):
     delay_s: float | None = None
     """Delay of the readings that the model does not include, s; None where it is unknown."""
     delay_explains: float | None = None
-    """Share of the squared error after that this delay explains."""
+    """Share of the squared error with the calibration that this delay explains."""
     regimes: Mapping[str, RegimeErrors] = field(default_factory=dict)
     """Regime of motion -> its errors; a regime with too few windows is left out."""
     one_attitude: bool = False
@@ -67,17 +70,20 @@ class ProofEntry(RegimeErrors):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry of a document."""
-        found = super().to_mapping()
-        regimes = found.pop('regimes')
-        for part in regimes.values():
-            # A regime in the unit of the entry does not repeat it.
-            if part.get('unit') == self.unit:
-                del part['unit']
+        entry = super().to_mapping()
+        # Regimes and the earlier calibration come last.
+        regimes = entry.pop('regimes')
+        earlier = entry.pop('earlier', None)
         if regimes:
-            found['regimes'] = {str(name): part for name, part in regimes.items()}
-        if 'earlier' in found:
-            found['earlier'] = found.pop('earlier')
-        return found
+            entry['regimes'] = {}
+        for name, errors in regimes.items():
+            # A regime in the unit of the entry does not repeat it.
+            if errors.get('unit') == self.unit:
+                del errors['unit']
+            entry['regimes'][str(name)] = errors
+        if earlier is not None:
+            entry['earlier'] = earlier
+        return entry
 
     @classmethod
     def from_mapping(cls, entry: Mapping[str, Any]) -> 'ProofEntry':

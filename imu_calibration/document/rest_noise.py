@@ -24,8 +24,8 @@ def rest_density(by_hand: Mapping, sensor: str) -> float:
     """
     Return the noise density of a sensor at rest at low frequencies, SI/√Hz; 0 if unknown.
 
-    ``sd * colour * sqrt(period)``, rms of the axes: `colour` is the factor over white noise that
-    the means of pieces of the rests show.
+    It is ``sd * colour * sqrt(period)``, rms of the axes: `colour` is the sd of means of pieces of
+    the rests over that by white noise.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def rest_density(by_hand: Mapping, sensor: str) -> float:
 
 def moved_at_rest(by_hand: Mapping, sensor: str) -> str:
     """
-    Return that the readings of a sensor at rest are those of an IMU that moved, or ''.
+    Return the statement that the IMU moved, if a sensor at rest is too noisy, or ''.
 
     Arguments as for `rest_density`.
     """
@@ -60,7 +60,7 @@ def moved_at_rest(by_hand: Mapping, sensor: str) -> str:
 
 def swayed_at_rest(by_hand: Mapping) -> str:
     """
-    Return that both sensors measure a slow tilt where the IMU was held still, or ''.
+    Return the statement that the IMU tilted, if both sensors measure it at rest, or ''.
 
     Arguments as for `rest_density`.
     """
@@ -74,12 +74,14 @@ def swayed_at_rest(by_hand: Mapping) -> str:
 
 
 def motions_at_rest(by_hand: Mapping, sensors: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return text -> sensors for each motion of an IMU that was held still."""
-    found: dict[str, tuple[str, ...]] = {}
+    """Return statement -> sensors that it concerns, for each motion of an IMU held still."""
+    motions: dict[str, tuple[str, ...]] = {}
     for sensor in sensors:
         text = moved_at_rest(by_hand, sensor)
         if text:
-            found[text] = (sensor,)
-    if not found and (text := swayed_at_rest(by_hand)):
-        found[text] = tuple(sensors)
-    return found
+            motions[text] = (sensor,)
+    if not motions:
+        text = swayed_at_rest(by_hand)
+        if text:
+            motions[text] = tuple(sensors)
+    return motions

@@ -74,7 +74,7 @@ class RecordingStatistics:
     dropped: Mapping[str, int]
     """Reason -> number of unusable samples."""
     stream: Mapping[str, int] | None = None
-    """What else happened in the streams -> count."""
+    """Event in the streams without a fault -> number of samples."""
     common_turn_deg: list[float] | None = None
     """Rotation vector of both sensors against the mount, deg."""
     unusable_sensors: Mapping[str, str] | None = None
@@ -83,6 +83,6 @@ class RecordingStatistics:
     """Delay of the gyroscope's stamps and its standard deviation, s."""
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the section of the document."""
-        found = stated(self)
-        return {**found.pop('sensors'), **found}
+        """Return the section of the document; the entry of each sensor is at its top level."""
+        entries = stated(self)
+        return {**entries.pop('sensors'), **entries}
