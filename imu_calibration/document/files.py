@@ -14,7 +14,7 @@ from pathlib import Path
 from secrets import token_hex
 from stat import S_ISDIR
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular
@@ -56,7 +56,9 @@ def name_of_path(path: str | PathLike[str]) -> str:
 
 def read_text(path: str | PathLike[str], what: str) -> str:
     """
-    Return the text of a file, or refuse in one line; not more than a document may hold is read.
+    Return the text of a file, or refuse in one line.
+
+    It is read up to one character more than a document may have, so that its reader refuses it.
     """
     try:
         with io.TextIOWrapper(open_regular(path), encoding='utf-8') as stream:
@@ -81,6 +83,7 @@ def read_bytes(path: str | PathLike[str], what: str) -> bytes:
 
 
 def _why(error: Exception) -> str:
+    """Return the text of an error, for one of the operating system without number and path."""
     return getattr(error, 'strerror', None) or str(error) or type(error).__name__
 
 
@@ -173,9 +176,11 @@ def read_calibration(path: str | PathLike[str]) -> Calibration:
     return calibration_from_text(read_text(calibration_path(path), 'calibration'))
 
 
-def given_calibration(chosen: Calibration | str | PathLike[str]) -> Calibration:
-    """Return the calibration, read where it is a file."""
-    return read_calibration(chosen) if isinstance(chosen, (str, PathLike)) else chosen
+def given_calibration(calibration: Calibration | str | PathLike[str]) -> Calibration:
+    """Return a calibration, which is read if it is the path of a file."""
+    if isinstance(calibration, (str, PathLike)):
+        return read_calibration(calibration)
+    return calibration
 
 
 def read_noise(path: str | os.PathLike) -> 'NoiseFigures':
@@ -211,8 +216,8 @@ def output_folder(path: str) -> Iterator[Path]:
         yield make_folder(path)
     except BaseException:
         with suppress(OSError):  # a folder with content is not removed
-            for made in missing:
-                made.rmdir()
+            for folder in missing:  # the innermost first
+                folder.rmdir()
         raise
 
 
@@ -251,37 +256,41 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str]) -> None:
 
 def hash_of(path: str | PathLike[str]) -> str:
     """
-    Return the SHA-256 of a file, or of the data files of a bag in order of name.
-
-    As hexadecimal digits.
+    Return the SHA-256 of a file, or of the data files of a bag in order of name, as hex digits.
     """
     path = Path(path)
-    files = (
-        sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml')
-        if path.is_dir()
-        else [path]
-    )
-    return _hash_of_unchanged(
-        tuple(
-            (file, (state := file.stat()).st_size, state.st_mtime_ns, state.st_ino)
-            for file in files
-        )
-    )
+    paths = [path]
+    if path.is_dir():
+        paths = sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml')
+    states = []
+    for file in paths:
+        state = file.stat()
+        states.append(_FileState(file, state.st_size, state.st_mtime_ns, state.st_ino))
+    return _hash_of_unchanged(tuple(states))
 
 
 HASHED_PIECE_BYTES = 1 << 20
 
 
-@lru_cache
-def _hash_of_unchanged(files: tuple[tuple[Path, int, int, int]]) -> str:
-    """
-    Return the hash of (path, size, time of the last change, inode) of each file.
+class _FileState(NamedTuple):
+    """A file and the signs of a change of it."""
 
-    A bag is read once in a process.
-    """
+    path: Path
+    """Path."""
+    size: int
+    """Bytes."""
+    changed_ns: int
+    """Time of the last change, ns."""
+    inode: int
+    """Number in the file system."""
+
+
+@lru_cache
+def _hash_of_unchanged(files: tuple[_FileState, ...]) -> str:
+    """Return the hash of the content of files; unchanged ones are read once in a process."""
     digest = hashlib.sha256()
-    for file, *_ in files:
-        with open(file, 'rb') as stream:
+    for file in files:
+        with open(file.path, 'rb') as stream:
             for piece in iter(partial(stream.read, HASHED_PIECE_BYTES), b''):
                 digest.update(piece)
     return digest.hexdigest()
@@ -306,13 +315,13 @@ def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) ->
 
     """
     path = Path(path)
-    with _beside(path) as beside:
-        with open(beside, 'xb') as stream:
+    with _temporary_name(path) as temporary:
+        with open(temporary, 'xb') as stream:
             stream.write(data)
             if to_disk:
                 stream.flush()
                 os.fsync(stream.fileno())
-        os.replace(beside, path)
+        os.replace(temporary, path)
 
 
 def try_place(path: Path) -> None:
@@ -326,8 +335,8 @@ def try_place(path: Path) -> None:
 
     """
     path = Path(path)
-    with _beside(path) as beside:
-        with open(beside, 'xb') as stream:
+    with _temporary_name(path) as temporary:
+        with open(temporary, 'xb') as stream:
             stream.write(b'.')
         with suppress(FileNotFoundError):
             if S_ISDIR(os.stat(path).st_mode):
@@ -345,11 +354,10 @@ def put_aside(path: str | PathLike[str]) -> Path:
 
     """
     path = Path(path)
-    free = next(
-        path.with_name(f'{path.name}.{number}')
-        for number in count(1)
-        if not path.with_name(f'{path.name}.{number}').exists()
-    )
+    for number in count(1):
+        free = path.with_name(f'{path.name}.{number}')
+        if not free.exists():
+            break
     try:
         os.rename(path, free)
     except OSError as error:
@@ -366,14 +374,15 @@ def remove_leftovers(path: Path) -> None:
     Errors are ignored.
     """
     with suppress(OSError, ValueError):
-        for found in path.parent.glob(f'.[0-9]*.{_ending(path)}'):
-            number = found.name.split('.')[1]
-            if number.isdigit() and not is_running(int(number)):
-                found.unlink(missing_ok=True)
+        # As `_temporary_name` names them: .PROCESS.RANDOM.ENDING
+        for file in path.parent.glob(f'.[0-9]*.{_ending(path)}'):
+            process = file.name.split('.')[1]
+            if process.isdigit() and not is_running(int(process)):
+                file.unlink(missing_ok=True)
 
 
 def is_running(process: int) -> bool:
-    """Return whether a process of this host has the number."""
+    """Return whether a process of this host has this number."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
@@ -384,26 +393,27 @@ def is_running(process: int) -> bool:
 
 
 def _ending(path: Path) -> str:
+    """Return the ending of the names of temporary files of a path: the checksum of its name."""
     return f'{zlib.crc32(path.name.encode(errors="replace")):08x}'
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
+def _temporary_name(path: Path) -> Iterator[Path]:
     """
-    Yield an unpredictable name in the same folder for a new file.
+    Yield an unpredictable name in the same folder for a temporary file, removed at the end.
 
-    An error becomes one line, and that file is removed.
+    An error of the operating system becomes an InputError.
     """
     # A link placed under a predictable name would be followed; a suffix to a name of the longest
     # length would exceed the limit.
-    beside = path.parent / f'.{os.getpid()}.{token_hex(8)}.{_ending(path)}'
+    temporary = path.parent / f'.{os.getpid()}.{token_hex(8)}.{_ending(path)}'
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield beside
+        yield temporary
     except (OSError, ValueError) as error:
         raise InputError(
             f'{path} must be writable: {_why(error)}; choose another place', code='not_writable'
         ) from error
     finally:
         with suppress(OSError, ValueError):  # in a read-only folder removal fails too
-            beside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What the statements on a calibration take from its reference: sensor axes and next steps."""
+"""Parts of the statements on a calibration that depend on its reference: axes, next steps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

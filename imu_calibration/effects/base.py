@@ -2,9 +2,10 @@
 An effect: one physical cause of sensor output, its columns, its coefficients and their derivatives.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
+from functools import partial
 from itertools import permutations, product
 from typing import Any
 
@@ -24,6 +25,7 @@ SECTIONS = SENSORS + ('reference',)
 """Sections of a model and of a calibration document."""
 
 VECTOR = AXES
+"""Components of an effect with one value for each axis."""
 OTHERS = tuple(f'{row}_{column}' for row, column in permutations(AXES, 2))
 MATRIX = tuple(row + column for row, column in product(AXES, AXES))
 IMPLAUSIBLE_RATIO = 10.0
@@ -56,38 +58,29 @@ class Role(Enum):
     TILT = auto()
     """Tilt of the table."""
     TERM = auto()
-    """A term, or a warp, of its own."""
+    """A term, or a warp, in none of the other places."""
 
 
 Values = dict[str, np.ndarray]
 """Effect name -> values of the effects of a sensor; column group -> coefficients."""
 
 
+@dataclass(frozen=True, eq=False)
 class Lag:
-    """
-    A weighted mean of delays, all proportional to the first value.
+    """A weighted mean of delays, all proportional to the first value of the effect."""
 
-    Parameters
-    ----------
-    pairs : sequence of (weight, delay)
-        Delays in units of the first value.
-    factor : callable, optional
-        ``factor(time, values) -> (n,)``, of a delay that changes with time.
-
-    """
-
-    def __init__(
-        self, pairs: Sequence[tuple[float, float]] = ((1.0, 1.0),), factor: Callable | None = None
-    ):
-        self.pairs, self.factor = pairs, factor
+    pairs: Sequence[tuple[float, float]] = ((1.0, 1.0),)
+    """(weight, delay in units of the first value) of each."""
+    factor: Callable | None = None
+    """``factor(time, values) -> (n,)``, for delays that change with time; None: constant."""
 
     @property
     def single(self) -> 'Lag':
-        """The delay of the same first derivative."""
+        """The single delay whose first derivative is that of the mean."""
         return Lag(factor=self.factor)
 
     def delays(self, time: np.ndarray, values: np.ndarray) -> list[tuple[float, np.ndarray]]:
-        """Return (weight, delay in s, shape () or (n,)) of each."""
+        """Return (weight, delay in s, shape () or (n,)) of each delay."""
         size = values[0] * (1.0 if self.factor is None else self.factor(time, values))
         return [(weight, size * delay) for weight, delay in self.pairs]
 
@@ -103,9 +96,9 @@ class Effect:
     coefficients of columns of their own; a triangular factor of the columns is then an exact
     summary of the data.
 
-    A *reference* effect (and a sensor's own lag) instead changes the motion that the sensor is
-    thought to have felt: `warp` gives another table and motion, or the delays of a lag, over which
-    the reference is the weighted mean.
+    A *reference* effect (and a sensor's own lag) instead changes the motion that is the sensor's
+    input: `warp` gives another table and motion, or the delays of a lag, over which the reference
+    is the weighted mean.
 
     All properties of an effect are fields here; none is derived from its name.
     """
@@ -272,8 +265,8 @@ class Effect:
         """Section of the document that lists it."""
         return 'reference' if self.in_reference else self.sensor
 
-    def groups_of(self, sensor: str) -> tuple:
-        """Return the groups that belong to a sensor."""
+    def groups_of(self, sensor: str) -> tuple[ColumnGroup, ...]:
+        """Return the groups of columns of a sensor."""
         if not self.group_sensors:  # each group belongs to all sensors that the effect acts on
             return self.groups
         pairs = zip(self.groups, self.group_sensors)
@@ -306,9 +299,7 @@ class Effect:
 
     def surpasses(self, amplitudes: np.ndarray, sd: np.ndarray | float = 0.0) -> bool:
         """
-        Return whether amplitudes exceed the amplitudes of any known instrument.
-
-        They must exceed them by more than three standard deviations.
+        Return whether an amplitude exceeds those of all known instruments by three sd.
         """
         return bool(np.max(np.abs(amplitudes) - 3 * sd) > IMPLAUSIBLE_RATIO * self.largest)
 
@@ -338,9 +329,9 @@ class Effect:
 
     def at_time_constant(self, constant: float) -> np.ndarray:
         """
-        Return the prior values with another time constant, shape (size,).
+        Return the prior values with another time constant `constant`, s, shape (size,).
 
-        A point of linearisation of a bank.
+        It is a point of linearisation of a bank of time constants.
         """
         return np.append(self.prior_values()[:-1], constant)
 
@@ -361,15 +352,15 @@ class Effect:
         components[list(self.input_places)] = 0.0
         return float(components.max())
 
-    def _all_components(self, values, rotation):
-        """Return all components of the tensors of `input_places` in other axes."""
+    def _all_components(self, values: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Return all components, in other axes, of tensors that have those of `input_places`."""
         width = 3 if self.input_order == 1 else len(PRODUCT_PAIRS)
         components = np.zeros(len(AXES) * width)
         components[list(self.input_places)] = values
         return self._turned(components, rotation)
 
-    def _turned(self, values, rotation):
-        """Return complete tensors in other axes."""
+    def _turned(self, values: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Return the components of complete tensors in other axes, as `in_other_axes` states."""
         if self.input_order == 1:
             return (values.reshape(-1, 3) @ rotation.T).ravel()
         if self.input_order == 2:
@@ -396,6 +387,7 @@ class Effect:
 
 
 PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+"""Axes of the factors of the six products of two components."""
 _IS_MIXED = [first != second for first, second in PRODUCT_PAIRS]
 MIXED_PRODUCTS = tuple(np.flatnonzero(np.tile(_IS_MIXED, len(AXES))).tolist())
 """Places of `PRODUCTS` among the six products of each output."""
@@ -413,37 +405,41 @@ TRIPLES = (
     (2, 2, 1),
     (0, 1, 2),
 )
+"""Axes of the factors of the ten products of three components."""
 TEMPERATURE_RISE = 'temperature_c - temperature_ref_c'
 INPUT = {'accelerometer': 'force', 'gyroscope': 'rate'}
+"""Sensor -> beginning of the names of the groups that are made of its true input."""
 _VECTOR = {'accelerometer': ('f_x', 'f_y', 'f_z'), 'gyroscope': ('w_x', 'w_y', 'w_z')}
 """Sensor -> names of the components of its true input in the text of a column."""
 
 
-def _of_input(ending, texts):
-    """Return {sensor: ColumnGroup} made of the components of its true input."""
-    return {
-        sensor: ColumnGroup(INPUT[sensor] + ending, tuple(texts(_VECTOR[sensor])))
-        for sensor in SENSORS
-    }
+def _of_input(
+    ending: str, texts: Callable[[Sequence[str]], Iterable[str]]
+) -> dict[str, ColumnGroup]:
+    """
+    Return {sensor: group of columns that are made of the components of its true input}.
+
+    ``texts(names of the components)`` gives the text of each column; `ending` is that of the name.
+    """
+    groups = {}
+    for sensor in SENSORS:
+        groups[sensor] = ColumnGroup(INPUT[sensor] + ending, tuple(texts(_VECTOR[sensor])))
+    return groups
 
 
-def _products_of_places(places):
-    """Return a function of three names: the products of the names at each tuple of places."""
-
-    def texts(names):
-        columns = []
-        for factors in places:
-            columns.append(' * '.join(names[place] for place in factors))
-        return columns
-
-    return texts
+def _products(axes_of_factors: Sequence[tuple[int, ...]], names: Sequence[str]) -> list[str]:
+    """Return the text of a product of components for each tuple of axes."""
+    products = []
+    for axes in axes_of_factors:
+        products.append(' * '.join(names[axis] for axis in axes))
+    return products
 
 
 CONSTANT = ColumnGroup('one', ('1',))
 TIME = ColumnGroup('time', ('time',))
 TRUE_INPUT = _of_input('', lambda v: v)
-SQUARES = _of_input('_squares', _products_of_places(PRODUCT_PAIRS))
-CUBES = _of_input('_cubes', _products_of_places(TRIPLES))
+SQUARES = _of_input('_squares', partial(_products, PRODUCT_PAIRS))
+CUBES = _of_input('_cubes', partial(_products, TRIPLES))
 SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi, vj in product(v, v)])
 """Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
 THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({TEMPERATURE_RISE})' for vi in v])
@@ -499,19 +495,18 @@ def power_coefficients(axes: np.ndarray, products: Sequence[tuple[int, ...]]) ->
     The coefficient of ``v_a v_b ...`` is ``u_a u_b ...`` times the number of orders of its factors
     (multinomial theorem).
     """
-    return np.stack(
-        [
-            axes[:, list(product)].prod(axis=1) * len(set(permutations(product)))
-            for product in products
-        ]
-    )
+    coefficients = []
+    for factors in products:
+        n_orders = len(set(permutations(factors)))
+        coefficients.append(axes[:, list(factors)].prod(axis=1) * n_orders)
+    return np.stack(coefficients)
 
 
 def signed_coefficients(axes: np.ndarray) -> np.ndarray:
     """
     Return the coefficients of `SIGNED` that give |u_i . v| for each row u_i of `axes`.
 
-    Shape (9, 3).
+    That is u_ij in row 3 i + j and column i, zero elsewhere, shape (9, 3).
     """
     block = np.zeros((3, 3, 3), axes.dtype)
     block[np.arange(3), :, np.arange(3)] = axes
@@ -522,16 +517,18 @@ def amplitude_coefficients(
     effect: Effect, values: Values, point: dict[str, Any], *, own_axis: bool = False
 ) -> Values:
     """
-    Return values straight before the columns: ``output_i = sum_k value_ik column_k``.
+    Return values that are the coefficients of columns: ``output_i = sum_k value_ik column_k``.
 
-    With three amplitudes and three columns each column may belong to one axis only (`own_axis`). A
-    last value that is a time constant is accompanied by the columns' derivatives by it.
+    With `own_axis` column i has the value of axis i, and no other axis. With a time constant T, the
+    last value, there are also the derivatives of the columns by it at T0 of `point`, with the
+    coefficients ``value_ik (T - T0)``.
     """
-    own = values[effect.name]
-    amplitudes = own[:-1] if effect.time_constant else own
+    effect_values = values[effect.name]
+    amplitudes = effect_values[:-1] if effect.time_constant else effect_values
     block = np.diag(amplitudes) if own_axis else amplitudes.reshape(3, -1).T
     if effect.time_constant:
-        block = np.concatenate([block, block * (own[-1] - point[effect.name][-1])])
+        change = effect_values[-1] - point[effect.name][-1]
+        block = np.concatenate([block, block * change])
     return {effect.groups[0].name: block}
 
 
@@ -539,9 +536,10 @@ def along_axis_coefficients(
     effect: Effect, values: Values, point: dict[str, Any], *, function: Callable
 ) -> Values:
     """
-    Return values before a function of the input along each element's own axis.
+    Return the coefficients of ``value_i g(u_i . v)`` with the unit input axis u_i of element i.
 
-    ``function(input axes)`` gives one of each.
+    The axes are the rows of the matrix, normalised. ``function(axes)`` gives the coefficients of
+    the columns for g, as `power_coefficients` does.
     """
     matrix = values['matrix'].reshape(3, 3)
     input_axes = matrix / np.sqrt((matrix**2).sum(axis=1))[:, None]
@@ -549,35 +547,33 @@ def along_axis_coefficients(
 
 
 def product_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
-    """Return values before the last three of six products, which are of different components."""
+    """Return values as coefficients of the three mixed products; those of the squares are 0."""
     block = values[effect.name].reshape(3, 3).T
     return {effect.groups[0].name: np.concatenate([np.zeros((3, 3), block.dtype), block])}
 
 
 def cross_axis_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
-    """Return two values for each axis, before the columns of the two other axes."""
+    """Return two values of each axis as coefficients of the columns of the two other axes."""
     block = np.zeros((3, 3), values[effect.name].dtype)
     block[~np.eye(3, dtype=bool)] = values[effect.name]
     return {effect.groups[0].name: block.T}
 
 
 def matrix_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
-    """Return the sensor's matrix, or its rows times one value per axis."""
+    """Return the sensor's matrix, or for another effect its rows times one value per axis."""
     matrix = values['matrix'].reshape(3, 3)
-    return {
-        effect.groups[0].name: (
-            matrix.T if effect.name == 'matrix' else (matrix * values[effect.name][:, None]).T
-        )
-    }
+    if effect.name != 'matrix':
+        matrix = matrix * values[effect.name][:, None]
+    return {effect.groups[0].name: matrix.T}
 
 
 def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
     """
-    Return the coefficients of the lever matrix W_jk for output i.
+    Return the coefficients M_ij r_ik of the lever matrix W_jk for output i, shape (9, 3).
 
-    M_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse).
+    With the matrix M and the arm r_i of output i (Zhang 2017, eq. 11-17 with the true inverse).
     """
-    # One arm for all three.
     matrix = values['matrix'].reshape(3, 3)
+    # One arm serves all three outputs.
     arms = np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3))
     return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}

@@ -10,7 +10,7 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
-from imu_calibration.effects.expressions import ColumnCentre
+from imu_calibration.effects.expressions import ColumnCentre, ColumnGroup
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 
@@ -65,32 +65,33 @@ def parse_reference(text: str | None, table: Table) -> tuple[str, ...]:
     """
     if text is not None:
         return tuple(name for name in text.split('+') if name not in ('', 'none'))
-    names = table.joint_names
-    said = {
-        'axis_non_orthogonality': names.angle_sd and names.angles,
-        'encoder_zero': names.angle_sd and names.zeros,
-        'axis_offset': names.place_sd and names.places,
-    }
-    return tuple(
-        name
-        for name in ('table_tilt', *said, 'earth_rate')
-        if said.get(name, True) and not _is_moot(name, table)
-    )
+    joints = table.joint_names
+    candidates = ['table_tilt']
+    if joints.angle_sd and joints.angles:
+        candidates.append('axis_non_orthogonality')
+    if joints.angle_sd and joints.zeros:
+        candidates.append('encoder_zero')
+    if joints.place_sd and joints.places:
+        candidates.append('axis_offset')
+    candidates.append('earth_rate')
+    return tuple(name for name in candidates if not _is_moot(name, table))
 
 
 def _is_moot(name: str, table: Table) -> bool:
+    """Return whether a reference effect cannot be tested with a table (`Effect.moot`)."""
     moot = CATALOGUE.find('reference', name).moot
     return moot is not None and moot(table) is not None
 
 
 def with_common_arm(model: 'SensorModel') -> 'SensorModel':
     """
-    Return the model with a common lever arm beside the arms of the size effect.
+    Return the model with a common lever arm in addition to the arms of the size effect.
 
-    Without a size effect unchanged.
+    A model without a size effect is unchanged.
     """
-    lacks = model.find('accelerometer', Role.ARMS) and not model.find('accelerometer', Role.ARM)
-    return model.with_effect('accelerometer', 'lever_arm') if lacks else model
+    if model.find('accelerometer', Role.ARMS) and not model.find('accelerometer', Role.ARM):
+        return model.with_effect('accelerometer', 'lever_arm')
+    return model
 
 
 WARP, WARP_LEVER = 'warp:', 'warp_lever:'
@@ -104,16 +105,16 @@ lever-arm terms.
 class ColumnLayout:
     """Columns of one sensor: their effects and the positions of their coefficients."""
 
-    effects: tuple
+    effects: tuple[Effect, ...]
     """Effects that concern the sensor."""
-    groups: dict
+    groups: dict[str, ColumnGroup]
     """Group name -> ColumnGroup, without the columns of warps."""
-    rows: dict
-    """Group name -> slice of the columns."""
+    rows: dict[str, slice]
+    """Group name -> slice of the columns, which are the rows of the coefficients."""
     width: int
     """Number of columns."""
-    point: dict
-    """Where the columns were linearised."""
+    point: dict[str, Any]
+    """Where the columns were linearised (`SensorModel.full_point`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,9 +183,7 @@ class SensorModel:
 
     def has_columns_of(self, other: 'SensorModel') -> bool:
         """
-        Return whether another model makes the very same columns.
-
-        The same effects, linearised at the same point.
+        Return whether another model has the same columns: equal effects, linearised equally.
         """
         for section in SECTIONS:
             if tuple(getattr(self, section)) != tuple(getattr(other, section)):
@@ -214,7 +213,7 @@ class SensorModel:
         """
         Return the slice of the parameter vector of the effect in a place of a sensor's equation.
 
-        Empty where there is none.
+        The slice is empty if the model has no such effect.
         """
         effect = self.find(sensor, role)
         return slice(0, 0) if effect is None else self.slices[effect.key]
@@ -223,7 +222,7 @@ class SensorModel:
         """
         Return the values of the effect in a place of a sensor's equation in its documented shape.
 
-        Or None.
+        None if the model has no such effect.
         """
         effect = self.find(sensor, role)
         return None if effect is None else values[self.slices[effect.key]].reshape(effect.shape)
@@ -273,7 +272,8 @@ class SensorModel:
 
         The prior time of a step is that of its columns.
         """
-        values, sds = [], []
+        values = []
+        sds = []
         for effect in self.effects:
             effect_values = effect.prior_values()
             if effect.located:
@@ -286,21 +286,26 @@ class SensorModel:
         """Return the values to start from: the prior's, or the point of the columns."""
         return np.concatenate([self.point_of(effect) for effect in self.effects])
 
-    def start_from(self, other: 'SensorModel', known: np.ndarray) -> np.ndarray:
-        """Return the initial values; effects of another model have their values there."""
+    def start_from(self, other: 'SensorModel', other_values: np.ndarray) -> np.ndarray:
+        """
+        Return values to start from, shape (n_params,), with those of another model where it can.
+
+        An effect that both models have gets its values of `other_values`, which are in the order of
+        the parameters of `other`; any other effect gets those of `start`.
+        """
         values = self.start()
         for effect in other.effects:
             if effect.key in self.slices:
-                values[self.slices[effect.key]] = known[other.slices[effect.key]]
+                values[self.slices[effect.key]] = other_values[other.slices[effect.key]]
         return values
 
     def values_of(self, sensor: str, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Return {effect name: values} that concern `sensor`, its own and the reference's."""
-        found = {}
-        for e in self.effects:
-            if e.sensor in (sensor, 'reference'):
-                found[e.name] = values[self.slices[e.key]]
-        return found
+        """Return {effect name: values} of the effects of `sensor` and of the reference."""
+        values_by_name = {}
+        for effect in self.effects:
+            if effect.sensor in (sensor, 'reference'):
+                values_by_name[effect.name] = values[self.slices[effect.key]]
+        return values_by_name
 
     def with_effect(self, sensor: str, name: str) -> 'SensorModel':
         """Return the model extended by one effect."""
@@ -312,7 +317,7 @@ class SensorModel:
         """
         Return (the model extended by one effect, its parameters).
 
-        `values` of this model, and the parameters `size` of the effect.
+        They are `values` of this model's effects, and `size` of the new one.
         """
         model = self.with_effect(sensor, name)
         extended = model.start_from(self, values)
@@ -324,9 +329,8 @@ class SensorModel:
         Return the model extended by the catalogue's effect for a place of a sensor's equation.
         """
         effects = self.catalogue.effects(self.joint_names).values()
-        return self.with_effect(
-            sensor, next(e.name for e in effects if e.sensor == sensor and e.role is role)
-        )
+        name = next(e.name for e in effects if e.sensor == sensor and e.role is role)
+        return self.with_effect(sensor, name)
 
     def with_reference_temperature(self, temperature_c: float) -> 'SensorModel':
         """
@@ -335,11 +339,10 @@ class SensorModel:
         return replace(self, temperature_ref_c=float(round(temperature_c)))
 
     def without(self, sensor: str, *names: str) -> 'SensorModel':
-        """Return the model without some effects of a sensor."""
-        left: dict[str, Any] = {
-            sensor: tuple(known for known in getattr(self, sensor) if known not in names)
-        }
-        return replace(self, **left)
+        """Return the model without the effects of a sensor that are named."""
+        remaining = tuple(name for name in getattr(self, sensor) if name not in names)
+        sections: dict[str, Any] = {sensor: remaining}
+        return replace(self, **sections)
 
     def without_arms(self) -> 'SensorModel':
         """Return the model without lever arms."""
@@ -352,11 +355,7 @@ class SensorModel:
 
     def concerning(self, sensor: str) -> list[Effect]:
         """Return the effects that contribute columns to `sensor`."""
-        found = []
-        for e in self.effects:
-            if e.sensor == sensor or (e.sensor == 'reference' and sensor in e.acts_on):
-                found.append(e)
-        return found
+        return [effect for effect in self.effects if sensor in effect.sensors]
 
     def groups(self, sensor: str) -> list[tuple[str, int]]:
         """Return the columns of `sensor` in order: (group name, width)."""
@@ -364,7 +363,10 @@ class SensorModel:
 
     def layout(self, sensor: str) -> ColumnLayout:
         """
-        Return the positions of the coefficients of each group (cached per sensor).
+        Return the columns of a sensor and the positions of their coefficients (cached).
+
+        A warp of n values has ``3 n`` columns, the derivative of the true input by each value, and
+        ``9 n`` of the lever matrix where these are separate.
 
         Raises
         ------
@@ -373,7 +375,8 @@ class SensorModel:
 
         """
         if sensor not in self._layouts:
-            groups, widths = {}, {}
+            groups: dict[str, ColumnGroup] = {}
+            widths: dict[str, int] = {}  # group name -> number of columns, in their order
             for effect in self.concerning(sensor):
                 for group in effect.groups_of(sensor):
                     if groups.setdefault(group.name, group) != group:
@@ -398,14 +401,13 @@ class SensorModel:
         return self._layouts[sensor]
 
     @cached_property
-    def _layouts(self):
+    def _layouts(self) -> dict[str, ColumnLayout]:
+        """Sensor -> its layout, once `layout` has made it."""
         return {}
 
     def columns_of(self, sensor: str, role: Role) -> slice:
         """
-        Return the slice of the columns that the effect in a place multiplies.
-
-        The place is one of a sensor's equation.
+        Return the slice of the columns of the effect in a place of a sensor's equation.
         """
         effect = self.find(sensor, role)
         if effect is None:
@@ -416,8 +418,10 @@ class SensorModel:
         """
         Return the values at which `effect`'s columns are linearised; default: its prior values.
         """
-        known = self.point.get(effect.name)
-        return effect.prior_values() if known is None else np.atleast_1d(np.asarray(known, float))
+        values = self.point.get(effect.name)
+        if values is None:
+            return effect.prior_values()
+        return np.atleast_1d(np.asarray(values, float))
 
     @property
     def relinearised(self) -> list[Effect]:
@@ -430,7 +434,11 @@ class SensorModel:
         return replace(self, point={**self.point, **moved})
 
     def full_point(self) -> dict[str, Any]:
-        """Return the data of the column groups in addition to the reference."""
+        """
+        Return the data on which columns depend in addition to the reference.
+
+        They are effect name -> values of linearisation, the reference temperature, and the centres.
+        """
         settling = {e.name: self.point_of(e) for e in self.effects if e.time_constant}
         point = {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c}
         if self.centre:
