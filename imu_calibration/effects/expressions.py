@@ -54,17 +54,12 @@ for _quantity, _names in QUANTITIES.items():
     PLACES |= _names
     QUANTITY_OF |= dict.fromkeys(_names, _quantity)
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
-MAX_CHARACTERS, MAX_COLUMN_DEPTH, MAX_EXPONENT, MAX_PRODUCTS, MAX_COLUMN_NUMBER = (
-    400,
-    30,
-    9,
-    200,
-    1e30,
-)
-"""
-Characters, depth, exponents, products and size of numbers at most, so that no document costs more
-than arithmetic should.
-"""
+# Limits of a column, so that no document costs more than arithmetic should.
+MAX_CHARACTERS = 400
+MAX_COLUMN_DEPTH = 30
+MAX_EXPONENT = 9
+MAX_PRODUCTS = 200
+MAX_COLUMN_NUMBER = 1e30
 LONGEST_EXPANDED = 5000
 """
 Characters of a column at most when it is multiplied out: nested powers of a function multiply its
@@ -95,19 +90,17 @@ def read(text: str) -> ast.expr:
         text = ' '.join(text.split())
         if len(text) > MAX_CHARACTERS:
             raise _Refused(MAX_CHARACTERS, 'too long')
-        if not text.isascii():
-            raise _Refused(
-                next(k for k, letter in enumerate(text) if not letter.isascii()),
-                'a letter that is not ASCII',
-            )
+        for position, letter in enumerate(text):
+            if not letter.isascii():
+                raise _Refused(position, 'a letter that is not ASCII')
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', SyntaxWarning)
             tree = ast.parse(text, mode='eval').body
-        return _checked(tree, text, 0)
+        return _checked(tree, 0)
     except SyntaxError as error:
         raise _refusal(text, (error.offset or 1) - 1, 'this cannot be read') from error
     except _Refused as error:
-        raise _refusal(text, error.place, error.why) from error
+        raise _refusal(text, error.position, error.why) from error
     except (AttributeError, TypeError, ValueError, RecursionError, MemoryError) as error:
         raise _refusal(text, 0, 'this cannot be read') from error
 
@@ -115,50 +108,46 @@ def read(text: str) -> ast.expr:
 class _Refused(Exception):
     """A forbidden part of a column, and its position."""
 
-    def __init__(self, place, why):
+    def __init__(self, position: int, why: str):
         super().__init__(why)
-        self.place, self.why = place, why
+        self.position = position
+        self.why = why
 
 
-def _refusal(text, place, why):
-    shown = ' '.join(str(text)[place : place + 30].split())
+def _refusal(text: str, position: int, why: str) -> InputError:
+    """Return the error of a column that is refused because of the part at a position."""
+    shown = ' '.join(str(text)[position : position + 30].split())
     return InputError(
         f'a column must be arithmetic of at most {MAX_CHARACTERS} characters in {VOCABULARY} with'
         f' {", ".join(FUNCTIONS)} and powers up to {MAX_EXPONENT}, got {why} at character'
-        f' {place + 1}: {shown!r}; correct it',
+        f' {position + 1}: {shown!r}; correct it',
         code='not_arithmetic',
     )
 
 
-def _checked(node, text, depth):
+def _checked(node: Any, depth: int) -> Any:
     """
-    Return the node with constants folded into finite floats.
+    Return a copy of a tree of permitted operations, with constants folded into finite floats.
 
-    An integer could grow without limit, a float raises.
+    An integer could grow without limit, a float raises. `depth` is that of the node in its column.
     """
     if depth > MAX_COLUMN_DEPTH:
         raise _Refused(node.col_offset, 'too many brackets')
-
-    def inner(part):
-        return _checked(part, text, depth + 1)
-
+    deeper = depth + 1
     match node:
+        case ast.BinOp(left=left, op=ast.Pow() as op, right=exponent):
+            is_integer = isinstance(exponent, ast.Constant) and type(exponent.value) is int
+            if not is_integer or not 0 <= exponent.value <= MAX_EXPONENT:
+                raise _Refused(
+                    exponent.col_offset, f'a power that is not an integer up to {MAX_EXPONENT}'
+                )
+            return _folded(ast.BinOp(_checked(left, deeper), op, exponent), node)
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, OPERATORS):
-            if isinstance(op, ast.Pow):
-                if not (
-                    isinstance(right, ast.Constant)
-                    and type(right.value) is int
-                    and 0 <= right.value <= MAX_EXPONENT
-                ):
-                    raise _Refused(
-                        right.col_offset, f'a power that is not an integer up to {MAX_EXPONENT}'
-                    )
-                return _folded(ast.BinOp(inner(left), op, right), node)
-            return _folded(ast.BinOp(inner(left), op, inner(right)), node)
+            return _folded(ast.BinOp(_checked(left, deeper), op, _checked(right, deeper)), node)
         case ast.UnaryOp(op=op, operand=operand) if isinstance(op, SIGNS):
-            return _folded(ast.UnaryOp(op, inner(operand)), node)
+            return _folded(ast.UnaryOp(op, _checked(operand, deeper)), node)
         case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in FUNCTIONS:
-            return _folded(ast.Call(node.func, [inner(argument)], []), node)
+            return _folded(ast.Call(node.func, [_checked(argument, deeper)], []), node)
         case ast.Name(id=name) if name in PLACES:
             return ast.copy_location(ast.Name(name, ast.Load()), node)
         case ast.Name(id=name):
@@ -171,18 +160,22 @@ def _checked(node, text, depth):
     raise _Refused(node.col_offset, 'an operation that is not arithmetic')
 
 
-def _folded(node, source):
-    """Return the node, or the number that it is."""
+def _folded(node: Any, source: Any) -> Any:
+    """
+    Return an operation, or its value as a constant if all its operands are constants.
+
+    `source` is the node of the text, whose position it gets.
+    """
     match node:
         case ast.BinOp(op=ast.Div(), right=ast.Constant(value=0.0)):
             raise _Refused(source.col_offset, 'a division by zero')
         case ast.BinOp():
-            parts = [node.left, node.right]
+            operands = [node.left, node.right]
         case ast.UnaryOp():
-            parts = [node.operand]
+            operands = [node.operand]
         case _:
-            parts = node.args
-    if not all(isinstance(part, ast.Constant) for part in parts):
+            operands = node.args
+    if not all(isinstance(operand, ast.Constant) for operand in operands):
         return ast.copy_location(node, source)
     with np.errstate(all='ignore'):
         value = float(array_function([node])({})[0])
@@ -202,18 +195,17 @@ def may_fail(tree: ast.expr) -> bool:
 
     It divides, or calls a function that is not defined everywhere.
     """
-    divides = any(
-        isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.BinOp)
-    )
-    return divides or any(
-        called(node) in UNBOUNDED_FUNCTIONS for node in ast.walk(tree) if isinstance(node, ast.Call)
-    )
+    for node in ast.walk(tree):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+            if not isinstance(node.right, ast.Constant):
+                return True
+        if isinstance(node, ast.Call) and called(node) in UNBOUNDED_FUNCTIONS:
+            return True
+    return False
 
 
 def called(node: ast.Call) -> str:
-    """Return the name of the function; `read` accepts no other calls."""
+    """Return the name of the function of a call; `read` accepts only calls by name."""
     return node.func.id if isinstance(node.func, ast.Name) else ''
 
 
@@ -221,29 +213,27 @@ def array_function(trees: Sequence[ast.expr]) -> Callable:
     """Return ``function({name: array or number}) -> tuple of arrays``, one for each tree."""
     source = ast.Expression(ast.Tuple(list(trees), ast.Load()))
     code = compile(ast.fix_missing_locations(source), '<columns>', 'eval')
-    known = {
+    functions = {
         '__builtins__': {},
         **{name: getattr(np, name) for name in FUNCTIONS},
         'abs': _abs,
         'sign': _sign,
     }
-    return lambda values: eval(code, known, values)  # the trees contain only arithmetic: see `read`
+    # The trees contain only arithmetic: see `read`.
+    return lambda values: eval(code, functions, values)
 
 
-def _sign(x):
+def _sign(x: Any) -> Any:
+    """Return the sign of the real part: its derivative, an imaginary part, is zero."""
     return np.sign(np.real(x))
 
 
-def _abs(x):
-    """
-    Keep the derivative that an imaginary part carries.
-
-    The modulus of a complex number does not keep it.
-    """
+def _abs(x: Any) -> Any:
+    """Return x or -x by the sign of the real part, so that an imaginary derivative is kept."""
     return np.where(np.real(x) < 0, -x, x) if np.iscomplexobj(x) else np.abs(x)
 
 
-def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
+def products(tree: ast.expr, sum_of: dict[str, Sum]) -> Sum:
     """
     Return a column as a sum of products, {factors: coefficient}.
 
@@ -251,8 +241,8 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
 
     Parameters
     ----------
-    known : dict
-        Name -> its sum of products.
+    sum_of : dict
+        Name of a quantity -> its sum of products.
 
     Raises
     ------
@@ -264,76 +254,81 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
         case ast.Constant():
             return {(): float(node.value)}  # type: ignore[arg-type]   # `read` accepts no other
         case ast.Name():
-            if node.id not in known:
+            if node.id not in sum_of:
                 raise InputError(
                     f"a column that compensation undoes must do without '{node.id}'"
                     f' ({QUANTITY_OF[node.id]}), which is not known there; declare the effect with'
                     " compensation 'none'",
                     code='variable_unavailable',
                 )
-            return known[node.id]
+            return sum_of[node.id]
         case ast.UnaryOp():
-            return scaled(
-                products(node.operand, known), -1.0 if isinstance(node.op, ast.USub) else 1.0
-            )
+            sign = -1.0 if isinstance(node.op, ast.USub) else 1.0
+            return scaled(products(node.operand, sum_of), sign)
         case ast.Call():
-            argument = as_text(products(node.args[0], known))
+            argument = as_text(products(node.args[0], sum_of))
             factor = f'{called(node)}({argument})'
             # A call costs more than all the arithmetic.
             if called(node) == 'sign' and argument.isidentifier():
                 factor = f'(({argument} > 0) - ({argument} < 0))'
             return {(factor,): 1.0}
         case ast.BinOp():
-            return _of_two(node, known)
+            return _of_two(node, sum_of)
     raise TypeError(f'{ast.dump(tree):.60} is no arithmetic')  # `read` accepts none
 
 
-def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
-    """Return the sum of products of an operation on two sums."""
-    left = products(node.left, known)
+def _of_two(node: ast.BinOp, sum_of: dict[str, Sum]) -> Sum:
+    """Return an operation on two columns as a sum of products; `sum_of` as in `products`."""
+    left = products(node.left, sum_of)
     if isinstance(node.op, ast.Pow):
         result: Sum = {(): 1.0}
         for _ in range(cast(ast.Constant, node.right).value):  # type: ignore[arg-type]   # `read` accepts integer powers
             result = _multiplied(result, left)
         return result
-    right = products(node.right, known)
+    right = products(node.right, sum_of)
     if isinstance(node.op, ast.Mult):
         return _multiplied(left, right)
     if isinstance(node.op, ast.Div):
-        divisor = right[()] if right.keys() == {()} else 0.0
-        if divisor:  # a constant
-            return scaled(left, 1.0 / divisor)
+        # The product of no factors is a constant.
+        constant_divisor = right[()] if right.keys() == {()} else 0.0
+        if constant_divisor:
+            return scaled(left, 1.0 / constant_divisor)
         return {(f'divided({as_text(left)}, {as_text(right)})',): 1.0}
     return added(left, right if isinstance(node.op, ast.Add) else scaled(right, -1.0))
 
 
-def added(*sums: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
+def added(*sums: Sum) -> Sum:
     """Return the sum of sums of products; products that cancel are omitted."""
-    total = {}
+    total: Sum = {}
     for terms in sums:
         for factors, coefficient in terms.items():
             total[factors] = total.get(factors, 0.0) + coefficient
     return {factors: coefficient for factors, coefficient in total.items() if coefficient != 0.0}
 
 
-def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str, ...], float]:
-    """Return a multiple of a sum of products."""
-    found = {}
+def scaled(terms: Sum, factor: float) -> Sum:
+    """Return a multiple of a sum of products; products that become zero are omitted."""
+    multiple = {}
     for factors, coefficient in terms.items():
         if factor * coefficient != 0.0:
-            found[factors] = factor * coefficient
-    return found
+            multiple[factors] = factor * coefficient
+    return multiple
 
 
-def _multiplied(left, right):
+def _multiplied(left: Sum, right: Sum) -> Sum:
+    """Return the product of two sums of products, multiplied out."""
     if len(left) * len(right) > MAX_PRODUCTS:
         raise InputError(
             f'a column must have at most {MAX_PRODUCTS} products when it is multiplied out, this'
             ' one has more; write it shorter',
             code='column_expands',
         )
-    pairs = product(left.items(), right.items())
-    result = added(*({tuple(sorted(a + b)): x * y} for (a, x), (b, y) in pairs))
+    terms = []
+    for left_factors, left_coefficient in left.items():
+        for right_factors, right_coefficient in right.items():
+            factors = tuple(sorted(left_factors + right_factors))
+            terms.append({factors: left_coefficient * right_coefficient})
+    result = added(*terms)
     if sum(map(len, chain.from_iterable(result))) > LONGEST_EXPANDED:
         raise InputError(
             f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out,'
@@ -343,9 +338,9 @@ def _multiplied(left, right):
     return result
 
 
-def as_text(terms: dict[tuple[str, ...], float]) -> str:
+def as_text(terms: Sum) -> str:
     """
-    Return a sum of products as a Python expression, coefficients of one left out.
+    Return a sum of products as a Python expression, without coefficients of 1.
 
     Raises
     ------
@@ -367,8 +362,10 @@ def as_text(terms: dict[tuple[str, ...], float]) -> str:
     return ' + '.join(texts) or '0.0'
 
 
-def _or_nan(function):
-    def careful(*arguments):
+def _or_nan(function: Callable[..., float]) -> Callable[..., float]:
+    """Return a function that is NaN where `function` is undefined or overflows."""
+
+    def careful(*arguments: float) -> float:
         try:
             return function(*arguments)
         except (ValueError, OverflowError, ZeroDivisionError):
@@ -395,7 +392,7 @@ class ColumnCentre:
     """
     The part of a group of columns that bias and matrix describe: ``constant + slope @ true``.
 
-    For effects that compensation cannot undo.
+    Compensation applies it for effects that it cannot invert.
     """
 
     constant: np.ndarray
@@ -432,7 +429,8 @@ class ColumnGroup:
         return ColumnGroup, tuple(getattr(self, f.name) for f in fields(self))
 
     @cached_property
-    def _trees(self):
+    def _trees(self) -> list[ast.expr]:
+        """Syntax tree of each text."""
         return [read(text) for text in self.text]
 
     @cached_property
@@ -451,19 +449,22 @@ class ColumnGroup:
         return len(self.text) * (2 if 'tau' in self.names else 1)
 
     @cached_property
-    def _function(self):
+    def _function(self) -> Callable:
+        """``function({name: array or number}) -> tuple``, an array for each text."""
         return array_function(self._trees)
 
     @cached_property
-    def _may_fail(self):
+    def _may_fail(self) -> bool:
+        """Whether a column may be without a finite value somewhere."""
         return any(map(may_fail, self._trees))
 
     @cached_property
-    def _places(self):
+    def _places(self) -> list[tuple[str, str, tuple]]:
+        """(name in a text, field of a Reference, index of that array) of each name."""
         places = []
         for name in sorted(self.names):
             field, *index = PLACES[name]
-            if field:  # not a field of a Reference otherwise
+            if field:  # other names are not fields of a Reference
                 places.append((name, field, (slice(None), *index)))
         return places
 
@@ -514,6 +515,6 @@ class ColumnGroup:
             )
         return result
 
-    def products(self, known: dict[str, Sum]) -> list[Sum]:
+    def products(self, sum_of: dict[str, Sum]) -> list[Sum]:
         """Return each column as a sum of products (`expressions.products`)."""
-        return [products(tree, known) for tree in self._trees]
+        return [products(tree, sum_of) for tree in self._trees]

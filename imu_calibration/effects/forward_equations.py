@@ -1,8 +1,7 @@
 """The columns of a model over a motion, predicted readings, and the model applied to samples."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import INPUT_OF, SENSORS, Effect, Lag, Role
 from imu_calibration.effects.expressions import ColumnCentre
-from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
+from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, ColumnLayout, SensorModel
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion, shifted
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
@@ -22,54 +21,62 @@ class _ActingWarp:
     """An effect with a warp, and the values at which it acts."""
 
     effect: Effect
+    """The effect."""
     values: np.ndarray
-    """Values of the effect, shape (size,)."""
+    """Its values, shape (size,)."""
 
     @property
-    def key(self):
+    def key(self) -> tuple:
         """Name and values; the key of a cache."""
         return self.effect.name, *self.values
 
     @property
-    def is_lag(self):
+    def is_lag(self) -> bool:
         """Whether it shifts the motion in time."""
         return isinstance(self.effect.warp, Lag)
 
 
-def _shifted_by(lags, motion, roughly):
+def _shifted_by(
+    lags: Sequence[_ActingWarp], motion: JointMotion, roughly: bool
+) -> list[tuple[float, JointMotion]]:
     """
     Return (weight, motion) pairs: the motion at each sum of the delays of several lags.
 
     A lag is ``x -> sum_k w_k x(t - d_k)``; the weights of lags in series are multiplied, and their
-    delays added.
+    delays added. `roughly` as in `References.at`.
     """
     delays = [(1.0, np.zeros(()))]
     for acting in lags:
         lag = acting.effect.warp
         if roughly:
             lag = lag.single
-        added = lag.delays(motion.time, acting.values)
-        delays = [(weight * w, delay + d) for (weight, delay), (w, d) in product(delays, added)]
+        delays_of_lag = lag.delays(motion.time, acting.values)
+        combined = []
+        for weight, delay in delays:
+            for lag_weight, lag_delay in delays_of_lag:
+                combined.append((weight * lag_weight, delay + lag_delay))
+        delays = combined
     return [(weight, shifted(motion, delay)) for weight, delay in delays]
 
 
-def _mean_reference(weighted, motion):
-    """Return the weighted mean of references (a lag is a mean over delays)."""
+def _mean_reference(weighted: Sequence[tuple[float, Reference]], motion: JointMotion) -> Reference:
+    """Return the mean of (weight, reference) pairs, of the given motion: a lag is such a mean."""
+    _, first = weighted[0]
     if len(weighted) == 1:
-        return weighted[0][1]
+        return first
     total = sum(weight for weight, _ in weighted)
-    mean: dict[str, Any] = {}
+    means: dict[str, Any] = {}
     for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn'):
         weighted_sum = sum(weight * getattr(ref, name) for weight, ref in weighted)
-        mean[name] = weighted_sum / total
-    return replace(weighted[0][1], motion=motion, **mean)
+        means[name] = weighted_sum / total
+    return replace(first, motion=motion, **means)
 
 
 class References:
     """
-    The motions that a model's sensors are thought to have felt.
+    The reference motion of each sensor: that of the table, changed by the warps of a model.
 
-    Each is worked out once for both sensors where both feel the same.
+    A reference that both sensors have in common is computed once.
     """
 
     def __init__(
@@ -84,14 +91,17 @@ class References:
         self.table = table
         self.motion = motion
         self.temperature_c = temperature_c
+        # Sensor -> the warps of the model at their points.
         self._warps: dict[str, list[_ActingWarp]] = {}
         for sensor in SENSORS:
             self._warps[sensor] = []
             for effect in model.concerning(sensor):
                 if effect.warp is not None:
                     self._warps[sensor].append(_ActingWarp(effect, model.point_of(effect)))
-        self._known: dict[tuple, Reference] = {}
-        self._shifts: dict[tuple, list] = {}
+        # Cache of `at`: warps with their values -> reference.
+        self._references: dict[tuple, Reference] = {}
+        # Cache of `_shifted_by`: lags with their values -> (weight, motion) pairs.
+        self._shifts: dict[tuple, list[tuple[float, JointMotion]]] = {}
 
     def at(
         self,
@@ -102,9 +112,7 @@ class References:
         roughly: bool = False,
     ) -> Reference:
         """
-        Return the reference that `sensor` is thought to have felt.
-
-        With every warp of the model at its point.
+        Return the reference of `sensor`, with every warp of the model at its point.
 
         The motion is shifted once by the sum of all lags; errors of table and encoders act on the
         shifted motion.
@@ -113,51 +121,50 @@ class References:
         ----------
         sensor : str
         effect, values : Effect and array, optional
-            An effect with other values than its point; the reference is then without attitude.
+            An effect with other values than its point, for a difference quotient; the reference is
+            then without attitude.
         roughly : bool
             Approximate a lag by a delay of the same first derivative; a filter averages several
             delays and costs as many times more.
 
         """
+        moved = None  # key of the effect that is not at its point
+        if effect is not None and values is not None:
+            if np.any(values != self.model.point_of(effect)):
+                moved = effect.key
         acting = []
-        moved = None
-        if (
-            effect is not None
-            and values is not None
-            and np.any(values != self.model.point_of(effect))
-        ):
-            moved = effect.key
-        for each in self._warps[sensor]:
-            if values is not None and each.effect.key == moved:
-                each = _ActingWarp(each.effect, values)
-            if np.any(each.values):  # a warp of zero changes nothing
-                acting.append(each)
-        key = (roughly, moved, *(each.key for each in acting))
-        if key not in self._known:
-            self._known[key] = self._warped(acting, roughly, attitude=moved is None)
-        return self._known[key]
+        for warp in self._warps[sensor]:
+            if values is not None and warp.effect.key == moved:
+                warp = _ActingWarp(warp.effect, values)
+            if np.any(warp.values):  # with zeros it has no effect
+                acting.append(warp)
+        key = (roughly, moved, *(warp.key for warp in acting))
+        if key not in self._references:
+            self._references[key] = self._warped(acting, roughly, attitude=moved is None)
+        return self._references[key]
 
-    def _warped(self, acting, roughly, attitude):
-        lags = [each for each in acting if each.is_lag]
+    def _warped(self, acting: Sequence[_ActingWarp], roughly: bool, attitude: bool) -> Reference:
+        """Return the reference after `acting` warps; `attitude`: whether it has `mat_sn`."""
+        lags = [warp for warp in acting if warp.is_lag]
         key = (roughly, *(lag.key for lag in lags))
         if key not in self._shifts:
             self._shifts[key] = _shifted_by(lags, self.motion, roughly)
         references = []
-        for weight, felt in self._shifts[key]:
+        for weight, motion in self._shifts[key]:
             table = self.table
-            for each in acting:
-                if not each.is_lag:
-                    table, felt = each.effect.warp(table, felt, each.values)
-            reference = reference_motion(table, felt, self.temperature_c, attitude=attitude)
+            for warp in acting:
+                if not warp.is_lag:
+                    table, motion = warp.effect.warp(table, motion, warp.values)
+            reference = reference_motion(table, motion, self.temperature_c, attitude=attitude)
             references.append((weight, reference))
         return _mean_reference(references, self.motion)
 
 
 def columns(references: References, sensor: str) -> np.ndarray:
     """
-    Return the regressors of `sensor` in the model of `references`.
+    Return the regressors of `sensor` in the model of `references`, shape (n, n_columns).
 
-    Shape (n, n_columns), in the order of ``model.groups(sensor)``.
+    They are in the order of ``model.groups(sensor)``.
 
     A warp contributes, per parameter, the three components of the derivative of the true input
     (`force_s` or `rate_s`); its coefficients are matrix times parameter. The derivative is a
@@ -166,9 +173,10 @@ def columns(references: References, sensor: str) -> np.ndarray:
     model = references.model
     ref = references.at(sensor)
     layout = model.layout(sensor)
-    if ref.temperature_c is None and any(
+    needs_temperature = any(
         group.uses & {'temperature', 'temperature rate'} for group in layout.groups.values()
-    ):
+    )
+    if needs_temperature and ref.temperature_c is None:
         raise InputError(
             'a thermal effect needs temperatures, none were received; record imu/temperature or'
             ' omit the effect',
@@ -185,21 +193,20 @@ def columns(references: References, sensor: str) -> np.ndarray:
     return np.concatenate(parts, axis=1)
 
 
-def _warp_columns(references, effect, sensor):
+def _warp_columns(references: References, effect: Effect, sensor: str) -> list[np.ndarray]:
     """
-    Return the columns of a warp.
+    Return the columns of a warp, one or two blocks.
 
-    D(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are
-    modelled.
-
-    With `folded_arms` the true input is that at the sensitive points, and there is no second block.
+    They are d(true input)/d(parameter), shape (n, 3 size), and for a model with arms also
+    d(lever matrix)/d(parameter), shape (n, 9 size). With `SensorModel.folded_arms` the true input
+    is that at the sensitive points, and there is no second block.
     """
     model = references.model
     if effect.derivative is not None:
         return [effect.derivative(references.at(sensor))]
     clock = model.find('reference', Role.DELAY)
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
-        effect = clock  # a lag of zero is a delay to first order
+        effect = clock  # to first order a lag near zero is a delay of the clock
     # A search folds the arms and needs many warps: forward differences halve the references, with
     # an error of the curvature over a step. Candidate effects are evaluated with a delay in place
     # of a filter.
@@ -208,10 +215,10 @@ def _warp_columns(references, effect, sensor):
     with_arms = sensor == 'accelerometer' and bool(model.arms)
     if in_search and not model.folded_arms.any():
         with_arms = False
-    inputs, levers = [], []
-    for values_above, values_below, distance in _steps(
-        effect, model.point_of(effect), forward=in_search
-    ):
+    inputs = []
+    levers = []
+    steps = _steps(effect, model.point_of(effect), forward=in_search)
+    for values_above, values_below, distance in steps:
         above = references.at(sensor, effect, values_above, roughly=roughly)
         below = references.at(sensor, effect, values_below, roughly=roughly)
         change = getattr(above, INPUT_OF[sensor]) - getattr(below, INPUT_OF[sensor])
@@ -227,42 +234,43 @@ def _warp_columns(references, effect, sensor):
     return [np.concatenate(part, axis=1) for part in (inputs, levers) if part]
 
 
-def _steps(effect, at, forward):
+def _steps(
+    effect: Effect, point: np.ndarray, forward: bool
+) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
     """
-    Yield (values above, values below, distance) for the derivative by each parameter.
+    Yield (values above, values below, distance) of the difference quotient by each parameter.
 
-    Nonnegative values are not varied below zero.
+    The differences are central, or `forward`. Nonnegative values are not varied below zero.
     """
     for index in range(effect.size):
-        step = np.zeros(effect.size)
         if index == effect.n_amplitudes and effect.located:
-            yield at, at, 1.0  # least squares does not move the time of a step
+            yield point, point, 1.0  # a zero column: least squares does not move the time of a step
             continue
-        step[index] = effect.step
-        below = at if forward else at - step
-        if effect.nonnegative:
-            step[index] = min(effect.step, 0.5 * at[index]) if at[index] > 0 else effect.step
-            below = at - step if at[index] > 0 and not forward else at
-        yield at + step, below, (at + step - below)[index]
+        size = effect.step
+        central = not forward
+        if effect.nonnegative and point[index] > 0:
+            size = min(size, 0.5 * point[index])
+        elif effect.nonnegative:
+            central = False
+        step = np.zeros(effect.size)
+        step[index] = size
+        above = point + step
+        below = point - step if central else point
+        yield above, below, (above - below)[index]
 
 
 def columns_at_point(model: SensorModel, sensor: str, ref: Reference) -> np.ndarray:
     """
-    Return the columns without the warps' derivatives.
-
-    These have zero coefficients at the point itself.
+    Return the columns without the warps' derivatives, whose coefficients are zero at the point.
     """
     layout = model.layout(sensor)
-    return np.concatenate(
-        [group.columns(ref, layout.point) for group in layout.groups.values()], axis=1
-    )
+    blocks = [group.columns(ref, layout.point) for group in layout.groups.values()]
+    return np.concatenate(blocks, axis=1)
 
 
 def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
     """
-    Return the coefficients of the columns for a parameter vector (real or complex).
-
-    Shape (n_columns, 3).
+    Return the coefficients of the columns for parameters, real or complex, shape (n_columns, 3).
     """
     of_sensor = model.values_of(sensor, values)
     layout = model.layout(sensor)
@@ -272,20 +280,32 @@ def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndar
     return total
 
 
-def _add_coefficients(total, model, effect, of_sensor, layout):
-    """Add one effect's coefficients in place."""
+def _add_coefficients(
+    total: np.ndarray,
+    model: SensorModel,
+    effect: Effect,
+    of_sensor: dict[str, np.ndarray],
+    layout: ColumnLayout,
+) -> None:
+    """
+    Add one effect's coefficients to `total`, shape (n_columns, 3), in place.
+
+    `of_sensor` has the values of all effects of the sensor by name. A warp with the change d_p of
+    parameter p, in output i of a sensor with matrix M and arms r, has the coefficients::
+
+        d_p M_ij         of d(true input_j) / dp
+        d_p M_ij r_ik    of d(lever matrix_jk) / dp
+    """
     if effect.warp is not None:
         change = of_sensor[effect.name] - model.point_of(effect)
         matrix = of_sensor['matrix'].reshape(3, 3)
-        total[layout.rows[WARP + effect.name]] += (change[:, None, None] * matrix.T[None]).reshape(
-            -1, 3
-        )
+        of_input = change[:, None, None] * matrix.T[None]
+        total[layout.rows[WARP + effect.name]] += of_input.reshape(-1, 3)
         if WARP_LEVER + effect.name in layout.rows:
             arms = sum((of_sensor[e.name].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
             products = (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T
-            total[layout.rows[WARP_LEVER + effect.name]] += (
-                change[:, None, None] * products[None]
-            ).reshape(-1, 3)
+            of_lever = change[:, None, None] * products[None]
+            total[layout.rows[WARP_LEVER + effect.name]] += of_lever.reshape(-1, 3)
     elif effect.coefficients is not None:
         for group, block in effect.coefficients(effect, of_sensor, layout.point).items():
             if group in layout.rows:  # an effect on both sensors has groups of each
@@ -294,9 +314,9 @@ def _add_coefficients(total, model, effect, of_sensor, layout):
 
 def all_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """
-    Return the arms from the reference point to the three sensitive points.
+    Return the arms from the reference point to the three sensitive points, m, shape (3, 3).
 
-    Shape (3, 3), zero where the model has none.
+    They are zero if the model has none.
     """
     return sum((values[model.slices[e.key]].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
 
@@ -305,22 +325,22 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     """
     Return d(coefficients)/d(values) by complex steps, shape (n_columns, 3, n_params).
 
-    Besides its own values an effect's coefficients depend on the sensor's matrix and, for warps, on
-    its arms.
+    The coefficients of an effect depend on its values, and on the effects that are
+    `Effect.shared`: the sensor's matrix and, for warps, the arms.
     """
     layout = model.layout(sensor)
     step = 1e-30
     jacobian = np.zeros((layout.width, 3, len(values)))
     for effect in layout.effects:
-        concerned = layout.effects if effect.shared else (effect,)
+        dependent_effects = layout.effects if effect.shared else (effect,)
         part = model.slices[effect.key]
         for index in range(part.start, part.stop):
             moved = values.astype(complex)
             moved[index] += 1j * step
             of_sensor = model.values_of(sensor, moved)
             total = np.zeros((layout.width, 3), complex)
-            for other in concerned:
-                _add_coefficients(total, model, other, of_sensor, layout)
+            for dependent in dependent_effects:
+                _add_coefficients(total, model, dependent, of_sensor, layout)
             jacobian[:, :, index] = total.imag / step
     return jacobian
 
@@ -331,20 +351,21 @@ def effect_slopes(
     """
     Return the coefficients of one effect and their derivatives, by group.
 
-    They are {group: coefficients (w, 3)} and {group: derivative by its own values (w, 3, size)}, by
-    complex steps.
+    They are {group: coefficients (w, 3)} and {group: derivative by the values of the effect
+    (w, 3, size)}, by complex steps. `of_sensor` is `SensorModel.values_of` the sensor, `point` is
+    `SensorModel.full_point`.
     """
     coefficients = effect.coefficients
     if coefficients is None:
         raise ValueError(f'{effect.name} has no coefficients')
-    found = coefficients(effect, of_sensor, point)
-    slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in found.items()}
+    blocks = coefficients(effect, of_sensor, point)
+    slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in blocks.items()}
     for k in range(effect.size):
         moved = of_sensor[effect.name].astype(complex)
         moved[k] += 1e-30j
         for group, block in coefficients(effect, {**of_sensor, effect.name: moved}, point).items():
             slopes[group][..., k] = np.imag(block) / 1e-30
-    return found, slopes
+    return blocks, slopes
 
 
 def output_of_effects(
@@ -373,11 +394,11 @@ def output_of_effects(
 
     """
     point = model.full_point()
-    own = model.values_of(effects[0].sensor, values)
+    of_sensor = model.values_of(effects[0].sensor, values)
     output = np.zeros((len(ref.time), 3))
     derivatives = []
     for effect in effects:
-        coefficients_of, slopes = effect_slopes(effect, own, point)
+        coefficients_of, slopes = effect_slopes(effect, of_sensor, point)
         contribution = np.zeros((len(ref.time), 3))
         derivative = np.zeros((len(ref.time), 3, effect.size))
         for group in effect.groups:
@@ -404,19 +425,19 @@ def predict(
     """
     exact = model.at(values)
     references = References(exact, table, motion, temperature_c=temperature_c)
-    outputs = {
-        sensor: sensor_output(exact, sensor, values, ref=references.at(sensor))
-        for sensor in SENSORS
-    }
-    force, rate = (clip(exact, sensor, values, output=output) for sensor, output in outputs.items())
+    readings = []
+    for sensor in SENSORS:
+        output = sensor_output(exact, sensor, values, ref=references.at(sensor))
+        readings.append(clip(exact, sensor, values, output=output))
+    force, rate = readings
     return force, rate
 
 
 def coefficients_at_point(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
     """Return the coefficients that belong to `columns_at_point`."""
     layout = model.layout(sensor)
-    found = coefficients(model, sensor, values)
-    return np.concatenate([found[layout.rows[name]] for name in layout.groups])
+    total = coefficients(model, sensor, values)
+    return np.concatenate([total[layout.rows[name]] for name in layout.groups])
 
 
 def clip(model: SensorModel, sensor: str, values: np.ndarray, *, output: np.ndarray) -> np.ndarray:
@@ -446,21 +467,18 @@ Centre = Mapping[str, ColumnCentre]
 
 def not_applied(model: SensorModel) -> list[Effect]:
     """
-    Return the effects of the sensors that compensation cannot undo.
+    Return the effects of the sensors that compensation cannot invert.
 
-    Drifts, formulas in joint angles or time.
+    They are drifts, and formulas in joint angles or time.
     """
-    found = []
+    effects = []
     for effect in model.effects:
-        if (
-            effect.sensor in SENSORS
-            and effect.compensation == 'none'
-            and not effect.in_reference
-            and effect.warp is None
-            and effect.groups
-        ):
-            found.append(effect)
-    return found
+        # An effect of the table or the session is no error of the sensor; a warp has no columns.
+        if effect.sensor not in SENSORS or effect.in_reference or effect.warp is not None:
+            continue
+        if effect.compensation == 'none' and effect.groups:
+            effects.append(effect)
+    return effects
 
 
 def in_time(effect: Effect) -> bool:
@@ -472,13 +490,14 @@ def centred(
     model: SensorModel, values: np.ndarray, centre: Centre
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (values, their derivative by the given ones) for centred columns.
+    Return (values with centred columns, their derivative by `values`).
 
-    With ``column = constant + slope @ true + rest`` the output is that of a changed bias and
-    matrix, and of the rest::
+    With ``column = constant + slope @ true + remainder`` the output is that of a changed bias and
+    matrix, and of the remainder::
 
         bias_i + matrix_ij true_j + column value_i
-            = (bias_i + constant value_i) + (matrix_ij + slope_j value_i) true_j + rest value_i
+            = (bias_i + constant value_i) + (matrix_ij + slope_j value_i) true_j
+              + remainder value_i
 
     Parameters
     ----------
@@ -488,7 +507,7 @@ def centred(
 
     """
     moved = values.copy()
-    slope = np.eye(len(values))
+    derivative = np.eye(len(values))
     for effect in not_applied(model):
         sensor = effect.sensor
         bias = model.part(sensor, Role.OFFSET)
@@ -496,17 +515,18 @@ def centred(
         for group in effect.groups:
             if group.name not in centre:
                 continue
-            of_group = centre[group.name]
+            part = centre[group.name]
             rows = model.layout(sensor).rows[group.name]
-            of_axes = coefficients(model, sensor, values)[rows]
-            derivative = coefficient_jacobian(model, sensor, values)[rows]
-            moved[bias] += of_group.constant @ of_axes
-            slope[bias] += np.einsum('q,qan->an', of_group.constant, derivative)
-            if np.any(of_group.slope):
-                moved[matrix] += (of_axes.T @ of_group.slope).ravel()
-                of_matrix = np.einsum('qk,qan->akn', of_group.slope, derivative)
-                slope[matrix] += of_matrix.reshape(9, -1)
-    return moved, slope
+            # Of the columns q in the outputs a, and their derivatives by the values n.
+            block = coefficients(model, sensor, values)[rows]
+            jacobian = coefficient_jacobian(model, sensor, values)[rows]
+            moved[bias] += part.constant @ block
+            derivative[bias] += np.einsum('q,qan->an', part.constant, jacobian)
+            if np.any(part.slope):
+                moved[matrix] += (block.T @ part.slope).ravel()
+                of_matrix = np.einsum('qk,qan->akn', part.slope, jacobian)
+                derivative[matrix] += of_matrix.reshape(9, -1)
+    return moved, derivative
 
 
 READ_FROM = {
@@ -517,13 +537,13 @@ READ_FROM = {
 
 
 def without_input(model: SensorModel, absent: Sequence[str]) -> list[Effect]:
-    """Return the effects that compensation needs readings of absent sensors for."""
+    """Return the effects for whose compensation readings of the absent sensors are needed."""
     unknown: frozenset[str] = frozenset().union(*(READ_FROM[sensor] for sensor in absent))
-    found = []
+    effects = []
     for effect in model.effects:
         if effect.sensor in SENSORS and any(group.uses & unknown for group in effect.groups):
-            found.append(effect)
-    return found
+            effects.append(effect)
+    return effects
 
 
 def applied_values(
@@ -534,12 +554,12 @@ def applied_values(
     absent: Sequence[str] = (),
 ) -> np.ndarray:
     """
-    Return the values with effects that compensation cannot undo fixed at the centre.
+    Return the values that compensation applies, shape (n_params,).
 
-    These effects are at their value in the centre, which bias and matrix contain; those that need
-    readings of the sensors `absent` are zero.
+    Effects that it cannot invert are at their priors, and bias and matrix contain their part in the
+    `centre`. Effects that need readings of the sensors `absent` are at their priors too.
     """
-    applied = centred(model, values, centre or {})[0]
+    applied, _ = centred(model, values, centre or {})
     for effect in (*not_applied(model), *without_input(model, absent)):
         applied[model.slices[effect.key]] = effect.prior_values()
     return np.where(np.isfinite(applied), applied, 0.0)

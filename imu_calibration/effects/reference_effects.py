@@ -1,6 +1,6 @@
 """Effects of the reference: table, encoders, clock, and the lags of the sensors."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import permutations, product
@@ -19,6 +19,7 @@ from imu_calibration.effects.base import (
     Effect,
     Lag,
     Role,
+    Values,
 )
 from imu_calibration.kinematics.chain import (
     WOBBLES,
@@ -29,7 +30,9 @@ from imu_calibration.kinematics.chain import (
     with_wobble,
 )
 from imu_calibration.kinematics.joint import JointNames
-from imu_calibration.kinematics.joint_motion import with_encoder_harmonics
+from imu_calibration.kinematics.joint_motion import JointMotion, with_encoder_harmonics
+from imu_calibration.kinematics.rotations import Reference
+from imu_calibration.kinematics.table import Table
 
 
 def _late_stamps(_component: str, delay: float, sd: float) -> str:
@@ -58,7 +61,7 @@ dx.
 """
 
 
-def _second_order():
+def _second_order() -> tuple[tuple[float, float], ...]:
     """
     Return (weight, delay) pairs of the maximally flat second-order filter, in units of its delay.
 
@@ -103,7 +106,8 @@ derivative.
 """
 
 
-def _lag_effect(sensor, ending):
+def _lag_effect(sensor: str, ending: str) -> Effect:
+    """Return a lag of a sensor; `ending` is a key of `_LAG_FORMS`."""
     component, pairs, description = _LAG_FORMS[ending]
     return Effect(
         name=lag_name(sensor, ending),
@@ -147,7 +151,7 @@ CLOCK = 'time_offset'
 CLOCKS = frozenset({'clock_rate', 'clock_step'})
 """Lags of both sensors that change with time."""
 FAMILY = frozenset({CLOCK, *(effect.name for effect in LAGS)})
-"""Effects with one first derivative."""
+"""Names of the lags, which have the same first derivative."""
 
 
 def total_lags(
@@ -156,8 +160,7 @@ def total_lags(
     """
     Return sensor -> (total lag of its output, standard deviation), s, of sensors with a lag.
 
-    The first derivative of all descriptions is the same, so this repeats where their names and
-    shares do not.
+    All lags have the same first derivative: recordings agree on their sum, but not on the shares.
 
     Parameters
     ----------
@@ -182,32 +185,42 @@ def total_lags(
 
 EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i, j, k in permutations(range(3))]
 """Axes i, j, k of a cross product with their sign."""
-_PAIR = {pair: place for place, pair in enumerate(PRODUCT_PAIRS)}
+_PAIR = {pair: index for index, pair in enumerate(PRODUCT_PAIRS)}
+"""Axes of a product of two components -> its index in `PRODUCT_PAIRS`."""
 ENCODER_ORDERS = (1, 2)
 """Harmonics per revolution of the encoder error."""
 
 
 @lru_cache(maxsize=512)
-def _changed(change, table, values):
+def _changed_table(
+    change: Callable[[Table, np.ndarray], Table], table: Table, values: tuple[float, ...]
+) -> Table:
     """
     Return ``change(table, values)``, cached: each window of a recording needs the same few hundred.
     """
     return change(table, np.array(values))
 
 
-def _of_table(change, table, motion, values):
-    """Return the warp of an effect that changes the table: ``change(table, values)``."""
-    return _changed(change, table, tuple(values)), motion
+def _of_table(
+    change: Callable[[Table, np.ndarray], Table],
+    table: Table,
+    motion: JointMotion,
+    values: np.ndarray,
+) -> tuple[Table, JointMotion]:
+    """Return (table, motion) after a warp that changes only the table, by `change`."""
+    return _changed_table(change, table, tuple(values)), motion
 
 
-def _tilt_derivative(ref):
-    """Derivative of ``mat_sn @ (up + theta x up) g`` with respect to (theta_x, theta_y)."""
+def _tilt_derivative(ref: Reference) -> np.ndarray:
+    """Return the derivative of ``mat_sn @ (up + theta x up) g`` by (theta_x, theta_y), (n, 6)."""
     return ref.gravity * np.concatenate([-ref.mat_sn[:, :, 1], ref.mat_sn[:, :, 0]], axis=1)
 
 
-def _zero(table, motion, values):
+def _shift_zeros(
+    table: Table, motion: JointMotion, values: np.ndarray
+) -> tuple[Table, JointMotion]:
     """
-    Shift the joints between the first and the last.
+    Add errors of the zeros, rad, to the joints between the first and the last.
 
     The first one's zero is the azimuth, the last one's belongs to the mount.
     """
@@ -216,15 +229,16 @@ def _zero(table, motion, values):
     return table, replace(motion, position=motion.position + offset)
 
 
-def _columns(table, names):
+def _columns(table: Table, names: Sequence[str]) -> list[int]:
+    """Return the columns of joints in the positions of a motion."""
     return [table.joint_names.index(name) for name in names]
 
 
-def _harmonics(table, motion, values):
+def _harmonics(table: Table, motion: JointMotion, values: np.ndarray) -> tuple[Table, JointMotion]:
+    """Add the periodic errors of encoders: `values` are (joint, order, cos and sin), rad."""
     amplitudes = np.zeros((motion.position.shape[1], len(ENCODER_ORDERS), 2))
-    amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(
-        values, (-1, len(ENCODER_ORDERS), 2)
-    )
+    turning = _columns(table, table.joint_names.turning)
+    amplitudes[turning] = np.reshape(values, (-1, len(ENCODER_ORDERS), 2))
     for index, order in enumerate(ENCODER_ORDERS):
         motion = with_encoder_harmonics(
             motion, order, amplitudes[:, index, 0], sin_amplitude=amplitudes[:, index, 1]
@@ -232,25 +246,26 @@ def _harmonics(table, motion, values):
     return table, motion
 
 
-def _elapsed(time, values):
+def _elapsed(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the factor of a delay that grows with time: a clock with another rate."""
     return time
 
 
-def _after(time, values):
+def _after(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the factor of a delay that begins at the time ``values[1]``: 0, then 1."""
     return time >= values[1]
 
 
-def _earth(effect, values, point):
-    """Coefficients of the attitude columns: matrix_ij C_jk earth_k."""
+def _earth(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+    """Return the coefficients M_ij earth_k of the attitude columns C_jk in output i."""
     matrix = values['matrix'].reshape(3, 3)
-    return {
-        ATTITUDE.name: (matrix[:, :, None] * values['earth_rate'][None, None, :]).reshape(3, 9).T
-    }
+    block = matrix[:, :, None] * values['earth_rate'][None, None, :]
+    return {ATTITUDE.name: block.reshape(3, 9).T}
 
 
-def _earth_known(table):
+def _earth_known(table: Table) -> tuple[str, str] | None:
     """
-    Return why the Earth's rate is not estimated: the reference includes it.
+    Return (why the Earth's rate is not estimated, remedy) if the reference includes it, or None.
 
     Without latitude or azimuth its three components in the level frame are unknowns.
     """
@@ -263,11 +278,9 @@ def _earth_known(table):
     )
 
 
-def _bent(effect, values, point):
+def _bent(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
     """
-    Coefficients of a mount that turns by theta = K f, to first order.
-
-    f is the force that the mount carries.
+    Return the coefficients of a mount that turns by theta = K f with the force f, to first order.
 
     The frame of the sensor turns, so that ``f' = f + f x theta`` and ``w' = w + w x theta + d theta
     / dt`` with df/dt = f x w where gravity is the load.
@@ -348,7 +361,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             prior_sd=names.angle_sd or 0.01,
             plausible=('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),
             motion=('static_dense',),
-            warp=_zero,
+            warp=_shift_zeros,
             needs=('joints', 'three_joints'),
         ),
         Effect(
