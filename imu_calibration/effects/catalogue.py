@@ -31,6 +31,17 @@ from imu_calibration.kinematics.joint import JointNames
 
 JOINT_INPUTS = {'joint angle', 'joint rate'}
 """Quantities that exist only with a table."""
+NOT_COMPENSATED = {'time', 'attitude', 'temperature rate', *JOINT_INPUTS}
+"""Quantities that are not known when readings are compensated."""
+SMOOTH_QUANTITIES = {
+    'time',
+    'temperature',
+    'temperature rate',
+    'thermal branch',
+    'reference temperature',
+    'time constant',
+}
+"""Quantities that change smoothly in time, or are constant."""
 QUANTITY_MOTIONS = (
     ('joint angle', ('static_dense', 'slow_turn')),
     ('joint rate', ('three_speeds',)),
@@ -122,11 +133,11 @@ def term(
     tolerance_reason : str
         Source of the tolerance.
     prior_sd : float, optional
-        Standard deviation of the prior about zero; a hundred tolerances.
+        Standard deviation of the prior about zero; default: a hundred tolerances.
     largest : float, optional
         Largest plausible size.
     time_constant : float
-        Where the time constant starts, s.
+        Prior of the time constant, s.
 
     Raises
     ------
@@ -145,12 +156,10 @@ def term(
     columns = (column,) if isinstance(column, str) else tuple(column)
     group = ColumnGroup(name, columns, name)
     try:
-        settles, thermal, turns = (
-            quantity in group.uses
-            for quantity in ('time constant', 'temperature', 'thermal branch')
-        )
+        uses = group.uses  # reads the columns
     except InputError as error:
         raise error.named(f"effect '{name}'") from error
+    has_time_constant = 'time constant' in uses
     definition = {
         'sensor': sensor,
         'column': column if isinstance(column, str) else list(columns),
@@ -159,67 +168,57 @@ def term(
         'tolerance_reason': tolerance_reason or None,
         **numbers,
     }
-    if not settles:
+    if not has_time_constant:
         del definition['time_constant']
-    spread = PRIOR_TOLERANCES * tolerance if prior_sd is None else prior_sd
-    thermal |= 'temperature rate' in group.uses
+
+    # Data and motions that show the effect.
     needs: tuple[str, ...] = ()
-    if thermal or turns:
+    if uses & {'temperature', 'temperature rate', 'thermal branch'}:
         needs += ('temperature',)
-    if turns:
+    if 'thermal branch' in uses:
         needs += ('cooling',)
-    if 'vibration' in group.uses:
+    if 'vibration' in uses:
         needs += ('vibration',)
-    if group.uses & {'rate', 'angular acceleration', 'joint rate'}:
+    if uses & {'rate', 'angular acceleration', 'joint rate'}:
         needs += ('rotation',)
-    shape: dict[str, Any] = {
+    motions = [motions for quantity, motions in QUANTITY_MOTIONS if quantity in uses]
+    abscissas = [abscissa for quantity, abscissa in DRAWN_AGAINST.items() if quantity in uses]
+
+    # The values and their prior.
+    amplitude_sd = PRIOR_TOLERANCES * tolerance if prior_sd is None else prior_sd
+    fields: dict[str, Any] = {
         'components': VECTOR,
         'shape': (3,),
         'unit': unit,
         'prior': 0.0,
-        'prior_sd': spread,
+        'prior_sd': amplitude_sd,
     }
-    if settles:
-        shape = {
+    if has_time_constant:
+        fields = {
             'components': (*VECTOR, 'time_constant'),
             'shape': (4,),
             'unit': (*[unit] * len(AXES), 's'),
             'time_constant': True,
             'prior': (0.0, 0.0, 0.0, time_constant),
-            'prior_sd': (spread, spread, spread, 10 * time_constant / 3),
+            'prior_sd': (amplitude_sd, amplitude_sd, amplitude_sd, 10 * time_constant / 3),
         }
     text = text.strip() or f'The {sensor} output follows {", ".join(columns)}'
     return Effect(
         name=name,
         sensor=sensor,
-        **shape,
+        **fields,
         tolerance=tolerance,
         tolerance_reason=tolerance_reason,
         explanation=text if text.endswith(('.', '!', '?')) else f'{text}.',
         needs=needs,
-        motion=next(
-            (motions for quantity, motions in QUANTITY_MOTIONS if quantity in group.uses),
-            ('static_poses',),
-        ),
-        compensation='none'
-        if group.uses & {'time', 'attitude', 'temperature rate', *JOINT_INPUTS}
-        else 'exact',
+        motion=motions[0] if motions else ('static_poses',),
+        compensation='none' if uses & NOT_COMPENSATED else 'exact',
         groups=(group,),
         coefficients=partial(amplitude_coefficients, own_axis=len(columns) == 3),
-        smooth=not group.uses
-        - {
-            'time',
-            'temperature',
-            'temperature rate',
-            'thermal branch',
-            'reference temperature',
-            'time constant',
-        },
+        smooth=uses <= SMOOTH_QUANTITIES,
         plausible=('such', largest, 'its definition') if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
-        against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[
-            :1
-        ],
+        against=tuple(abscissas[:1]),
     )
 
 
@@ -242,17 +241,15 @@ def _definition_of(name: str) -> Document:
     return replace(DEFINITION, name=f"effect '{shortened(str(name))}'")
 
 
-def _reduced(effect):
+def _reduced(effect: Effect) -> Any:
     """
-    Return how an effect is sent to other processes.
+    Return the pickled form of an effect, as of `object.__reduce__`.
 
-    By its definition if there is one, because `coefficients` hold functions.
+    An effect with a definition is made again from it, because `coefficients` hold functions.
     """
-    return (
-        object.__reduce_ex__(effect, 2)
-        if effect.definition is None
-        else (from_definition, (effect.name, effect.definition))
-    )
+    if effect.definition is None:
+        return object.__reduce_ex__(effect, 2)
+    return from_definition, (effect.name, effect.definition)
 
 
 copyreg.pickle(Effect, _reduced)
@@ -262,7 +259,7 @@ JOINTS = ('outer', 'middle', 'inner')
 """Default joint names."""
 MOST_ADDED = 50
 """Effects that a document may add at most."""
-UNDONE_WITH = {
+QUANTITIES_OF_SAMPLE = {
     'force',
     'rate',
     'angular acceleration',
@@ -271,13 +268,14 @@ UNDONE_WITH = {
     'vibration',
     'reference temperature',
 }
-"""Quantities of a sample that compensation has."""
+"""Quantities that compensation has of each sample."""
 
 
 @lru_cache(maxsize=8)
-def _own_effects(joint_names):
-    every = ACCELEROMETER + GYROSCOPE + reference_effects(joint_names)
-    return {effect.key: effect for effect in every if effect.size}
+def _package_effects(joint_names: JointNames) -> dict[tuple[str, str], Effect]:
+    """Return the effects of this package by (sensor, name), without those that need more joints."""
+    effects = ACCELEROMETER + GYROSCOPE + reference_effects(joint_names)
+    return {effect.key: effect for effect in effects if effect.size}
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,9 +322,8 @@ class Catalogue:
 
     def effects(self, joint_names: Sequence[str] = JOINTS) -> dict[tuple[str, str], Effect]:
         """Return every effect by (sensor, name) for a table with these joints."""
-        return _own_effects(JointNames.of(joint_names)) | {
-            effect.key: effect for effect in self.added
-        }
+        added = {effect.key: effect for effect in self.added}
+        return _package_effects(JointNames.of(joint_names)) | added
 
     def find(
         self,
@@ -343,12 +340,10 @@ class Catalogue:
         """
         effects = self.effects(joint_names)
         if (sensor, name) not in effects:
-            known = sorted(
-                known_name for known_sensor, known_name in effects if known_sensor == sensor
-            )
+            choices = sorted(choice for owner, choice in effects if owner == sensor)
             raise InputError(
-                f"the {sensor} has no effect '{name}'{did_you_mean(name, [*models, *known])};"
-                f' choose from {", ".join(known)}',
+                f"the {sensor} has no effect '{name}'{did_you_mean(name, [*models, *choices])};"
+                f' choose from {", ".join(choices)}',
                 code='effect_unknown',
             )
         return effects[sensor, name]
@@ -359,15 +354,17 @@ class Catalogue:
 
         The names 'bias' and 'matrix' belong to both sensors and are refused.
         """
-        names = [known for _, known in self.effects(joint_names)]
+        keys = list(self.effects(joint_names))
+        names = [effect_name for _, effect_name in keys]
         if names.count(name) != 1:
-            known = sorted(n for n in names if names.count(n) == 1)
+            choices = sorted(choice for choice in names if names.count(choice) == 1)
             raise InputError(
-                f"effect '{name}' is unknown or ambiguous{did_you_mean(name, known)}; choose from"
-                f' {", ".join(known)}',
+                f"effect '{name}' is unknown or ambiguous{did_you_mean(name, choices)}; choose from"
+                f' {", ".join(choices)}',
                 code='effect_unknown',
             )
-        return next(sensor for sensor, known in self.effects(joint_names) if known == name)
+        sensor, _ = keys[names.index(name)]
+        return sensor
 
     def with_effects(self, *effects: Effect) -> 'Catalogue':
         """
@@ -380,11 +377,11 @@ class Catalogue:
             that compensation cannot compute.
 
         """
-        grown = self
+        catalogue = self
         for effect in effects:
-            _check(effect, {name for _, name in grown.effects()})
-            grown = replace(grown, added=(*grown.added, effect))
-        return grown
+            _check(effect, {name for _, name in catalogue.effects()})
+            catalogue = replace(catalogue, added=(*catalogue.added, effect))
+        return catalogue
 
     def definitions(self, names: Collection[str]) -> dict[str, Any]:
         """Return {effect name: plain data} of the added effects among `names`, for a document."""
@@ -420,9 +417,9 @@ class Catalogue:
 
     def with_document(self, document: dict[str, Any]) -> 'Catalogue':
         """
-        Return a catalogue with the effects defined in a document under `effects`.
+        Return a catalogue with the effects that a document defines under `effects`.
 
-        A file of effects, or a calibration.
+        The document is a file of effects, or a calibration, which has a 'format'.
 
         Raises
         ------
@@ -430,14 +427,14 @@ class Catalogue:
             When there is no such part, or when a file of effects has other parts.
 
         """
-        strange = (
-            [] if 'format' in document else sorted(str(key) for key in document if key != 'effects')
-        )
-        if strange or 'effects' not in document:
+        unknown = []
+        if 'format' not in document:
+            unknown = sorted(str(key) for key in document if key != 'effects')
+        if unknown or 'effects' not in document:
             raise InputError(
                 'a file of effects must hold effects: NAME: {sensor, column, unit, tolerance,'
                 ' text}, it holds'
-                f' {", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"};'
+                f' {", ".join(unknown)[:80] or ", ".join(map(str, document))[:80] or "nothing"};'
                 ' correct it',
                 code='effects_file',
             )
@@ -448,10 +445,11 @@ CATALOGUE = Catalogue()
 """The package's own effects."""
 
 
-def _check(effect, taken):
-    if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken | {
-        'effects'
-    }:
+def _check(effect: Effect, taken_names: set[str]) -> None:
+    """Refuse an effect with an unusable name, without a sensor, or that cannot be compensated."""
+    is_identifier = isinstance(effect.name, str) and effect.name.isidentifier()
+    # 'effects' is a key of a section of a document.
+    if not is_identifier or effect.name in taken_names | {'effects'}:
         raise InputError(
             'an effect must have a name of its own made of letters, digits and underscores, got'
             f" '{effect.name}'; choose another one",
@@ -462,10 +460,10 @@ def _check(effect, taken):
             f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}';"
             ' correct it'
         )
-    used = set()
+    quantities: set[str] = set()
     for group in effect.groups:
-        used |= group.uses
-    unknown = used - UNDONE_WITH
+        quantities |= group.uses
+    unknown = quantities - QUANTITIES_OF_SAMPLE
     if effect.compensation == 'exact' and unknown:
         raise InputError(
             f"effect '{effect.name}' must not use {', '.join(sorted(unknown))}, which are unknown"

@@ -28,14 +28,17 @@ from imu_calibration.effects.base import (
     matrix_coefficients,
     product_coefficients,
 )
+from imu_calibration.kinematics.table import Table
 
 VIBRATION_VARIANCE = 0.05
-"""Variance of a vibration that is plainly felt, (m/s^2)^2."""
+"""Variance of a plain vibration, (m/s^2)^2."""
 
 
-def _one_axis(table):
+def _one_axis(table: Table) -> tuple[str, str] | None:
     """
-    Return why lags between axes cannot be tested: they show where motions about several axes mix.
+    Return (why lags between axes cannot be tested, remedy) for a table with one turning axis.
+
+    They are visible only in motions about several axes at once.
     """
     if len(table.joint_names.turning) > 1:
         return None
@@ -45,18 +48,16 @@ def _one_axis(table):
     )
 
 
-def _pair(sensor):
+def _common_effects(sensor: str) -> tuple[Effect, ...]:
     """Return the effects that both sensors have, for one of them."""
     accel = sensor == 'accelerometer'
     short = PREFIXES[sensor]
     kind = base.INPUT[sensor]
     unit = UNITS[sensor]
+    # Tolerance of the readings, and the input at which it applies to a term that grows with it.
     small = MILLI_G if accel else 0.01 * DEG
     full = STANDARD_GRAVITY if accel else 100 * DEG
-    own = {
-        group: getattr(base, group)[sensor]
-        for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE_COLUMNS', 'WARM_UP')
-    }
+    # Motions that show a curved response.
     curved = ('static_dense', 'centrifuge') if accel else ('three_speeds',)
 
     return (
@@ -96,7 +97,7 @@ def _pair(sensor):
             prior=tuple(np.eye(3).ravel()),
             prior_sd=0.1,
             motion=('static_poses',) if accel else ('spin_x', 'spin_y', 'spin_z'),
-            groups=(own['TRUE_INPUT'],),
+            groups=(base.TRUE_INPUT[sensor],),
             input_order=1,
             coefficients=matrix_coefficients,
         ),
@@ -118,7 +119,7 @@ def _pair(sensor):
                 'ADIS16460 data sheet: 0.1 % / 0.5 % of range',
             ),
             motion=curved,
-            groups=(own['SQUARES'],),
+            groups=(base.SQUARES[sensor],),
             input_order=0,
             coefficients=partial(
                 along_axis_coefficients,
@@ -136,7 +137,7 @@ def _pair(sensor):
             prior_sd=0.05,
             plausible=('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),
             motion=curved,
-            groups=(own['SIGNED'],),
+            groups=(base.SIGNED[sensor],),
             input_order=0,
             coefficients=partial(along_axis_coefficients, function=base.signed_coefficients),
         ),
@@ -246,7 +247,7 @@ def _pair(sensor):
             plausible=('consumer', 1e-3, 'ADXL358, ADIS16460 data sheets'),
             motion=('warm_up',),
             needs=('temperature',) if accel else ('temperature', 'rotation'),
-            groups=(own['THERMAL'],),
+            groups=(base.THERMAL[sensor],),
             input_order=0,
             coefficients=matrix_coefficients,
         ),
@@ -268,7 +269,7 @@ def _pair(sensor):
             motion=('oscillate_fast', 'two_axis'),
             needs=('rotation',),
             moot=_one_axis,
-            groups=(own['CHANGE_COLUMNS'],),
+            groups=(base.CHANGE_COLUMNS[sensor],),
             input_order=1,
             input_places=base.OTHER_AXES,
             coefficients=cross_axis_coefficients,
@@ -297,7 +298,7 @@ def _pair(sensor):
             ),
             motion=('warm_up',),
             compensation='none',
-            groups=(own['WARM_UP'],),
+            groups=(base.WARM_UP[sensor],),
             coefficients=amplitude_coefficients,
         ),
         Effect(
@@ -341,7 +342,7 @@ def _pair(sensor):
     )
 
 
-ACCELEROMETER = _pair('accelerometer') + (
+ACCELEROMETER = _common_effects('accelerometer') + (
     Effect(
         name='accel_cubic',
         sensor='accelerometer',
@@ -430,7 +431,7 @@ ACCELEROMETER = _pair('accelerometer') + (
     ),
 )
 
-GYROSCOPE = _pair('gyroscope') + (
+GYROSCOPE = _common_effects('gyroscope') + (
     Effect(
         name='gyro_g_sensitivity',
         sensor='gyroscope',
