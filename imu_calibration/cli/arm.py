@@ -56,10 +56,12 @@ def run(options: Options) -> VerbResult:
     choices = options.choices()
     readings = readings_of(choices)
     log = log_options(readings, choices)
-    topics = [
-        Topics(imu=topic, frame=frame, log=log) for topic, frame in zip(options.imu_topic, frames)
-    ]
-    if len({(topic.lstrip('/'), frame) for topic, frame in zip(options.imu_topic, frames)}) == 1:
+    topics = []
+    distinct = set()
+    for topic, frame in zip(options.imu_topic, frames):
+        topics.append(Topics(imu=topic, frame=frame, log=log))
+        distinct.add((topic.lstrip('/'), frame))
+    if len(distinct) == 1:
         raise InputError(
             f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a'
             ' frame_id for each',
@@ -70,7 +72,7 @@ def run(options: Options) -> VerbResult:
     # Read both IMUs; joints are not used.
     imus = []
     for topic in topics:
-        open_bag(options.bag, topic, want_joints=False).close()
+        open_bag(options.bag, topic, want_joints=False).close()  # refuses a missing topic
         (source,) = sources_without([source_of(options.bag, topic)], [options.bag], options.exclude)
         recording = read_recording(source, readings, Preflight())
         imus.append(recording.imu)

@@ -32,10 +32,12 @@ def run(options: Options) -> VerbResult:
     options.require_place(options.bags)
     with files.output_folder(options.output) as folder:
         choices = options.choices()
-        found = calibrate_recordings(
+        calibrated = calibrate_recordings(
             options.bags, options.stand(), jobs=options.jobs, earlier=options.earlier, **choices
         )
-        warn(found.calibration.statistics['preflight'])
-        found.save(folder, report=not options.no_report, force=True)  # `require_place`
-        show_calibration(found, folder, options.hints(), report=not options.no_report)
-        return VerbResult(found.exit_code, calibration_mapping(found.calibration), found.reasons)
+        warn(calibrated.calibration.statistics['preflight'])
+        calibrated.save(folder, report=not options.no_report, force=True)  # `require_place`
+        show_calibration(calibrated, folder, options.hints(), report=not options.no_report)
+        return VerbResult(
+            calibrated.exit_code, calibration_mapping(calibrated.calibration), calibrated.reasons
+        )

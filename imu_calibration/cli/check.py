@@ -1,9 +1,14 @@
 """``imu_calibration check``: is a calibration still good on this recording?"""
 
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
 from imu_calibration.core.settings import CHANGE
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.check_result import CheckResult
+    from imu_calibration.report.answer_page import AnswerTable
 
 EXAMPLES = (
     'later_session --calibration result/calibration.yaml --table table.yaml',
@@ -35,7 +40,7 @@ def run(options: Options) -> VerbResult:
     """
     Print the errors before and after with their interval and the decision.
 
-    Exit code 0 when it helps each sensor and no error has changed, otherwise 3.
+    Exit code 0 when it helps change sensor and no error has changed, otherwise 3.
     """
     from imu_calibration.cli.show import show_table, warn
     from imu_calibration.cli.terminal import Terminal
@@ -45,64 +50,64 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.calibrate import check_recording
 
     page = options.page('check.html')
-    found = check_recording(
+    result = check_recording(
         options.bag,
         options.calibration,
         options.stand(),
         change=options.change,
         **options.choices(),
     )
-    warn([finding.to_mapping() for finding in visible_findings(found.findings)])
+    warn([finding.to_mapping() for finding in visible_findings(result.findings)])
     out = Terminal.of()
-    table = _table(found)
+    table = _table(result)
     show_table(out, table.columns, list(table.rows), numbers=table.numbers)
-    out.print(str(found))
+    out.print(str(result))
     if page is not None:
-        headline, *lines = str(found).split('\n')
+        headline, *lines = str(result).split('\n')
         text = answer_page(
             'Check of a calibration',
             headline,
             lines,
             table=table,
-            good=not found.exit_code,
+            good=not result.exit_code,
             lead=(
                 'Errors on the new recording before and after correction, and in the file of the'
                 ' calibration on held-out data. A sensor has changed where the 95 % interval of now'
-                f' / stored lies above {found.change_limit:g} in a kind of motion.'
+                f' / stored lies above {result.change_limit:g} in a kind of motion.'
             ),
             facts={'recording': str(options.bag), 'calibration': str(options.calibration)},
         )
         files.write_texts(page.parent, {page.name: text})
         out.print(f'written: {page}')
     document = {
-        'proof': {sensor: entry.to_mapping() for sensor, entry in found.proof.items()},
-        'helps': found.helps,
-        'changes': [asdict(each) for each in found.changes],
-        'changed': bool(found.changed),
+        'proof': {sensor: entry.to_mapping() for sensor, entry in result.proof.items()},
+        'helps': result.helps,
+        'changes': [asdict(change) for change in result.changes],
+        'changed': bool(result.changed),
     }
-    return VerbResult(found.exit_code, document, found.reasons)
+    return VerbResult(result.exit_code, document, result.reasons)
 
 
-def _table(found):
-    """Return the errors by sensor and motion: before, after, and against the stored one."""
+def _table(result: 'CheckResult') -> 'AnswerTable':
+    """Return the errors by sensor and motion: before, after, and now against the stored one."""
     from imu_calibration.core.units import error_text
     from imu_calibration.document.decision import ratio_text
     from imu_calibration.report.answer_page import AnswerTable
 
     numbers = ('seconds', 'before', 'after', 'after / before, 95 %', 'stored', 'now / stored, 95 %')
-    since = {(each.sensor, each.regime): each for each in found.changes}
+    change_of = {(change.sensor, change.regime): change for change in result.changes}
     rows = []
-    for sensor, entry in found.proof.items():
-        for motion, part in (('all', entry), *entry.regimes.items()):
-            change = since.get((sensor, motion))
+    for sensor, entry in result.proof.items():
+        for motion, errors in (('all', entry), *entry.regimes.items()):
+            change = change_of.get((sensor, motion))
             rows.append(
                 (
                     sensor,
                     motion,
-                    f'{part.seconds:.0f}',
-                    error_text(part.before, part.unit),
-                    error_text(part.after, part.unit),
-                    ratio_text(part),
+                    f'{errors.seconds:.0f}',
+                    error_text(errors.before, errors.unit),
+                    error_text(errors.after, errors.unit),
+                    ratio_text(errors),
                     '-' if change is None else error_text(change.stored, change.unit),
                     '-' if change is None else f'{change.low:.2g} to {change.high:.2g}',
                 )

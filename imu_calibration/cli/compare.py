@@ -34,19 +34,21 @@ def run(options: Options) -> VerbResult:
     for row in result.rows:
         factor, unit = for_people(row.unit, row.name)
         difference, sd = with_sd((row.second - row.first) * factor, row.sd * factor)
+        first, _ = with_sd(row.first * factor, row.sd * factor)
+        second, _ = with_sd(row.second * factor, row.sd * factor)
         shown.append(
             (
                 row.name,
-                *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)),
+                first,
+                second,
                 difference,
                 sd,
                 unit,
                 '-' if row.ratio is None else f'{row.ratio:.1f}',
             )
         )
-    table = AnswerTable(
-        ('parameter', *numbers[:-1], 'unit', 'in sd'), numbers, tuple(map(tuple, shown))
-    )
+    headings = ('parameter', 'A', 'B', 'B - A', 'combined sd', 'unit', 'in sd')
+    table = AnswerTable(headings, numbers, tuple(shown))
     show_table(out, table.columns, shown, numbers=numbers)
     out.print('\n'.join(result.lines))
     if page is not None:

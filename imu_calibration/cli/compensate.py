@@ -78,25 +78,27 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.compensate import compensate_recording
     from msg_adapters.csv_log import is_text_log
 
-    found = compensate_recording(options.bag, **options.arguments_for(compensate_recording))
-    for line in found.warnings:
+    compensated = compensate_recording(options.bag, **options.arguments_for(compensate_recording))
+    for line in compensated.warnings:
         print_line(f'note: {line}')
-    for line in found.reasons:
-        if line not in found.warnings:
+    for line in compensated.reasons:
+        if line not in compensated.warnings:
             print_line(f'warning: {line}')
     topic = '' if is_text_log(options.output) else options.corrected_topic
     place = f'{options.output} with {topic}' if topic else options.output
-    print_line(f'written: {place} ({found.count} samples)')
-    if found.lost:
-        print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in found.lost.items()))
+    print_line(f'written: {place} ({compensated.count} samples)')
+    if compensated.lost:
+        print(
+            'lost: ' + ', '.join(f'{count} {reason}' for reason, count in compensated.lost.items())
+        )
     return VerbResult(
-        found.exit_code,
+        compensated.exit_code,
         {
             'output': str(options.output),
             'topic': topic,
-            'count': found.count,
-            'warnings': list(found.warnings),
-            'lost': found.lost,
+            'count': compensated.count,
+            'warnings': list(compensated.warnings),
+            'lost': compensated.lost,
         },
-        found.reasons,
+        compensated.reasons,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from msg_adapters.storages import identifiers
@@ -38,13 +38,14 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 
-def joined_document(joined: JoinedSensors) -> dict:
-    """Return how two sensors were joined as data."""
+def joined_document(joined: JoinedSensors) -> dict[str, Any]:
+    """Return how two sensors were joined: the slower one, and its delay, s, if it is known."""
     delay = joined.delay
-    known = {'delay': None, 'delay_sd': None}
-    if delay is not None:
-        known = {'delay': delay.delay, 'delay_sd': delay.sd}
-    return {'slower': joined.slower, **known}
+    return {
+        'slower': joined.slower,
+        'delay': None if delay is None else delay.delay,
+        'delay_sd': None if delay is None else delay.sd,
+    }
 
 
 def run(options: Options) -> VerbResult:

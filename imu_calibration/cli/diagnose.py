@@ -38,19 +38,17 @@ def run(options: Options) -> VerbResult:
         options.require_new(options.mcap)
     options.require_place([options.bag])
     with files.output_folder(options.output) as folder:
-        found = diagnose(options.bag, options.stand(), **options.choices())
-        warn(found.calibration.statistics['preflight'])
-        found.save(folder, force=True)  # `require_place` has looked
+        diagnosis = diagnose(options.bag, options.stand(), **options.choices())
+        warn(diagnosis.calibration.statistics['preflight'])
+        diagnosis.save(folder, force=True)  # after `require_place`
         if options.mcap:
-            found.save_overlay(options.mcap, force=options.force)
-        also = (
-            ''
-            if found.transferable is None
-            else ', and extended.yaml with the proposed formula in the model,'
-        )
-        for line in (
-            *str(found).splitlines(),
-            f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}',
-        ):
+            diagnosis.save_overlay(options.mcap, force=options.force)
+        extended = ''
+        if diagnosis.transferable is not None:
+            extended = ', and extended.yaml with the proposed formula in the model,'
+        for line in str(diagnosis).splitlines():
             print_line(line)
-        return VerbResult(found.exit_code, found.document, found.reasons)
+        print_line(
+            f'written: diagnosis.json, calibration.yaml and report.html{extended} in {folder}'
+        )
+        return VerbResult(diagnosis.exit_code, diagnosis.document, diagnosis.reasons)

@@ -50,12 +50,13 @@ def run(options: Options) -> VerbResult:
     """Show the list, or write the file and print the information that is lost."""
     if options.list:
         return VerbResult(0, {'targets': _show_targets()})
-    for name, given in (
-        ('CALIBRATION', options.document),
-        ('--to NAME', options.to),
-        ('--output FILE', options.output),
-    ):
-        if not given:
+    required = {
+        'CALIBRATION': options.document,
+        '--to NAME': options.to,
+        '--output FILE': options.output,
+    }
+    for name, argument in required.items():
+        if not argument:
             raise InputError(f'an export must have {name}, none was given; give it, or see --list')
     from imu_calibration.use_cases.choices import topics_of
     from imu_calibration.use_cases.exporting import export_calibration
@@ -63,20 +64,20 @@ def run(options: Options) -> VerbResult:
 
     if not options.bag:
         refuse_stand(options.stand(), 'the recording --bag BAG, none was given; give both')
-    found = export_calibration(
+    exported = export_calibration(
         options.document,
         stand=options.stand(),
         topics=topics_of(vars(options)),
         **options.arguments_for(export_calibration),
     )
-    for line in (*found.lines, f'written: {options.output}'):
+    for line in (*exported.lines, f'written: {options.output}'):
         print_line(line)
-    return VerbResult(
-        found.exit_code, {'output': options.output, 'lines': found.lines}, found.reasons
-    )
+    document = {'output': options.output, 'lines': exported.lines}
+    return VerbResult(exported.exit_code, document, exported.reasons)
 
 
-def _show_targets():
+def _show_targets() -> list[dict[str, str]]:
+    """Print the programs to whose files an export can write; return them as data."""
     from imu_calibration.cli.show import show_table
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document.exports.export import all_targets, holds_in_words
@@ -90,6 +91,5 @@ def _show_targets():
     show_table(
         Terminal.of(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows
     )
-    return [
-        dict(zip(('name', 'file', 'holds', 'noise', 'import'), row, strict=True)) for row in rows
-    ]
+    keys = ('name', 'file', 'holds', 'noise', 'import')
+    return [dict(zip(keys, row, strict=True)) for row in rows]

@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from imu_calibration.core.units import for_people, significant, with_sd
 from imu_calibration.document import files
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN
 from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.exclusion import (
     Exclusion,
     WithoutExcluded,
@@ -50,7 +51,7 @@ def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
     """
     Return (name, paths of recordings) for each unit.
 
-    A bag, or a sub-folder that holds bags, which are joined.
+    A unit is a bag, or a sub-folder that holds bags, which are joined.
 
     Parameters
     ----------
@@ -71,17 +72,19 @@ def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
         raise InputError(
             f'the folder of units {folder} must exist, there is none; correct the path'
         )
-    members = []
+    unit_paths = []
     for path in sorted(folder.iterdir()):
-        if not path.name.startswith('.') and path.resolve() != output:
-            members.append(path)
-    units = []
-    for path in members:
+        if path.name.startswith('.') or path.resolve() == output:
+            continue
         if path.is_dir() or is_bag(path):
-            units.append((path.name if path.is_dir() else path.stem, bags_of(path)))
-    units = [(name, bags or [folder / name]) for name, bags in units]
-    names = [name for name, _ in units]
-    units = [(name if names.count(name) == 1 else bags[0].name, bags) for name, bags in units]
+            unit_paths.append(path)
+    names = [path.name if path.is_dir() else path.stem for path in unit_paths]
+    units = []
+    for path, name in zip(unit_paths, names):
+        # A folder without bags is a unit too, which then fails.
+        bags = bags_of(path) or [path]
+        # Files that differ in their suffix only have it in their names.
+        units.append((name if names.count(name) == 1 else bags[0].name, bags))
     if not units:
         raise InputError(
             f'{folder} must hold one bag or one sub-folder with bags per unit, there is none; give'
@@ -99,9 +102,9 @@ def is_bag(path: Path) -> bool:
     """Return whether a path has the form of a recording."""
     if not path.is_dir():
         return path.suffix in (*suffixes(), '.bag')
-    return (path / 'metadata.yaml').exists() or any(
-        inner.suffix in suffixes() for inner in path.iterdir()
-    )
+    if (path / 'metadata.yaml').exists():
+        return True
+    return any(inner.suffix in suffixes() for inner in path.iterdir())
 
 
 def fleet_unit(
@@ -151,27 +154,27 @@ CSV_KEYS = (
 def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
     # One unit per folder or file, each with its recordings and its exclusions.
-    found = find_units(options.folder, options.output)
+    paths_of_units = find_units(options.folder, options.output)
     recordings = []
     names_of_recordings = {}
-    for name, paths in found:
+    for name, paths in paths_of_units:
         recordings += paths
         names_of_recordings[name] = [path.name for path in paths]
     table = _table(options, recordings)
     choices = options.choices()
-    used = provenance_with('fleet', (), choices, stand=options.stand())['options']
+    provenance_options = provenance_with('fleet', (), choices, stand=options.stand())['options']
     exclusions = exclusions_of_units(
         parse_exclusions(options.exclude) if options.exclude else (), names_of_recordings
     )
     units = []
-    for name, paths in found:
+    for name, paths in paths_of_units:
         units.append(
             fleet_unit(
                 name,
                 paths,
                 topics_of(choices),
                 joint_names=table.joint_names,
-                options=used,
+                options=provenance_options,
                 exclusions=exclusions[name],
             )
         )
@@ -182,12 +185,12 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
         step = FleetStep(table, settings, None if options.no_report else calibration_report)
-        each = [(unit,) for unit in units]
+        arguments = [(unit,) for unit in units]
         if options.scheduler:
-            results = on_cluster(options.scheduler, step.calibrate, each, advance=advance)
+            results = on_cluster(options.scheduler, step.calibrate, arguments, advance=advance)
         else:
             jobs = jobs_for(options.jobs, len(units))
-            results = in_processes(step.calibrate, each, jobs, advance=advance)
+            results = in_processes(step.calibrate, arguments, jobs, advance=advance)
         spreads = summarise(results)
         reasons = []
         for result in results:
@@ -214,19 +217,19 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     )
 
 
-def _require_same_units(folder, units, *, report):
+def _require_same_units(folder: Path, units: Sequence[Unit], *, report: bool) -> None:
     """Refuse a folder with a result of other recordings for one of the units."""
     for unit in units:
-        found = {}
+        provenance: Mapping[str, Any] = {}
         if (folder / unit.name / 'calibration.yaml').exists():
             try:
-                found = unit.provenance()
+                provenance = unit.provenance()
             except (ImuCalibrationError, OSError):
                 continue  # A unit that cannot be read gives no file.
-        require_same_inputs(folder / unit.name, partial(dict, found), report=report)
+        require_same_inputs(folder / unit.name, partial(dict, provenance), report=report)
 
 
-def _table(options, bags):
+def _table(options: Options, bags: Sequence[Path]) -> Table:
     """
     Return the chain of joints; a description in recordings is read from the first readable one.
     """
@@ -264,8 +267,8 @@ def fleet_unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
     """
     Return one row per unit.
 
-    Decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI; None:
-    unknown.
+    It has the decisions, the exit code, the reason of a refusal, the number of dropped samples, and
+    each parameter with its sd, SI; None: unknown.
     """
     # Every row has the parameters of all units, in the order of the first unit with each.
     parameters: dict[str, float | None] = {}
@@ -301,26 +304,27 @@ def csv_text(rows: Sequence[dict[str, Any]]) -> str:
     Unknown values are empty, and text that a spreadsheet would calculate begins with a quote.
     """
     text = io.StringIO()
-    written = csv.DictWriter(text, rows[0] if rows else CSV_KEYS, lineterminator='\n')
-    written.writeheader()
+    writer = csv.DictWriter(text, rows[0] if rows else CSV_KEYS, lineterminator='\n')
+    writer.writeheader()
     for row in rows:
-        written.writerow({key: _cell(value) for key, value in row.items()})
+        writer.writerow({key: _cell(value) for key, value in row.items()})
     return text.getvalue()
 
 
-def _cell(value):
+def _cell(value: Any) -> Any:
+    """Return a value as a cell of a CSV file, see `csv_text`."""
     if isinstance(value, str):
         # Spreadsheets skip blanks in front of a formula, and a bare \r begins another row.
         value = printable(value)
         return f"'{value}" if value.strip()[:1] in tuple('=+-@') else value
-    return '' if isinstance(value, float) and math.isnan(value) else value
+    if isinstance(value, float) and math.isnan(value):
+        return ''
+    return value
 
 
 def printed_parameter(spread: Spread) -> tuple[str, ...]:
     """
-    Return the printed cells of a parameter.
-
-    Name, mean, spread, typical sd, unit, ratio, the units at the ends.
+    Return the printed cells of a parameter, in the order of `SPREAD_HEADINGS`.
     """
     factor, unit = for_people(spread.unit, spread.name)
     if not spread.count:
@@ -359,21 +363,19 @@ def show_fleet(
         out,
         SPREAD_HEADINGS,
         map(printed_parameter, spreads),
-        numbers=[SPREAD_HEADINGS[k] for k in (1, 2, 3, 5)],
+        numbers=('mean', 'spread', 'typical sd', 'spread / sd'),
     )
     for result in results:
         out.print(
             f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}'
         )
         if result.calibration is not None:
-            warn(
-                {**found, 'text': f'{result.name}: {found["text"]}'}
-                for found in result.calibration.statistics['preflight']
-            )
-    calibrated = sum(result.calibration is not None for result in results)
+            for finding in result.calibration.statistics['preflight']:
+                warn([{**finding, 'text': f'{result.name}: {finding["text"]}'}])
+    n_calibrated = sum(result.calibration is not None for result in results)
     out.print(
-        f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in'
-        f' {folder}'
+        f'written: {n_calibrated} of {len(results)} units, summary.csv, units.csv and summary.html'
+        f' in {folder}'
     )
 
 

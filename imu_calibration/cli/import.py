@@ -33,13 +33,15 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.estimation.solution import HELD
     from imu_calibration.use_cases.exporting import import_calibration
 
-    found = import_calibration(options.file, **options.arguments_for(import_calibration))
-    held = [name for name, status in found.requested.items() if status == HELD]
-    for sensor, word in found.decisions.items():
-        print_line(
-            ': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])])
-        )
-    for line in found.notes:
+    calibration = import_calibration(options.file, **options.arguments_for(import_calibration))
+    held = [name for name, status in calibration.requested.items() if status == HELD]
+    for sensor, decision in calibration.decisions.items():
+        line = f'{sensor} {decision}'
+        reason = calibration.decision_reasons.get(sensor)
+        if reason:
+            line += f': {reason}'
+        print_line(line)
+    for line in calibration.notes:
         print_line(line)
     if held:
         print_line(f'not in the file, held at the prior: {", ".join(held)}')

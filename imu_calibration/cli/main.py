@@ -9,39 +9,47 @@ import threading
 import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from typing import Any, TextIO
+from typing import Any, TextIO, cast
 
-SHARE_BAR, RUNNING_BAR = (
-    '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}',
-    '{desc} |{bar:40}| {elapsed}',
-)
-"""Lines of progress with a known and an unknown total."""
-SWEEP, SWEEP_STEP_SECONDS = 10, 0.2
-"""Steps and seconds per step of the bar of an unknown total."""
+SHARE_BAR = '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}'
+"""Line of progress with a known total."""
+RUNNING_BAR = '{desc} |{bar:40}| {elapsed}'
+"""Line of progress with an unknown total."""
+SWEEP = 10
+"""Steps of the bar of an unknown total."""
+SWEEP_STEP_SECONDS = 0.2
+"""Seconds per step."""
 
 
 class ProgressBars:
     """
-    Listens to `imu_calibration.core.progress`.
+    A listener of `imu_calibration.core.progress` that shows the present phase as a bar.
 
-    The bar of the present phase, removed before other text; it moves between reports too.
+    The bar is removed before other text; it moves between reports too.
     """
 
-    def __init__(self, *, verbose: bool = False):
+    def __init__(self, *, verbose: bool = False) -> None:
         self._verbose = verbose
+        # Ends the thread that moves the bar.
         self._ended = threading.Event()
+        # The tqdm bar, made at the first report on a terminal.
         self._bar: Any = None
+        # Present phase, and the time of its beginning, s.
         self._phase = ''
         self._since = time.monotonic()
+        # Whether the bar is not on the screen at present.
         self._removed = False
 
-    def __enter__(self):
+    def __enter__(self) -> 'ProgressBars':
+        """Replace the standard streams by `BarFreeStream`."""
         self._streams = sys.stdout, sys.stderr
-        sys.stdout, sys.stderr = (BarFreeStream(stream, self) for stream in self._streams)
+        sys.stdout = cast(TextIO, BarFreeStream(sys.stdout, self))
+        sys.stderr = cast(TextIO, BarFreeStream(sys.stderr, self))
         return self
 
-    def __exit__(self, *exception):
-        self._change('')
+    def __exit__(self, *exception: object) -> None:
+        """End the phase, and restore the streams."""
+        self._begin_phase('')
         self._ended.set()
         sys.stdout, sys.stderr = self._streams
         if self._bar is not None:
@@ -57,9 +65,9 @@ class ProgressBars:
 
     def __call__(self, phase: str, done: float, total: float) -> None:
         """Show the amount done of a phase."""
-        new = phase != self._phase
-        if new:
-            self._change(phase)
+        is_new = phase != self._phase
+        if is_new:
+            self._begin_phase(phase)
         if not self._streams[1].isatty():
             return
         if self._bar is None:
@@ -74,15 +82,17 @@ class ProgressBars:
             )
             self._refresher = threading.Thread(target=self._refresh, name='progress', daemon=True)
             self._refresher.start()
-        self._bar.total, self._bar.bar_format = total or SWEEP, SHARE_BAR if total else RUNNING_BAR
+        self._bar.total = total or SWEEP
+        self._bar.bar_format = SHARE_BAR if total else RUNNING_BAR
         self._removed = False
-        if new:
+        if is_new:
             self._bar.set_description_str(phase, refresh=False)
             self._bar.reset()
         if total:
             self._bar.n = min(done, total)
 
-    def _refresh(self):
+    def _refresh(self) -> None:
+        """Draw the bar again and again, in a thread; one of unknown total sweeps."""
         while not self._ended.wait(SWEEP_STEP_SECONDS):
             if self._bar.bar_format == RUNNING_BAR:
                 self._bar.n = (self._bar.n + 1) % (SWEEP + 1)
@@ -90,19 +100,23 @@ class ProgressBars:
                 if not self._removed:
                     self._bar.refresh(nolock=True)
 
-    def _change(self, phase):
+    def _begin_phase(self, phase: str) -> None:
+        """Begin a phase, '' for none; with --verbose print the time of the last one."""
         if self._verbose and self._phase:
             print(f'{self._phase}: {time.monotonic() - self._since:.1f} s', file=sys.stderr)
-        self._phase, self._since = phase, time.monotonic()
+        self._phase = phase
+        self._since = time.monotonic()
 
 
 class BarFreeStream:
     """A stream that removes the bar of progress before each text."""
 
-    def __init__(self, stream: TextIO, bars: ProgressBars):
-        self._stream, self._bars = stream, bars
+    def __init__(self, stream: TextIO, bars: ProgressBars) -> None:
+        self._stream = stream
+        self._bars = bars
 
     def __getattr__(self, name: str) -> Any:
+        """Return any other attribute of the stream."""
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
@@ -145,9 +159,8 @@ def run(options: Namespace) -> int:
             if options.json or options.quiet:
                 stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
             if not options.quiet:
-                stack.enter_context(
-                    listening(stack.enter_context(ProgressBars(verbose=options.verbose)))
-                )
+                bars = stack.enter_context(ProgressBars(verbose=options.verbose))
+                stack.enter_context(listening(bars))
                 stack.enter_context(reading_remarks(complain))
             code, document, reasons = options.run(options)
     except BrokenPipeError:
@@ -157,17 +170,17 @@ def run(options: Namespace) -> int:
         if isinstance(error, ImuCalibrationError):
             text = error.with_hint(options.hints())
             key = error.key
-            name = error.code
+            error_code = error.code
         else:
             text = printable(
                 f'{type(error).__name__}: {error}; check disk space, memory, permissions and'
                 ' the input'
             )
             key = None
-            name = ''
+            error_code = ''
         complain(f'{prog}: {text}')
         code = 1
-        document = {'error': text, 'key': key, 'code': name}
+        document = {'error': text, 'key': key, 'code': error_code}
     except KeyboardInterrupt:
         return _interrupted(prog)
     if options.quiet:
@@ -178,7 +191,8 @@ def run(options: Namespace) -> int:
     return code
 
 
-def _interrupted(prog):
+def _interrupted(prog: str) -> int:
+    """Print that the command was interrupted; return its exit code."""
     print(f'{prog}: interrupted; no file was written', file=sys.stderr)
     return 130
 

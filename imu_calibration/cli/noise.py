@@ -1,8 +1,13 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
+from collections.abc import Sequence
 from itertools import groupby
+from typing import TYPE_CHECKING
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
+
+if TYPE_CHECKING:
+    from imu_calibration.use_cases.noise import IdentifiedNoise
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
@@ -61,35 +66,28 @@ def run(options: Options) -> VerbResult:
             report=not options.no_report,
         )
     with files.output_folder(options.output) as folder:
-        found = identify_recording(options.bag, **choices)
-        warn(finding.to_mapping() for finding in found.findings)
-        found.save(folder, report=not options.no_report, force=True)
-        _show(
-            found,
-            [found.figures.rate, *options.rate],
-            folder,
-            'noise.yaml' + ('' if options.no_report else ' and report.html'),
-        )
-        return VerbResult(
-            found.exit_code, noise_mapping(found.figures, found.horizon), found.reasons
-        )
+        noise = identify_recording(options.bag, **choices)
+        warn(finding.to_mapping() for finding in noise.findings)
+        noise.save(folder, report=not options.no_report, force=True)
+        _show(noise, [noise.figures.rate, *options.rate])
+        names = 'noise.yaml' if options.no_report else 'noise.yaml and report.html'
+        print_line(f'written: {names} in {folder}')
+        document = noise_mapping(noise.figures, noise.horizon)
+        return VerbResult(noise.exit_code, document, noise.reasons)
 
 
-def _show(found, rates, folder, names):
-    """Print the figures, their remarks, and the figures for filters."""
+def _show(noise: 'IdentifiedNoise', rates: Sequence[float]) -> None:
+    """Print the figures, their remarks, and the figures for filters at sampling rates, Hz."""
     from imu_calibration.allan import document
 
-    for head, rows in groupby(
-        document.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'
-    ):
+    rows = document.rows(noise.figures)
+    for head, rows_of_head in groupby(rows, lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
         print(head)
-        for row in rows:
+        for row in rows_of_head:
             line = f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'
             print(line.rstrip())
     print()
-    for line in [
-        *document.lines(found.figures),
-        *document.filter_lines(found.figures, rates, found.horizon),
-    ]:
+    lines = document.lines(noise.figures)
+    filter_lines = document.filter_lines(noise.figures, rates, noise.horizon)
+    for line in [*lines, *filter_lines]:
         print_line(line, '    ')
-    print_line(f'written: {names} in {folder}')

@@ -104,12 +104,13 @@ BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'
 
 class OneLineParser(argparse.ArgumentParser):
     """
-    Refuses with one line and exit code 1.
+    A parser that refuses arguments with one line and exit code 1.
 
     `common` and `expert` declare an option in one of the two groups.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
+        """Make the two groups; arguments as of `argparse.ArgumentParser`."""
         super().__init__(*arguments, **{'add_help': False, **options})
         self.common = self.add_argument_group('common options').add_argument
         self.expert = self.add_argument_group('expert options').add_argument
@@ -119,12 +120,10 @@ class OneLineParser(argparse.ArgumentParser):
         """Parse; an unknown option is refused with the closest known one."""
         options, extra = self.parse_known_args(args, namespace or Options())
         if extra:
-            known = getattr(options, 'verb_options', ())
+            first_name, _, _ = extra[0].partition('=')
+            hint = did_you_mean(first_name, getattr(options, 'verb_options', ()))
             self.prog += f' {options.verb}'
-            self.error(
-                'unrecognized arguments:'
-                f' {" ".join(extra)}{did_you_mean(extra[0].partition("=")[0], known)}'
-            )
+            self.error(f'unrecognized arguments: {" ".join(extra)}{hint}')
         return options
 
     def error(self, message: str) -> NoReturn:
@@ -349,10 +348,11 @@ class Options(argparse.Namespace):
         """Return the choices for a use case."""
         from imu_calibration.use_cases.choices import Choices
 
-        return cast(
-            Choices,
-            {name: value for name, value in vars(self).items() if name in Choices.__annotations__},
-        )
+        choices = {}
+        for name, value in vars(self).items():
+            if name in Choices.__annotations__:
+                choices[name] = value
+        return cast(Choices, choices)
 
     def hints(self) -> dict[str, str]:
         """Return {key of an error: option}, of the options that this verb has."""
@@ -389,11 +389,11 @@ class Options(argparse.Namespace):
 
     def arguments_for(self, function: Callable) -> dict[str, Any]:
         """Return the options whose names are parameters of a function."""
-        found = {}
+        arguments = {}
         for name, value in vars(self).items():
             if name in signature(function).parameters:
-                found[name] = value
-        return found
+                arguments[name] = value
+        return arguments
 
 
 def complain(text: str) -> None:
@@ -412,7 +412,7 @@ def folded(text: str, indent: str = '', last: str = '') -> str:
     """
     Return a line broken between words at the width of standard output.
 
-    `last` ends each but the last part.
+    `last` ends every part except the last one, as a backslash of a shell.
     """
     return f'{last}\n'.join(wrapped(text, Terminal.of().width - len(last), indent))
 
@@ -469,15 +469,16 @@ def add_verbs(
             help='print each phase with its time on standard error',
         )
         added.set_defaults(run=module.run, verb_options=sorted(added._option_string_actions))
-        words = [action for action in added._actions if action.required]
-        added.usage = ' '.join(['%(prog)s', *map(_usage, words), '[options]'])
-        examples = (f'  imu_calibration {name} {example}'.rstrip() for example in module.EXAMPLES)
-        added.epilog = '\n'.join(
-            ['examples:', *(folded(example, 6 * ' ', ' \\') for example in examples)]
-        )
+        required_actions = [action for action in added._actions if action.required]
+        added.usage = ' '.join(['%(prog)s', *map(_usage, required_actions), '[options]'])
+        epilog = ['examples:']
+        for arguments in module.EXAMPLES:
+            example = f'  imu_calibration {name} {arguments}'.rstrip()
+            epilog.append(folded(example, 6 * ' ', ' \\'))
+        added.epilog = '\n'.join(epilog)
 
 
-def _usage(action):
+def _usage(action: argparse.Action) -> str:
     """Return a required argument as the usage line shows it."""
     name = action.metavar or action.dest.upper()
     if action.option_strings:

@@ -1,9 +1,16 @@
 """``imu_calibration plan``: the motions that bring every parameter within its tolerance."""
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
+
+if TYPE_CHECKING:
+    from imu_calibration.use_cases.plan import Planned
+    from imu_calibration.use_cases.recordings import Stand
 
 EXAMPLES = ('--table table.yaml --output plan', '--by-hand --output plan')
 
@@ -98,9 +105,9 @@ def run(options: Options) -> VerbResult:
     require_no_plan(options.output, report=not options.no_report, force=options.force)
     with files.output_folder(options.output) as folder:
         if options.by_hand and options.motion == 'any':
-            made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **options.choices())
+            planned = by_hand(grade=options.grade, imu_rate=options.imu_rate, **options.choices())
         else:
-            made = plan(
+            planned = plan(
                 _stand(options),
                 calibration=options.calibration,
                 grade=options.grade,
@@ -112,30 +119,34 @@ def run(options: Options) -> VerbResult:
                 reach=options.reach,
                 **options.choices(),
             )
-        made.save(
+        planned.save(
             folder,
             report=not options.no_report,
             storage=options.storage,
             force=options.force,
         )
-    _show(made, folder)
-    return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance), made.reasons)
+    _show(planned, folder)
+    document = plan_to_mapping(planned.plan, planned.provenance)
+    return VerbResult(planned.exit_code, document, planned.reasons)
 
 
-def _pose(text):
+def _pose(text: str) -> dict[str, float]:
     """Return joint -> number of 'NAME=NUMBER,...'."""
+    pose = {}
     try:
-        return {
-            name.strip(): float(value)
-            for name, value in (part.split('=') for part in text.split(',') if part)
-        }
+        for part in text.split(','):
+            if part:
+                name, value = part.split('=')
+                pose[name.strip()] = float(value)
     except ValueError:
         raise InputError(
             f"a pose must be NAME=DEG,..., got '{text}'; name every joint once"
         ) from None
+    return pose
 
 
-def _stand(options):
+def _stand(options: Options) -> 'Stand | None':
+    """Return the table or arm of the options; for yaw-only one axis that is vertical."""
     from imu_calibration.kinematics.rotations import local_gravity
     from imu_calibration.planning.motion_library import yaw_table
 
@@ -145,15 +156,17 @@ def _stand(options):
     return options.stand()
 
 
-def _show(planned, folder):
+def _show(planned: 'Planned', folder: Path) -> None:
+    """Print the first motions with their ends, the prediction, and where the files are."""
     from imu_calibration.use_cases.plan import plan_summary
 
-    made, most = planned.plan, planned.plan.most_printed
-    for end, motion in list(zip(made.ends, made.motions, strict=True))[:most]:
+    plan = planned.plan
+    limit = plan.most_printed  # None: all motions are printed
+    for end, motion in list(zip(plan.ends, plan.motions, strict=True))[:limit]:
         print_line(f'until {end:6.1f} s  {motion.words}', ' ' * 16)
-    if most is not None and len(made.motions) > most:
-        print(f'... and {len(made.motions) - most} more, in plan.yaml')
-    for line in [*plan_summary(made), *planned.notes]:
+    if limit is not None and len(plan.motions) > limit:
+        print(f'... and {len(plan.motions) - limit} more, in plan.yaml')
+    for line in [*plan_summary(plan), *planned.notes]:
         print_line(line, '    ')
-    trajectory = ' and the trajectory' if made.moved_joints else ''
+    trajectory = ' and the trajectory' if plan.moved_joints else ''
     print_line(f'written: plan.yaml{trajectory} in {folder}')

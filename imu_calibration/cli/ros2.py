@@ -20,16 +20,16 @@ class ImuCommand(CommandExtension):
         self, parser: ArgumentParser, cli_name: str, *, argv: Sequence[str] | None = None
     ) -> None:
         """Add the verbs; of the one that is called, only its module is imported."""
-        self._parser, parser.epilog = parser, EXIT_CODES
+        self._parser = parser
+        parser.epilog = EXIT_CODES
         # One line, and the exit code of the plain command.
         setattr(parser, 'error', MethodType(OneLineParser.error, parser))
         words = list(sys.argv[1:] if argv is None else argv)
-        after = (
-            words[words.index(cli_name.split()[-1]) + 1 :][:1]
-            if cli_name.split()[-1] in words
-            else []
-        )
-        add_verbs(parser, *after, required=False)
+        command = cli_name.split()[-1]
+        verb = None
+        if command in words[:-1]:
+            verb = words[words.index(command) + 1]
+        add_verbs(parser, verb, required=False)
 
     def main(self, *, args: Namespace, **_: ArgumentParser) -> int:
         """

@@ -102,7 +102,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.simulate import replay, simulate
 
     if options.replay is None:
-        made = simulate(
+        simulated = simulate(
             **options.arguments_for(simulate)
             | {
                 'effects': options.effect,
@@ -117,28 +117,30 @@ def run(options: Options) -> VerbResult:
                 key='calibration',
                 code='replay_without_calibration',
             )
-        made = replay(
+        simulated = replay(
             options.replay,
             options.calibration,
             options.stand(),
             seed=options.seed,
             **options.choices(),
         )
-    made.save(options.output, storage=options.storage, compression=options.compression)
-    samples = made.samples
-    print_line(
-        f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, '
-        f'{len(samples.joints or ())} JointState), with truth.yaml and table.yaml'
-        + f'; {made.lost} samples without known joints left out'
-        * bool(made.lost)
+    simulated.save(options.output, storage=options.storage, compression=options.compression)
+    n_imu = len(simulated.samples.imu or ())
+    n_joints = len(simulated.samples.joints or ())
+    line = (
+        f'written: {options.output} ({simulated.duration:.0f} s, {n_imu} Imu, {n_joints}'
+        ' JointState), with truth.yaml and table.yaml'
     )
+    if simulated.lost:
+        line += f'; {simulated.lost} samples without known joints left out'
+    print_line(line)
     return VerbResult(
         0,
         {
             'output': str(options.output),
-            'seconds': made.duration,
-            'imu': len(samples.imu or ()),
-            'joints': len(samples.joints or ()),
-            'lost': made.lost,
+            'seconds': simulated.duration,
+            'imu': n_imu,
+            'joints': n_joints,
+            'lost': simulated.lost,
         },
     )

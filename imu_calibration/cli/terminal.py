@@ -53,10 +53,9 @@ class Terminal:
         """
         stream = stream or sys.stdout
         moves = stream.isatty()
+        width = shutil.get_terminal_size().columns if moves else UNLIMITED
         coloured = moves and not os.environ.get('NO_COLOR') and os.environ.get('TERM') != 'dumb'
-        return cls(
-            stream, shutil.get_terminal_size().columns if moves else UNLIMITED, moves, coloured
-        )
+        return cls(stream, width, moves, coloured)
 
     def styled(self, text: str, style: str) -> str:
         """Return the text in a style of `STYLE_CODES`; '' is plain."""
@@ -103,7 +102,8 @@ class Terminal:
         """
         if not rows:
             return []
-        texts, styles = [], []
+        texts = []
+        styles = []
         for row in rows:
             cells = [cell if isinstance(cell, tuple) else (cell, '') for cell in row]
             texts.append([text for text, _ in cells])
@@ -114,9 +114,9 @@ class Terminal:
         widths = [max(map(len, ['', *' '.join(column).split()])) for column in columns]
         room = self.width - sum(widths) - gap * (len(widths) - 1)
         for k in sorted(range(len(widths)), key=lambda k: k not in right):
-            wider = max(0, min(room, max(map(len, columns[k])) - widths[k]))
-            widths[k] += wider
-            room -= wider
+            growth = max(0, min(room, max(map(len, columns[k])) - widths[k]))
+            widths[k] += growth
+            room -= growth
 
         lines = []
         for row_texts, row_styles in zip(texts, styles):

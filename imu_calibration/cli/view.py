@@ -37,13 +37,13 @@ def run(options: Options) -> VerbResult:
     foxglove()  # before the work, not after it
     options.require_new(options.output)
     layout = config_file('view.foxglove.json')
-    found = view(options.source, options.stand(), **options.choices())
-    found.save(options.output, force=options.force)
-    for line in found.lacks:
+    overlay = view(options.source, options.stand(), **options.choices())
+    overlay.save(options.output, force=options.force)
+    for line in overlay.lacks:
         complain(f'warning: {line}')
     print_line(f'written: {options.output}; open it in Foxglove with the layout {layout}')
     return VerbResult(
-        found.exit_code,
-        {'output': str(options.output), 'layout': str(layout), 'lacks': found.lacks},
-        found.reasons,
+        overlay.exit_code,
+        {'output': str(options.output), 'layout': str(layout), 'lacks': overlay.lacks},
+        overlay.reasons,
     )

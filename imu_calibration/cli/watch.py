@@ -13,6 +13,7 @@ EXAMPLES = ('', '--node /lab/calibration_node --once')
 GONE = 5.0
 """Seconds without a message after which the node counts as ended."""
 WATCH_PERIOD_SECONDS = 0.25
+"""Time between two screens."""
 ONCE_SECONDS = 10.0
 """
 Default patience where one status is wanted; also the longest wait for a complete screen where the
@@ -61,8 +62,8 @@ def run(options: Options) -> VerbResult:
         context.try_shutdown()
 
 
-def _watch(watcher, options):
-    """Wait for the node, then show it."""
+def _watch(watcher: 'NodeWatcher', options: Options) -> VerbResult:
+    """Wait for the node, then show its screen until it ends, or once."""
     patience = options.patience
     if patience is None:
         patience = math.inf
@@ -89,38 +90,38 @@ def _watch(watcher, options):
                 'status': {name: asdict(status) for name, status in watcher.statuses.items()},
             },
         )
-    drawn = out.redraw(watcher.screen(out), 0)
+    n_drawn = out.redraw(watcher.screen(out), 0)
     while time.monotonic() - watcher.heard < GONE:
         watcher.spin(WATCH_PERIOD_SECONDS)
-        drawn = out.redraw(watcher.screen(out), drawn)
+        n_drawn = out.redraw(watcher.screen(out), n_drawn)
     if not out.moves:
         out.write(watcher.screen(out))
     out.print(f'{watcher.name} has ended')
     return VerbResult(0, {'node': watcher.name})
 
 
-def _wait_for_status(watcher, patience):
-    """Wait for the first status of the node; name a missing node once."""
+def _wait_for_status(watcher: 'NodeWatcher', patience: float) -> None:
+    """Wait up to `patience` seconds for the first status of the node; name a missing node once."""
     start = time.monotonic()
-    named = False
+    is_named = False
     while not watcher.statuses and time.monotonic() - start < patience:
         watcher.spin(WATCH_PERIOD_SECONDS)
-        if not named and time.monotonic() - start > NOTICE_SECONDS and not watcher.statuses:
-            named = True
+        if not is_named and time.monotonic() - start > NOTICE_SECONDS and not watcher.statuses:
+            is_named = True
             complain(f"waiting for '{watcher.name}' on /diagnostics{_heard(watcher)}")
 
 
-def _heard(watcher):
-    """Return the names of the received nodes in brackets, '' without any."""
+def _heard(watcher: 'NodeWatcher') -> str:
+    """Return in brackets the names of the nodes whose status was received, '' without any."""
     if not watcher.others:
         return ''
     return f' (heard: {", ".join(sorted(watcher.others))})'
 
 
 class NodeWatcher:
-    """Listens to one node."""
+    """Receives the status of one node, and its picture of the coverage."""
 
-    def __init__(self, context: Any, name: str):
+    def __init__(self, context: Any, name: str) -> None:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.executors import SingleThreadedExecutor
@@ -128,9 +129,13 @@ class NodeWatcher:
         from visualization_msgs.msg import MarkerArray
 
         self.name = name
-        self.statuses = {}
-        self.others = set()
+        # Name of a status, without the node's -> its last value.
+        self.statuses: dict[str, NodeStatus] = {}
+        # Names of further nodes that publish a status.
+        self.others: set[str] = set()
+        # Text line of the sphere of imu/coverage.
         self.picture = ''
+        # Time of the last status of the node, s.
         self.heard = time.monotonic()
         self._node = rclpy.create_node('imu_calibration_watch', context=context)
         self._executor = SingleThreadedExecutor(context=context)
@@ -145,7 +150,8 @@ class NodeWatcher:
         """Whether every part of the screen was received."""
         return 'streams' in self.statuses and bool(self.picture)
 
-    def _take(self, array):
+    def _take(self, array: Any) -> None:
+        """Store the statuses of a DiagnosticArray."""
         for status in array.status:
             node, _, name = status.name.partition(': ')
             if node == self.name:
@@ -157,17 +163,20 @@ class NodeWatcher:
             else:
                 self.others.add(printable(node))
 
-    def _draw(self, array):
-        # The planner adds its own.
-        self.picture = next(
-            (marker.text for marker in array.markers if marker.ns == 'text'), self.picture
-        )
+    def _draw(self, array: Any) -> None:
+        """Store the text line of a MarkerArray; markers of the planner have none."""
+        for marker in array.markers:
+            if marker.ns == 'text':
+                self.picture = marker.text
+                break
 
     def spin(self, seconds: float) -> None:
-        """Listen for so long."""
+        """Receive messages for this time."""
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
+        remaining = seconds
+        while remaining > 0:
+            self._executor.spin_once(timeout_sec=remaining)
+            remaining = end - time.monotonic()
 
     def screen(self, out: Terminal) -> list[str]:
         """Return the lines of the present screen."""
@@ -181,6 +190,7 @@ FULL_RATIO = 1000.0
 EMPTY_RATIO = 0.1
 """Times the tolerance at which it is empty."""
 LEVELS = ('good', 'warning', 'refuse')
+"""Key of `STYLES` of each `NodeStatus.level`."""
 NOT_GROUPS = ('streams', 'calibration', 'poses', 'diagnosis', 'diagnostics', 'planner')
 
 
@@ -202,29 +212,22 @@ def ratio_of(status: NodeStatus) -> float:
 
     It is NaN before there is one.
     """
-    found = {key.partition(' [')[0]: value for key, value in status.values.items()}
+    # Keys end in their unit, as 'tolerance [m/s^2]'.
+    texts = {key.partition(' [')[0]: text for key, text in status.values.items()}
     try:
-        return float(found['standard error']) / float(found['tolerance'])
+        return float(texts['standard error']) / float(texts['tolerance'])
     except (KeyError, ValueError, ZeroDivisionError):
         return math.nan
 
 
 def bar(ratio: float, width: int = BAR) -> str:
     """Return a bar that shrinks with the uncertainty of a parameter; ``|`` marks its tolerance."""
-    tick = round(width * math.log(1 / EMPTY_RATIO) / math.log(FULL_RATIO / EMPTY_RATIO))
+    span = math.log(FULL_RATIO / EMPTY_RATIO)
+    tick = round(width * math.log(1 / EMPTY_RATIO) / span)
     if math.isnan(ratio):
         return ' ' * tick + '|' + '?' * (width - tick - 1)
-    filled = round(
-        width
-        * min(
-            max(
-                math.log(max(ratio, EMPTY_RATIO) / EMPTY_RATIO)
-                / math.log(FULL_RATIO / EMPTY_RATIO),
-                0.0,
-            ),
-            1.0,
-        )
-    )
+    share = math.log(max(ratio, EMPTY_RATIO) / EMPTY_RATIO) / span
+    filled = round(width * min(max(share, 0.0), 1.0))
     cells = ['#' if k < filled else ' ' for k in range(width)]
     cells[min(tick, width - 1)] = '|'
     return ''.join(cells)
@@ -246,21 +249,13 @@ def screen(node: str, statuses: dict[str, NodeStatus], picture: str, *, out: Ter
 
     """
     lines = [out.styled(node, 'bold')]
-    for title, name in (
-        ('streams', 'streams'),
-        ('verdict', 'calibration'),
-        ('finding', 'diagnosis'),
-    ):
+    titles = {'streams': 'streams', 'calibration': 'verdict', 'diagnosis': 'finding'}
+    for name, title in titles.items():
         if name in statuses:
             status = statuses[name]
-            lines += out.table(
-                [
-                    (
-                        (title, 'dim'),
-                        (status.message.partition('; ')[0], STYLES[LEVELS[min(status.level, 2)]]),
-                    )
-                ]
-            )
+            message, _, _ = status.message.partition('; ')
+            style = STYLES[LEVELS[min(status.level, 2)]]
+            lines += out.table([((title, 'dim'), (message, style))])
     rows: list[list[Cell]] = []
     for name, status in statuses.items():
         if name not in NOT_GROUPS:
@@ -274,4 +269,6 @@ def screen(node: str, statuses: dict[str, NodeStatus], picture: str, *, out: Ter
     if rows:
         headings = ('parameters', f'{"":{round(BAR / 4)}}| determined', 'x tolerance')
         lines += out.table([[(heading, 'dim') for heading in headings], *rows], right=[2])
-    return lines + (out.table([(('next', 'dim'), (picture, 'bold'))]) if picture else [])
+    if picture:
+        lines += out.table([(('next', 'dim'), (picture, 'bold'))])
+    return lines

@@ -31,7 +31,7 @@ from imu_calibration.effects.base import (
 from imu_calibration.kinematics.table import Table
 
 VIBRATION_VARIANCE = 0.05
-"""Variance of a plain vibration, (m/s^2)^2."""
+"""Variance of a distinct vibration, (m/s^2)^2."""
 
 
 def _one_axis(table: Table) -> tuple[str, str] | None:
