@@ -136,8 +136,8 @@ def _checked(node: Any, depth: int) -> Any:
     deeper = depth + 1
     match node:
         case ast.BinOp(left=left, op=ast.Pow() as op, right=exponent):
-            is_integer = isinstance(exponent, ast.Constant) and type(exponent.value) is int
-            if not is_integer or not 0 <= exponent.value <= MAX_EXPONENT:
+            power = exponent.value if isinstance(exponent, ast.Constant) else None
+            if type(power) is not int or not 0 <= power <= MAX_EXPONENT:  # a bool is no power
                 raise _Refused(
                     exponent.col_offset, f'a power that is not an integer up to {MAX_EXPONENT}'
                 )

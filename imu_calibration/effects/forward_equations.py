@@ -1,8 +1,8 @@
 """The columns of a model over a motion, predicted readings, and the model applied to samples."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def _shifted_by(
     """
     delays = [(1.0, np.zeros(()))]
     for acting in lags:
-        lag = acting.effect.warp
+        lag = cast(Lag, acting.effect.warp)
         if roughly:
             lag = lag.single
         delays_of_lag = lag.delays(motion.time, acting.values)
@@ -154,7 +154,8 @@ class References:
             table = self.table
             for warp in acting:
                 if not warp.is_lag:
-                    table, motion = warp.effect.warp(table, motion, warp.values)
+                    change = cast(Callable, warp.effect.warp)
+                    table, motion = change(table, motion, warp.values)
             reference = reference_motion(table, motion, self.temperature_c, attitude=attitude)
             references.append((weight, reference))
         return _mean_reference(references, self.motion)
@@ -210,10 +211,11 @@ def _warp_columns(references: References, effect: Effect, sensor: str) -> list[n
     # A search folds the arms and needs many warps: forward differences halve the references, with
     # an error of the curvature over a step. Candidate effects are evaluated with a delay in place
     # of a filter.
-    in_search = model.folded_arms is not None
+    folded_arms = model.folded_arms
+    in_search = folded_arms is not None
     roughly = in_search and not np.any(model.point_of(effect))
     with_arms = sensor == 'accelerometer' and bool(model.arms)
-    if in_search and not model.folded_arms.any():
+    if folded_arms is not None and not folded_arms.any():
         with_arms = False
     inputs = []
     levers = []
@@ -226,8 +228,8 @@ def _warp_columns(references: References, effect: Effect, sensor: str) -> list[n
             # Force at a sensitive point: force_s + lever_matrix @ arm.
             lever_above = lever_matrix(above.rate_s, above.alpha_s)
             lever_change = lever_above - lever_matrix(below.rate_s, below.alpha_s)
-            if in_search:
-                change = change + np.einsum('nij,ij->ni', lever_change, model.folded_arms)
+            if folded_arms is not None:
+                change = change + np.einsum('nij,ij->ni', lever_change, folded_arms)
             else:
                 levers.append(lever_change.reshape(-1, 9) / distance)
         inputs.append(change / distance)
