@@ -137,12 +137,12 @@ class Calibration:
         return self.accelerometer_defines_axes and not self.absent
 
     @property
-    def by_hand(self) -> dict:
+    def by_hand(self) -> dict[str, Any]:
         """Statistics of poses and turns by hand; {} for a calibration on a table."""
         return self.statistics.get('by_hand') or {}
 
     @property
-    def common_scale(self) -> dict:
+    def common_scale(self) -> dict[str, Any]:
         """
         {'sd', 'tolerance', 'status'} of the accelerometer's common scale by hand.
 

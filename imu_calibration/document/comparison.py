@@ -391,7 +391,7 @@ def _compared(
             f'{n_not_estimated} parameters are held or fixed in one of them and were not compared'
         )
     if in_other_axes.any():
-        names = [common[k] for k in np.flatnonzero(in_other_axes)]
+        names = [name for name, is_turned in zip(common, in_other_axes) if is_turned]
         lines.append(
             f'not compared, because their axes differ by {np.degrees(angle):.2g} deg:'
             f' {listed(names)}'
