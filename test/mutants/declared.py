@@ -864,15 +864,15 @@ TRUST = _of(
     (
         'the mount that bends goes from one side of the proof',
         'not_applied',
-        '_1.sensor in SENSORS',
-        'True',
+        '_1.sensor not in SENSORS',
+        'False',
         'test_proof.py::test_both_sides_are_compared_with_the_same_table',
     ),
     (
         'effects that are not applied count from zero',
         'applied_values',
-        'centred(_1, _2, _3 or {})[0]',
-        '_2.copy()',
+        'centred(_1, _2, _3 or {})',
+        '(_2.copy(), None)',
         'test_applied.py',
     ),
     (
@@ -912,7 +912,7 @@ TRUST = _of(
 FILES = _of(
     (
         'files written where they stand',
-        '_beside',
+        '_temporary_name',
         '_1.parent / f".{os.getpid()}.{token_hex(8)}.{_ending(_1)}"',
         '_1',
         'test_files_disk_faults.py test_main_bad_input.py',
