@@ -1,6 +1,7 @@
 """Phases of the joints (rest, constant rate, motion), and windows cut in them."""
 
 from collections import Counter, deque
+from dataclasses import dataclass
 from enum import IntEnum
 from math import ceil
 from typing import Any
@@ -80,67 +81,141 @@ def joint_phases(
     """
     period = np.median(np.diff(time)) if len(time) > 1 else 1.0
     rows = np.ascontiguousarray(position.T)
-    step, noise = (values[:, None] for values in _resolution(rows, noise_rad))
+    step = np.array([encoder_step(row) for row in rows])[:, None]
+    # The lower quartile: if a quarter of the readings are at rest, it contains neither jitter nor
+    # jerk.
+    noise = np.maximum(noise_rad or 0.0, _white_noise(rows, 0.25))[:, None]
+
+    # Rest: the slopes over 0.2 s, and those over a second near the reading, are small.
     half = _half_width(RATE_SPAN, period, 2)
-    rate, level, ripple = _slopes(time, rows, half)
-    still = _slow(rate, settings.static_rate, half, period, step, noise)
+    lines = _LineFits.of(time, rows, half)
+    level = lines.mean.T
+    still = _is_slow(lines, settings.static_rate, period, step, noise)
     if still.any():
         long_half = _half_width(min(LONGEST_SPAN, settings.static_minimum), period, half)
-        long_rate, _, _ = _slopes(time, rows, long_half)
+        long_lines = _LineFits.of(time, rows, long_half)
         still &= _widened(
-            _slow(long_rate, settings.static_rate, long_half, period, step, noise), long_half
+            _is_slow(long_lines, settings.static_rate, period, step, noise), long_lines.half
         )
     if still.all():
-        return np.full(len(time), STILL, np.int8), level.T
+        return np.full(len(time), STILL, np.int8), level
+
+    # Turn at a constant rate. In motion the steps of the encoders are noise too.
     noise = np.maximum(
         np.maximum(noise, step / np.sqrt(12)), _white_noise(rows, 0.5, ~still)[:, None]
     )
     steady_half = _half_width(min(LONGEST_SPAN, settings.spin_minimum), period, half)
-    steady = _steady(
-        rate, settings, steady_half, 4 * noise * _slope_gain(half, period), ripple, half, 3 * noise
-    )
-    return np.where(still, STILL, np.where(steady, STEADY, MOVING)).astype(np.int8), level.T
+    steady = _is_steady(lines, settings, steady_half, period, noise)
+    return np.where(still, STILL, np.where(steady, STEADY, MOVING)).astype(np.int8), level
 
 
-def _resolution(rows, noise_rad):
-    """Return the step of the encoders and the noise of the readings, both (n_joints,), rad."""
-    step = np.array([encoder_step(row) for row in rows])
-    # the lower quartile: if a quarter of the readings are at rest, it contains neither jitter nor
-    # jerk
-    return step, np.maximum(noise_rad or 0.0, _white_noise(rows, 0.25))
-
-
-def _white_noise(rows, quantile, chosen=None):
+def _white_noise(rows: np.ndarray, quantile: float, chosen: np.ndarray | None = None) -> np.ndarray:
     """
-    Return the noise of the readings from a quantile of their fourth differences, (n_joints,).
+    Return the sd of the white noise of each joint from its fourth differences, rad, (n_joints,).
 
-    Smooth motion drops out.
+    Smooth motion cancels in them, and white noise has 70 times its variance. Their sd is computed
+    from a quantile of their absolute values, for a normal distribution.
+
+    Parameters
+    ----------
+    rows : array, shape (n_joints, n)
+        Readings, rad.
+    quantile : float
+        Small where most readings contain other errors.
+    chosen : array of bool, shape (n,), optional
+        Readings that are used; by default all.
+
     """
     fourth = np.abs(np.diff(rows, 4, axis=1))
-    fourth = fourth if chosen is None else fourth[:, chosen[2:-2]]
+    if chosen is not None:
+        fourth = fourth[:, chosen[2:-2]]
     if fourth.shape[1] < 12:
         return np.zeros(len(rows))
     return np.quantile(fourth, quantile, axis=1) / (ndtri((1 + quantile) / 2) * np.sqrt(70))
 
 
-def _half_width(span, period, least):
+def _half_width(span: float, period: float, least: int) -> int:
+    """Return half the number of readings in `span` s, at least `least`."""
     return max(least, int(round(span / period / 2)))
 
 
-def _slope_gain(half, period):
-    """Return the standard deviation of a slope over ``2 half + 1`` readings for noise of one."""
+def _slope_gain(half: int, period: float) -> float:
+    """Return the sd of a slope over ``2 half + 1`` readings for noise of one, 1/s."""
     n = 2 * half + 1
     return np.sqrt(12 / n) / (n * period)
 
 
-def _slow(rate, static_rate, half, period, step, noise):
+def _widened(mask: np.ndarray, half: int) -> np.ndarray:
+    """Return a mask of the readings with a marked one within `half` readings."""
+    return any_within(mask, half, half)
+
+
+@dataclass(frozen=True, eq=False)
+class _LineFits:
+    """Straight lines fitted to the readings around each reading, for each joint."""
+
+    half: int
+    """A line is fitted to ``2 half + 1`` readings, fewer at the ends."""
+    slope: np.ndarray
+    """rad/s, shape (n_joints, n)."""
+    mean: np.ndarray
+    """Mean of these readings, rad, shape (n_joints, n)."""
+    residual: np.ndarray
+    """Reading in the middle minus its line, rad, shape (n_joints, n)."""
+
+    @classmethod
+    def of(cls, time: np.ndarray, rows: np.ndarray, half: int) -> '_LineFits':
+        """
+        Fit the lines of readings `rows`, rad, shape (n_joints, n), at times, shape (n,).
+
+        With sums over the N readings of a line::
+
+            slope = (sum t p - sum t sum p / N) / (sum t^2 - (sum t)^2 / N)
+        """
+        n = len(time)
+        n_side = min(half, n - 1)
+        index = np.arange(n)
+        count = np.minimum(index + n_side + 1, n) - np.maximum(index - n_side, 0)
+        # Relative to the means, against rounding.
+        origin = rows.mean(axis=1, keepdims=True)
+        t = time - time.mean()
+        p = rows - origin
+        sum_t, sum_tt = _window_sums(np.stack([t, t * t]), n_side)
+        sum_p = _window_sums(p, n_side)
+        sum_tp = _window_sums(p * t, n_side)
+        spread = np.maximum(sum_tt - sum_t**2 / count, 1e-18)
+        slope = (sum_tp - sum_t * sum_p / count) / spread
+        residual = p - sum_p / count - slope * (t - sum_t / count)
+        return cls(half, slope, sum_p / count + origin, residual)
+
+
+def _is_slow(
+    lines: _LineFits, static_rate: float, period: float, step: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """
+    Return where the slopes of all joints are those of a rest, bool, shape (n,).
+
+    Allowed are `static_rate`, four sd of a slope for `noise`, and 1.5 encoder steps over the span
+    of a line; `step` and `noise` in rad, shape (n_joints, 1).
+    """
     allowed = (
-        static_rate + 4 * noise * _slope_gain(half, period) + 1.5 * step / ((2 * half + 1) * period)
+        static_rate
+        + 4 * noise * _slope_gain(lines.half, period)
+        + 1.5 * step / ((2 * lines.half + 1) * period)
     )
-    return np.all(np.abs(rate) <= allowed, axis=0)
+    return np.all(np.abs(lines.slope) <= allowed, axis=0)
 
 
-def _steady(rate, settings, half, allowance, ripple, ripple_half, noise):
+def _is_steady(
+    lines: _LineFits, settings: WindowSettings, half: int, period: float, noise: np.ndarray
+) -> np.ndarray:
+    """
+    Return where the rates of all joints are constant, bool, shape (n,).
+
+    A reading is in a steady turn if one of the spans of ``2 half + 1`` readings that contain it is
+    steady: the slopes in the span vary by less than the settings allow plus their noise, and the
+    rms of the residuals of the lines is explained by `noise`, rad, shape (n_joints, 1).
+    """
     from scipy.ndimage import (  # here, because its import is slow
         maximum_filter1d,
         minimum_filter1d,
@@ -148,44 +223,22 @@ def _steady(rate, settings, half, allowance, ripple, ripple_half, noise):
     )
 
     size = 2 * half + 1
-    high = maximum_filter1d(rate, size, axis=1, mode='nearest')
-    low = minimum_filter1d(rate, size, axis=1, mode='nearest')
+    slope_error = 4 * noise * _slope_gain(lines.half, period)
+    high = maximum_filter1d(lines.slope, size, axis=1, mode='nearest')
+    low = minimum_filter1d(lines.slope, size, axis=1, mode='nearest')
     change = np.maximum(settings.spin_rate_variation * np.abs(high + low) / 2, settings.static_rate)
-    # a rate that swings by `change` within the span moves the readings by this
+    is_constant = high - low <= change + 2 * slope_error
+
+    # A rate that swings by `change` within the span of a line moves the readings by `swing`.
     swing = change * RATE_SPAN / (2 * np.pi)
-    rough = np.sqrt(
-        np.maximum(uniform_filter1d(ripple**2, 2 * ripple_half + 1, axis=1, mode='nearest'), 0.0)
-    )
-    even = maximum_filter1d(rough - swing, size, axis=1, mode='nearest') <= noise
-    return _widened(np.all((high - low <= change + 2 * allowance) & even, axis=0), half)
+    mean_square = uniform_filter1d(lines.residual**2, 2 * lines.half + 1, axis=1, mode='nearest')
+    rms = np.sqrt(np.maximum(mean_square, 0.0))
+    is_even = maximum_filter1d(rms - swing, size, axis=1, mode='nearest') <= 3 * noise
+    return _widened(np.all(is_constant & is_even, axis=0), half)
 
 
-def _widened(mask, half):
-    return any_within(mask, half, half)
-
-
-def _slopes(time, rows, half):
-    """
-    Return least-squares slopes, means, and the residuals of the readings.
-
-    The slopes and means are over ``2 half + 1`` readings, fewer at the ends.
-    """
-    n = len(time)
-    half = min(half, n - 1)
-    place = np.arange(n)
-    count = np.minimum(place + half + 1, n) - np.maximum(place - half, 0)
-    middle = rows.mean(axis=1, keepdims=True)
-    t = time - time.mean()
-    p = rows - middle
-    sum_t, sum_tt = _window_sums(np.stack([t, t * t]), half)
-    sum_p = _window_sums(p, half)
-    sum_tp = _window_sums(p * t, half)
-    spread = np.maximum(sum_tt - sum_t**2 / count, 1e-18)
-    slope = (sum_tp - sum_t * sum_p / count) / spread
-    return slope, sum_p / count + middle, p - sum_p / count - slope * (t - sum_t / count)
-
-
-def _window_sums(rows, half):
+def _window_sums(rows: np.ndarray, half: int) -> np.ndarray:
+    """Return the sums of each row over ``2 half + 1`` values about each one, fewer at the ends."""
     n = rows.shape[1]
     sums = np.empty((len(rows), n + 2 * half + 1))
     sums[:, : half + 1] = 0.0
@@ -199,7 +252,20 @@ LEAST_READINGS = 4
 
 
 class JointRun:
-    """Joint readings without gaps."""
+    """
+    Joint readings without gaps, with their phases.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Session time, s.
+    position, velocity : array, shape (n, n_joints)
+        rad, rad/s; a velocity is NaN where it is unknown.
+    settings : WindowSettings
+    noise_rad : float or None
+        Known noise of the encoders, rad.
+
+    """
 
     def __init__(
         self,
@@ -214,14 +280,18 @@ class JointRun:
         self.position = position
         self.velocity = velocity
         self.phase, self.level = joint_phases(time, position, settings, noise_rad=noise_rad)
-        self._moving = time[self.phase != STILL]
+        """Phase at each reading, shape (n,), and positions averaged over 0.2 s, (n, n_joints)."""
         self.step = np.array([encoder_step(column) for column in position.T])
+        """Steps of the encoders, rad, zero where none are visible, shape (n_joints,)."""
+        # Times of the readings with moving joints, s.
+        self._moving_time = time[self.phase != STILL]
 
     def covered(self, time: np.ndarray, before: bool, after: bool) -> np.ndarray:
         """
-        Return a mask of the instants between the readings.
+        Return a mask of the instants between the readings, shape of `time`.
 
-        Where the joints rest, also of those within two periods of the first or last reading.
+        With `before` (`after`) also of those up to two periods before the first (after the last)
+        reading, if the joints rest there.
         """
         reach = 2 * np.median(np.diff(self.time))
         low = self.time[0] - (reach if before and self.phase[0] == STILL else 0.0)
@@ -244,11 +314,11 @@ class JointRun:
 
         The instants are between the readings and within `distance` of one with moving joints.
         """
-        if not len(self._moving):
+        if not len(self._moving_time):
             return np.zeros(len(time), bool)
-        right = np.searchsorted(self._moving, time)
-        ahead = self._moving[np.minimum(right, len(self._moving) - 1)]
-        behind = self._moving[np.maximum(right - 1, 0)]
+        right = np.searchsorted(self._moving_time, time)
+        ahead = self._moving_time[np.minimum(right, len(self._moving_time) - 1)]
+        behind = self._moving_time[np.maximum(right - 1, 0)]
         near = np.minimum(np.abs(ahead - time), np.abs(time - behind)) <= distance
         return near & (time >= self.time[0]) & (time <= self.time[-1])
 
@@ -290,48 +360,55 @@ class WanderLimit:
     """
 
     def __init__(self) -> None:
+        # Noise densities of the specific force in the newest rests, m/s^2/sqrt(Hz).
         self._densities: deque[float] = deque(maxlen=9)
 
-    def rested(self, samples: PhasedSamples) -> None:
-        """Estimate the noise density from a window at rest."""
+    def add_rest(self, samples: PhasedSamples) -> None:
+        """
+        Estimate the noise density d from a window at rest.
+
+        The variance of a mean over T is ``d^2 / T``, and half that of the differences of
+        neighbouring means, in which drift cancels. The median of the axes is used.
+        """
         period = _period(samples)
         length = int(round(PIECE_SECONDS / period)) if period > 0 else 0
-        pieces = len(samples) // length if length else 0
-        if pieces >= MIN_NOISE_PIECES:
-            means = samples.force_s[: pieces * length].reshape(pieces, length, 3).mean(axis=1)
-            self._densities.append(
-                float(np.sqrt(np.median(np.diff(means, axis=0).var(axis=0) / 2) * length * period))
-            )
+        n_means = len(samples) // length if length else 0
+        if n_means < MIN_NOISE_PIECES:
+            return
+        means = samples.force_s[: n_means * length].reshape(n_means, length, 3).mean(axis=1)
+        variance = np.median(np.diff(means, axis=0).var(axis=0) / 2)
+        self._densities.append(float(np.sqrt(variance * length * period)))
 
-    def pieces(self, samples: PhasedSamples) -> int:
+    def n_windows(self, samples: PhasedSamples) -> int:
         """
         Return the number of windows into which motion is cut; one if no rest has occurred yet.
         """
         if not self._densities or len(samples) < 3:
             return 1
         density = float(np.median(self._densities))
+        # Error of the reference as a density: gravity turns by rate * jitter between samples.
         jitter = np.diff(samples.time, 2).std() / np.sqrt(6)
-        if (
-            STANDARD_GRAVITY
-            * np.sqrt((samples.rate_s**2).sum(axis=1).mean())
-            * jitter
-            * np.sqrt(_period(samples))
-            > density
-        ):
+        rms_rate = np.sqrt((samples.rate_s**2).sum(axis=1).mean())
+        jitter_density = STANDARD_GRAVITY * rms_rate * jitter * np.sqrt(_period(samples))
+        if jitter_density > density:
             return 1
         longest = max(MIN_MOVING_SECONDS, density * np.sqrt(BEST_TIME / 2) / BEST_BIAS)
         return ceil((samples.time[-1] - samples.time[0]) / longest)
 
 
-def _period(samples):
+def _period(samples: PhasedSamples) -> float:
+    """Return the mean step of the times, s."""
     return (samples.time[-1] - samples.time[0]) / max(len(samples) - 1, 1)
 
 
 _USES: tuple[Any, ...] = (*tuple(WindowKind)[1:], *tuple(UnusedReason)[1:])
+"""Uses of a sample: the kinds of windows, then the reasons for none. Arrays hold their indices."""
 _STATIC, _SPIN, _DYNAMIC, _SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(
     len(_USES)
 )
 _MIN_WINDOW_SAMPLES = 5
+_NO_PHASE = -1
+"""In place of the phase before a run that begins a recording or follows a gap."""
 
 
 class WindowCutter:
@@ -343,17 +420,33 @@ class WindowCutter:
     Three steps, each with the least delay:
     runs of one phase that are too short for it become motion, samples get a use, runs of one use
     become windows or are unused.
+
+    Parameters
+    ----------
+    settings : WindowSettings
+    short_rest : float
+        A shorter rest between motions is part of the motion, s.
+    keep_unused : bool
+        Also return windows of kind 'unused'.
+
     """
 
     def __init__(self, settings: WindowSettings, short_rest: float, keep_unused: bool = False):
         self.counts = Counter()
+        """Use (a window kind or an `UnusedReason`) -> samples of finished runs."""
         self._settings = settings
         self._short_rest = short_rest
         self._keep_unused = keep_unused
-        self._waiting = None
-        self._phase_before = None
-        self._disturbed = self._ramped = -np.inf
-        self._open: tuple[Any, Any] | None = None
+        # Step 1. Samples of the newest run of one phase while it is too short, because it may
+        # continue; and the phase of the sample before them.
+        self._undecided: PhasedSamples | None = None
+        self._phase_before: int | None = None
+        # Step 2. Times of the newest samples that are not in a calm rest, not in a steady turn, s:
+        # `settling` counts from them.
+        self._not_resting_time = -np.inf
+        self._not_steady_time = -np.inf
+        # Step 3. Samples and use of the newest run of one use, which may continue.
+        self._open_run: tuple[PhasedSamples, int] | None = None
         self._wander = WanderLimit()
 
     def change(self, settings: WindowSettings, short_rest: float) -> None:
@@ -361,11 +454,11 @@ class WindowCutter:
         self._settings, self._short_rest = settings, short_rest
 
     @property
-    def n_waiting(self) -> int:
-        """Samples held."""
-        return (0 if self._waiting is None else len(self._waiting)) + (
-            0 if self._open is None else len(self._open[0])
-        )
+    def n_buffered(self) -> int:
+        """Number of samples that are not in a window or counted as unused yet."""
+        n_undecided = 0 if self._undecided is None else len(self._undecided)
+        n_open = 0 if self._open_run is None else len(self._open_run[0])
+        return n_undecided + n_open
 
     def push(self, samples: PhasedSamples | None, final: bool = False) -> list[Window]:
         """
@@ -374,113 +467,113 @@ class WindowCutter:
         With `final` all remaining ones.
         """
         windows = []
-        if self._waiting is not None:
-            samples = (
-                self._waiting
-                if samples is None
-                else PhasedSamples.concatenate([self._waiting, samples])
-            )
-            self._waiting = None
+        if self._undecided is not None:
+            if samples is None:
+                samples = self._undecided
+            else:
+                samples = PhasedSamples.concatenate([self._undecided, samples])
+            self._undecided = None
         if samples is not None and len(samples):
-            windows += self._cut(*self._decided(samples, final))
-        if final and self._open is not None:
-            windows += self._close(*self._open)
-            self._open = None
+            phase = self._final_phases(samples, final)
+            n_final = len(phase)
+            if n_final < len(samples):
+                self._undecided = samples.select(slice(n_final, None))
+            if n_final:
+                self._phase_before = samples.phase[n_final - 1]
+                windows += self._cut(samples.select(slice(0, n_final)), phase)
+        if final and self._open_run is not None:
+            windows += self._close(*self._open_run)
+            self._open_run = None
         return windows
 
-    def _decided(self, samples, final):
-        """Return the samples whose phase is final, and that phase; buffer the remaining samples."""
-        starts, stops = _runs(samples.phase, samples.after_gap).T
-        time, settings = samples.time, self._settings
-        phase = samples.phase.copy()
-        original = samples.phase[starts]
-        before = np.concatenate(
-            [[-1 if self._phase_before is None else self._phase_before], original[:-1]]
-        )
-        before[samples.after_gap[starts]] = -1
-        decided = len(samples)
-        for k, (start, stop) in enumerate(zip(starts, stops, strict=True)):
-            is_open = k == len(starts) - 1 and not final
-            length = time[stop - 1] - time[start]
-            needed = (
-                self._short_rest
-                if original[k] == STILL
-                else settings.spin_minimum + (settings.settling if before[k] >= 0 else 0.0)
-            )
-            goes_on = before[k] == original[k]  # the part before was long enough already
-            if original[k] == MOVING or goes_on or length > needed:
-                continue
-            if is_open:
-                decided = start
-            elif original[k] == STEADY or (
-                before[k] in (STEADY, MOVING)
-                and k + 1 < len(original)
-                and not samples.after_gap[stop]
-            ):
-                phase[start:stop] = MOVING
-        if decided < len(samples):
-            self._waiting = samples.select(slice(decided, None))
-        if decided:
-            self._phase_before = samples.phase[decided - 1]
-        return samples.select(slice(0, decided)), phase[:decided]
+    def _final_phases(self, samples: PhasedSamples, final: bool) -> np.ndarray:
+        """
+        Return the phases of the first samples, as many as are decided, with short runs as MOVING.
 
-    def _cut(self, samples, phase):
-        if not len(samples):
-            return []
+        Undecided is a short run at the end, unless the samples are the `final` ones.
+        """
+        starts, stops = _runs(samples.phase, samples.after_gap).T
+        time = samples.time
+        settings = self._settings
+        run_phase = samples.phase[starts]
+        first_before = _NO_PHASE if self._phase_before is None else self._phase_before
+        phase_before = np.concatenate([[first_before], run_phase[:-1]])
+        phase_before[samples.after_gap[starts]] = _NO_PHASE
+
+        phase = samples.phase.copy()
+        for k, (start, stop) in enumerate(zip(starts, stops, strict=True)):
+            if run_phase[k] == MOVING:
+                continue
+            # The begin of this run is decided already, because it was long enough.
+            if phase_before[k] == run_phase[k]:
+                continue
+            needed = self._short_rest
+            if run_phase[k] == STEADY:
+                needed = settings.spin_minimum
+                if phase_before[k] != _NO_PHASE:
+                    needed += settings.settling
+            if time[stop - 1] - time[start] > needed:
+                continue
+
+            is_last = k + 1 == len(starts)
+            if is_last and not final:
+                return phase[:start]
+            # A short rest next to a gap or an end stays a rest, because it may have been longer.
+            between_motions = (
+                phase_before[k] in (STEADY, MOVING) and not is_last and not samples.after_gap[stop]
+            )
+            if run_phase[k] == STEADY or between_motions:
+                phase[start:stop] = MOVING
+        return phase
+
+    def _cut(self, samples: PhasedSamples, phase: np.ndarray) -> list[Window]:
+        """Return the windows completed by samples with their final phases; store the open run."""
         use = self._uses(samples, phase)
-        if self._open is not None:
-            before, use_before = self._open
-            samples = PhasedSamples.concatenate([before, samples])
-            use = np.append(np.full(len(before), use_before), use)
+        if self._open_run is not None:
+            open_samples, open_use = self._open_run
+            samples = PhasedSamples.concatenate([open_samples, samples])
+            use = np.append(np.full(len(open_samples), open_use), use)
         windows = []
         for start, stop in _runs(use, samples.after_gap):
-            cut_off, start = self._shed(samples, start, stop, use[start])
-            windows += cut_off
-            rest = samples.select(slice(start, stop)), use[start]
+            # Windows are cut off the run while it is twice as long as one, whether it is complete
+            # or not: the cuts do not depend on the pieces in which the samples arrive.
+            run_use = use[start]
+            longest = self._longest(run_use)
+            while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
+                cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
+                windows += self._finished(samples.select(slice(start, cut)), run_use)
+                start = cut
+            run = samples.select(slice(start, stop))
             if stop < len(samples):
-                windows += self._close(*rest)
-        self._open = rest
+                windows += self._close(run, run_use)
+            else:
+                self._open_run = run, run_use
         return windows
 
-    def _shed(self, samples, start, stop, use):
-        """
-        Cut complete windows off a run while it is twice as long as a window, open or not.
+    def _uses(self, samples: PhasedSamples, phase: np.ndarray) -> np.ndarray:
+        """Return the use of each sample with its final phase, indices of `_USES`, shape (n,)."""
+        time = samples.time
+        settings = self._settings
+        known_before = ~samples.after_loss
+        calm_rest = (phase == STILL) & samples.quiet & known_before
+        steady = (phase == STEADY) & known_before
 
-        Independent of the time of arrival.
-        """
-        windows = []
-        longest = self._longest(use)
-        while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
-            cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
-            windows += self._finished(samples.select(slice(start, cut)), use)
-            start = cut
-        return windows, start
+        # Samples of rests and steady turns settle first.
+        not_resting_time = _last_time(time, ~calm_rest, self._not_resting_time)
+        not_steady_time = _last_time(time, ~steady, self._not_steady_time)
+        self._not_resting_time = not_resting_time[-1]
+        self._not_steady_time = not_steady_time[-1]
+        rest_settled = time - not_resting_time >= settings.settling
+        turn_settled = time - not_steady_time >= settings.settling
 
-    def _uses(self, samples, phase):
-        time, settings = samples.time, self._settings
-        unknown = samples.after_loss
-        calm_rest = (phase == STILL) & samples.quiet & ~unknown
-        steady = (phase == STEADY) & ~unknown
-        rested = time - self._last_time(time, ~calm_rest, '_disturbed') >= settings.settling
-        settled = time - self._last_time(time, ~steady, '_ramped') >= settings.settling
         use = np.full(len(time), _DYNAMIC)
-        for at_phase, good, wanted in ((STILL, rested, _STATIC), (STEADY, settled, _SPIN)):
-            use[phase == at_phase] = np.where(good[phase == at_phase], wanted, _SETTLING)
+        use[phase == STILL] = np.where(rest_settled[phase == STILL], _STATIC, _SETTLING)
+        use[phase == STEADY] = np.where(turn_settled[phase == STEADY], _SPIN, _SETTLING)
         use[(use == _SETTLING) & (phase == STILL) & ~samples.quiet] = _NOT_QUIET
         use[time < settings.turn_on] = _TURN_ON
         return use
 
-    def _last_time(self, time, event, name):
-        """
-        Return the time of the last event at or before each sample.
-
-        The last one is remembered under `name`.
-        """
-        last = np.maximum.accumulate(np.where(event, time, getattr(self, name)))
-        setattr(self, name, last[-1])
-        return last
-
-    def _close(self, samples, use):
+    def _close(self, samples: PhasedSamples, use: int) -> list[Window]:
         """
         Return the windows of a complete run of one use, cut into equal pieces.
 
@@ -492,44 +585,56 @@ class WindowCutter:
             windows += self._finished(part, use)
         return windows
 
-    def _least(self, use):
-        settings = self._settings
-        return {
-            _STATIC: settings.static_minimum,
-            _SPIN: settings.spin_minimum,
-            _DYNAMIC: settings.dynamic_minimum,
-        }.get(use, 0.0)
+    def _shortest(self, use: int) -> float:
+        """Return the shortest length of a window of a use, s."""
+        if use == _STATIC:
+            return self._settings.static_minimum
+        if use == _SPIN:
+            return self._settings.spin_minimum
+        if use == _DYNAMIC:
+            return self._settings.dynamic_minimum
+        return 0.0
 
-    def _longest(self, use):
-        # halves of a window slightly above the longest length must not be below the shortest
-        return max(self._settings.window_maximum, 2 * self._least(use))
+    def _longest(self, use: int) -> float:
+        """Return the longest length of a window of a use, s."""
+        # Halves of a window slightly above the longest length must not be below the shortest.
+        return max(self._settings.window_maximum, 2 * self._shortest(use))
 
-    def _finished(self, samples, use):
+    def _finished(self, samples: PhasedSamples, use: int) -> list[Window]:
+        """Count the samples of a piece of one use and return its windows, if it has any."""
         n = len(samples)
         length = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
-        if length < self._least(use) or (use <= _DYNAMIC and n < _MIN_WINDOW_SAMPLES):
+        if length < self._shortest(use) or (use <= _DYNAMIC and n < _MIN_WINDOW_SAMPLES):
             use = _REST_TOO_SHORT if use == _STATIC else _TOO_SHORT
         self.counts[_USES[use]] += n
         if use > _DYNAMIC:
-            return (
-                [make_window(samples, WindowKind.UNUSED, _USES[use])] if self._keep_unused else []
-            )
+            if not self._keep_unused:
+                return []
+            return [make_window(samples, WindowKind.UNUSED, _USES[use])]
         if use == _STATIC:
-            self._wander.rested(samples)
-        pieces = self._wander.pieces(samples) if use == _DYNAMIC else 1
-        return [make_window(part, _USES[use]) for part in _equal_parts(samples, pieces)]
+            self._wander.add_rest(samples)
+        n_windows = self._wander.n_windows(samples) if use == _DYNAMIC else 1
+        return [make_window(part, _USES[use]) for part in _equal_parts(samples, n_windows)]
 
 
-def _equal_parts(samples, count):
+def _last_time(time: np.ndarray, event: np.ndarray, earlier: float) -> np.ndarray:
+    """Return the time of the last event at or before each sample; `earlier`: before them all."""
+    return np.maximum.accumulate(np.where(event, time, earlier))
+
+
+def _equal_parts(samples: PhasedSamples, count: int) -> list[PhasedSamples]:
+    """Return the samples in `count` parts of equal length, in order."""
     bounds = np.linspace(0, len(samples), count + 1).astype(int)
-    return [
-        samples.select(slice(start, stop))
-        for start, stop in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
+    parts = []
+    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        parts.append(samples.select(slice(start, stop)))
+    return parts
 
 
-def _runs(value, broken):
-    """Return (start, stop) of runs of equal values that are not broken before a sample."""
+def _runs(value: np.ndarray, broken: np.ndarray) -> np.ndarray:
+    """
+    Return (start, stop) of runs of equal values that are not broken before a sample, (n_runs, 2).
+    """
     return runs_of(np.ones(len(value)), (value[1:] != value[:-1]) | broken[1:])
 
 
@@ -543,8 +648,8 @@ def dropped(counts: dict[str | UnusedReason | WindowKind, int]) -> dict[str, int
 
     Without zeros.
     """
-    found = {}
+    lost = {}
     for reason, count in sorted(counts.items()):
         if count and reason not in ACCEPTED:
-            found[reason] = int(count)
-    return found
+            lost[reason] = int(count)
+    return lost

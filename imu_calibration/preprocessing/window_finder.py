@@ -89,7 +89,7 @@ class MotionGatherer:
         waiting = 0
         for queue in self._queue.values():
             waiting += sum(len(part) for _, part in queue)
-        return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_waiting
+        return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_buffered
 
     @property
     def counts(self) -> dict[str | UnusedReason | WindowKind, int]:

@@ -621,9 +621,9 @@ def test_the_quieter_the_accelerometer_the_shorter_its_moving_windows():
             rng.normal(0.0, 10.0 * density, (2000, 3)),
             np.ones((2000, 3)),
         )
-        assert limit.pieces(samples) == 1
-        limit.rested(samples)
-        cuts[density, jitter] = limit.pieces(samples)
+        assert limit.n_windows(samples) == 1
+        limit.add_rest(samples)
+        cuts[density, jitter] = limit.n_windows(samples)
     assert list(cuts.values()) == [np.ceil(time[-1] / MIN_MOVING_SECONDS), 3, 1, 1]
 
 
