@@ -6,7 +6,7 @@ Position and phase of the joints at the IMU's stamps.
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,9 @@ class SampleBuffer:
 
     def __init__(self) -> None:
         self.newest_ns: int | None = None
-        self._blocks = []
+        """Largest stamp of all samples that were added; None before the first."""
+        # Not empty, in order; joined to one when they are read.
+        self._blocks: list[Any] = []
 
     def __len__(self) -> int:
         return sum(len(block) for block in self._blocks)
@@ -65,13 +67,16 @@ class SampleBuffer:
             del self._blocks[0]
         if self._blocks and self._blocks[0].stamp_ns[0] < stamp_ns:
             block = self._blocks[0]
-            place = max(0, int(np.searchsorted(block.stamp_ns, stamp_ns)) - keep_one)
-            if place:
-                kept = block.select(slice(place, None))
+            n_dropped = int(np.searchsorted(block.stamp_ns, stamp_ns))
+            if keep_one:
+                n_dropped -= 1
+            if n_dropped > 0:
+                kept = block.select(slice(n_dropped, None))
                 # A slice would keep the complete block in memory.
                 self._blocks[:1] = [type(kept).concatenate([kept])] if len(kept) else []
 
-    def _joined(self):
+    def _joined(self) -> Any:
+        """Return all buffered samples; None when there are none."""
         if len(self._blocks) > 1:
             self._blocks = [type(self._blocks[0]).concatenate(self._blocks)]
         return self._blocks[0] if self._blocks else None
@@ -87,6 +92,18 @@ _LEAST_MARGIN = max(window_cutter.PHASE_REACH, QUIETNESS_REACH) + 0.4
 NEVER = 1 << 62
 
 
+@dataclass(frozen=True, eq=False)
+class _JointsAtImu:
+    """The joints at the stamps of the IMU."""
+
+    phase: np.ndarray
+    """STILL, STEADY, MOVING, or LOST where there are no readings of the joints, shape (n,)."""
+    level: np.ndarray
+    """Positions averaged over 0.2 s, rad, shape (n, n_joints)."""
+    step: np.ndarray
+    """Steps of the encoders, rad, zero where none are visible, shape (n, n_joints)."""
+
+
 class MotionChunks:
     """
     One epoch of the clock: converts samples to `PhasedSamples`, in order.
@@ -95,6 +112,15 @@ class MotionChunks:
     first IMU sample. The result depends on samples within the chunk and a margin only, and a chunk
     is processed when all streams have passed its margin (or are given up), so the division of the
     streams into blocks has no effect. The waiting times bound the memory.
+
+    Parameters
+    ----------
+    settings : WindowSettings
+    noise_rad : float or None
+        Known noise of the encoders, rad.
+    floors : tuple of QuietFloor
+        Noise of the accelerometer and the gyroscope at rest, of all epochs.
+
     """
 
     def __init__(
@@ -104,27 +130,38 @@ class MotionChunks:
         floors: tuple[QuietFloor, QuietFloor],
     ):
         self.counts = Counter()
+        """Reason -> number of IMU samples dropped here."""
         self.time_origin = 0.0
+        """Session time at the first IMU sample of this epoch, s."""
+        self.margin = max(settings.overlap, _LEAST_MARGIN)
+        """Samples up to this distance from a chunk have an influence on it, s."""
         self._settings = settings
         self._noise_rad = noise_rad
         self._floors = floors
+        self._chunk_ns = _ns(settings.chunk)
+        self._margin_ns = _ns(self.margin)
+
+        # Streams, and quantities that are computed from all their samples in order.
         self._imu = SampleBuffer()
         self._joints = SampleBuffer()
         self._temperature = SampleBuffer()
         self._branch = ThermalBranch()
-        self._vibration = BandVariance()
         self._slope = TemperatureSlope()
-        self.margin = max(settings.overlap, _LEAST_MARGIN)
-        self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
+        self._vibration = BandVariance()
+
+        # Stamps of the first samples, None before they are added. Chunks exist after the first IMU
+        # sample only.
         self._start_ns: int | None = None
         self._first_joint_ns: int | None = None
+        # Number of the next chunk.
         self._chunk = 0
+        # Of the last IMU sample of the chunk before: its stamp, and whether its joints are unknown.
         self._previous_ns: int | None = None
-        self._after_loss = False
+        self._previous_is_lost = False
 
     @property
     def short_rest(self) -> float:
-        """Length of the rests that have a curve of the joints throughout, s."""
+        """Rests up to this length have a curve of the joints at all their samples, s."""
         return min(self._settings.settling + self._settings.static_minimum, self.margin)
 
     def change(self, settings: WindowSettings) -> None:
@@ -137,7 +174,7 @@ class MotionChunks:
 
     @property
     def n_buffered(self) -> int:
-        """Samples held, of all streams."""
+        """Number of buffered samples of all streams."""
         return sum(len(buffer) for buffer in (self._imu, self._joints, self._temperature))
 
     @property
@@ -157,11 +194,14 @@ class MotionChunks:
         if imu is not None and len(imu):
             if self._start_ns is None:
                 self._start_ns = int(imu.stamp_ns[0])
-            self._imu.add(self._not_late(imu, 'late IMU sample'))
+            n_late = self._n_late(imu, 0)
+            self._count('late IMU sample', n_late)
+            self._imu.add(imu.select(slice(n_late, None)))
         if joints is not None and len(joints):
             if self._first_joint_ns is None:
                 self._first_joint_ns = int(joints.stamp_ns[0])
-            self._joints.add(self._not_late(joints, None))
+            n_late = self._n_late(joints, self._margin_ns)
+            self._joints.add(joints.select(slice(n_late, None)))
         if temperature is not None and len(temperature):
             self._temperature.add(
                 replace(
@@ -178,89 +218,97 @@ class MotionChunks:
         Without samples that have no joints.
         """
         if self._start_ns is not None:
-            passed = np.inf if final else self._passed_ns()
-            while (
-                self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
-                and self._advance(passed, final)
-            ):
-                chunk = self._work(self._next_start_ns(), final)
+            passed_ns = np.inf if final else self._passed_ns()
+            while self._chunk_is_complete(passed_ns) and self._advance(passed_ns, final):
+                chunk = self._process_chunk(self._next_start_ns(), final)
                 self._chunk += 1
                 if chunk is not None:
                     yield chunk
-        self._forget()
+        self._drop_old_samples()
 
-    def joints_left(self) -> JointSamples:
-        """Return the joint samples that are still held, or None."""
+    def remaining_joints(self) -> JointSamples | None:
+        """Return the buffered joint samples, or None."""
         return self._joints.between(-NEVER, NEVER)
 
-    def _next_start_ns(self):
+    def _next_start_ns(self) -> int:
+        """Return the stamp at which the next chunk starts, once an IMU sample has been added."""
+        assert self._start_ns is not None
         return self._start_ns + self._chunk * self._chunk_ns
 
-    def _passed_ns(self):
+    def _passed_ns(self) -> int:
         """Return the stamp that all streams have passed or will never pass."""
-        imu, joints, temperature = (
-            -NEVER if b.newest_ns is None else b.newest_ns
-            for b in (self._imu, self._joints, self._temperature)
+        imu_ns, joints_ns, temperature_ns = (
+            -NEVER if buffer.newest_ns is None else buffer.newest_ns
+            for buffer in (self._imu, self._joints, self._temperature)
         )
-        given_up = _ns(JOINT_WAIT)
-        imu, joints = max(imu, joints - given_up), max(joints, imu - given_up)
-        return min(imu, joints, max(temperature, imu - _ns(TEMPERATURE_WAIT)))
+        # A stream that is behind another one by more than its waiting time is not waited for.
+        joint_wait_ns = _ns(JOINT_WAIT)
+        imu_passed_ns = max(imu_ns, joints_ns - joint_wait_ns)
+        joints_passed_ns = max(joints_ns, imu_ns - joint_wait_ns)
+        temperature_passed_ns = max(temperature_ns, imu_passed_ns - _ns(TEMPERATURE_WAIT))
+        return min(imu_passed_ns, joints_passed_ns, temperature_passed_ns)
 
-    def _advance(self, passed, final):
-        """Advance to the next chunk with IMU samples; False when there is none yet."""
-        oldest = self._imu.first_from(self._next_start_ns())
-        if oldest is None:
-            if not final:
-                self._chunk = max(
-                    self._chunk, int((passed - self._margin_ns - self._start_ns) // self._chunk_ns)
-                )
-            return False
-        # Set by the first samples, which are necessary for `oldest`.
+    def _chunk_is_complete(self, passed_ns: float) -> bool:
+        """Return whether the streams have passed the next chunk and its margin."""
+        return self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed_ns
+
+    def _advance(self, passed_ns: float, final: bool) -> bool:
+        """
+        Advance to the next chunk with IMU samples, and return whether it is complete.
+
+        False as well if there is no such chunk yet.
+        """
         assert self._start_ns is not None
-        self._chunk = (oldest - self._start_ns) // self._chunk_ns
-        return self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
+        oldest_ns = self._imu.first_from(self._next_start_ns())
+        if oldest_ns is None:
+            if not final:
+                # IMU samples of these chunks would be late.
+                n_passed = int((passed_ns - self._margin_ns - self._start_ns) // self._chunk_ns)
+                self._chunk = max(self._chunk, n_passed)
+            return False
+        self._chunk = (oldest_ns - self._start_ns) // self._chunk_ns
+        return self._chunk_is_complete(passed_ns)
 
-    def _not_late(self, samples, reason):
-        """Return `samples` without the ones in chunks already processed."""
+    def _n_late(self, samples: ImuSamples | JointSamples, margin_ns: int) -> int:
+        """Return the number of samples before the next chunk and its margin: their chunks exist."""
         if self._start_ns is None or self._chunk == 0:
-            return samples
-        late = int(
-            np.searchsorted(
-                samples.stamp_ns, self._next_start_ns() - (0 if reason else self._margin_ns)
-            )
-        )
-        if reason:
-            self._count(reason, late)
-        return samples.select(slice(late, None)) if late else samples
+            return 0
+        return int(np.searchsorted(samples.stamp_ns, self._next_start_ns() - margin_ns))
 
-    def _forget(self):
+    def _drop_old_samples(self) -> None:
+        """
+        Drop the samples that no later chunk needs.
+
+        Before the first IMU sample, those before the newest joints by more than the waiting time,
+        or without joints before the newest temperature. One older temperature is kept, because
+        temperatures are interpolated.
+        """
         if self._start_ns is not None:
-            oldest = self._next_start_ns() - self._margin_ns
+            oldest_ns = self._next_start_ns() - self._margin_ns
         elif self._joints.newest_ns is not None:
-            oldest = self._joints.newest_ns - _ns(JOINT_WAIT)
+            oldest_ns = self._joints.newest_ns - _ns(JOINT_WAIT)
         else:
-            oldest = (self._temperature.newest_ns or 0) - _ns(JOINT_WAIT)
-        for buffer, keep_one in (
-            (self._imu, False),
-            (self._joints, False),
-            (self._temperature, True),
-        ):
-            buffer.forget_before(oldest, keep_one)
+            oldest_ns = (self._temperature.newest_ns or 0) - _ns(JOINT_WAIT)
+        self._imu.forget_before(oldest_ns)
+        self._joints.forget_before(oldest_ns)
+        self._temperature.forget_before(oldest_ns, keep_one=True)
 
-    def _count(self, reason, number):
+    def _count(self, reason: str, number: int) -> None:
         self.counts += Counter({reason: int(number)})  # without zeros
 
-    def _work(self, start_ns, final):
+    def _process_chunk(self, start_ns: int, final: bool) -> PhasedSamples | None:
         """Return the chunk from `start_ns` on, or None when no sample in it can be used."""
+        first_ns = start_ns - self._margin_ns
         stop_ns = start_ns + self._chunk_ns
-        imu = self._imu.between(start_ns - self._margin_ns, stop_ns + self._margin_ns)
-        core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
-        time = (imu.stamp_ns - self._start_ns) / 1e9
+        last_ns = stop_ns + self._margin_ns
+
+        # Phases and quietness of the samples of the chunk and its margins.
+        imu = self._imu.between(first_ns, last_ns)
+        time = self._seconds(imu.stamp_ns)
         period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
-        runs, limit = self._joint_runs(
-            start_ns - self._margin_ns, stop_ns + self._margin_ns, period
-        )
-        phase, level, joint_step = self._phases(time, runs, final)
+        longest_step = max(self._settings.gap, 5 * period)
+        runs = self._joint_runs(first_ns, last_ns, longest_step)
+        joints = self._joints_at(time, runs, final)
         quiet = quiet_beside_joints(
             imu.force_s,
             imu.rate_s,
@@ -268,152 +316,164 @@ class MotionChunks:
             ratio=self._settings.quiet_ratio,
             longest=self._settings.static_minimum,
             floors=self._floors,
-            resting=phase == STILL,
+            resting=joints.phase == STILL,
         )
-        after_gap = self._after_gaps(imu.stamp_ns[core], limit)
-        # Position, velocity, acceleration and jerk of the joints.
-        motion = np.zeros((4,) + level[core].shape)
-        motion[0] = level[core]
-        self._draw_curves(motion, time[core], phase[core], runs)
-        temperature, branch, rate = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
+
+        # From here on samples of the chunk only.
+        core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
+        stamp_ns = imu.stamp_ns[core]
+        lost = joints.phase[core] == LOST
+        after_loss = np.concatenate([[self._previous_is_lost], lost[:-1]])
+        self._previous_is_lost = bool(lost[-1])
+        after_gap = self._after_gaps(stamp_ns, longest_step) | after_loss
+        derivatives = self._joint_derivatives(
+            joints.level[core], time[core], joints.phase[core], runs
+        )
+        temperature = self._temperature_at(stamp_ns, last_ns)
         vibration = self._vibration.of(period, imu.force_s[core])
-        corrected = None if imu.corrected is None else imu.corrected[core]
-        return self._without_lost(
-            PhasedSamples(
-                imu.stamp_ns[core],
-                imu.force_s[core],
-                imu.rate_s[core],
-                JointMotion(
-                    time[core] + self.time_origin,
-                    motion[0],
-                    motion[1],
-                    motion[2],
-                    motion[3],
-                    branch,
-                    vibration,
-                    rate,
-                ),
-                temperature,
-                phase[core],
-                quiet[core],
-                after_gap,
-                np.zeros(len(after_gap), bool),
-                joint_step[core],
-                corrected,
-                imu.absent,
-            ),
-            self._at_edge(imu.stamp_ns[core], limit, final),
+        motion = JointMotion(
+            time[core] + self.time_origin,
+            *derivatives,
+            temperature.branch,
+            vibration,
+            temperature.rate,
         )
-
-    def _joint_runs(self, first_ns, last_ns, period):
-        """
-        Return joint readings between two stamps as stretches without gaps.
-
-        The longest step that is no gap, in s, is returned as well.
-        """
-        joints = self._joints.between(first_ns, last_ns)
-        limit = max(self._settings.gap, 5 * period)
-        if joints is None or not len(joints):
-            return [], limit
-        time = (joints.stamp_ns - self._start_ns) / 1e9
-        step = np.diff(time)
-        joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
-        runs = []
-        for a, b in runs_of(np.ones(len(time)), step > joint_limit):
-            if b - a >= LEAST_READINGS:
-                runs.append(
-                    JointRun(
-                        time[a:b],
-                        joints.position[a:b],
-                        joints.velocity[a:b],
-                        settings=self._settings,
-                        noise_rad=self._noise_rad,
-                    )
-                )
-        return runs, limit
-
-    def _phases(self, time, runs, final):
-        """
-        Return the phase of each IMU sample, and the level and steps of the joints there.
-
-        The level is that of the joints and the steps are of their encoders.
-        """
-        phase = np.full(len(time), LOST, np.int8)
-        level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
-        steps = np.zeros(level.shape)
-        # Set by the first samples.
-        assert self._start_ns is not None
-        for k, run in enumerate(runs):
-            first = (
-                self._first_joint_ns is not None
-                and run.time[0] <= (self._first_joint_ns - self._start_ns) / 1e9
-            )
-            inside = run.covered(time, before=first, after=final and k == len(runs) - 1)
-            phase[inside], level[inside] = run.at(time[inside])
-            steps[inside] = run.step
-        return phase, level, steps
-
-    def _draw_curves(self, motion, time, phase, runs):
-        """Set the joints' motion on the samples near moving joints."""
-        for run in runs:
-            need = np.flatnonzero((phase != LOST) & run.near_motion(time, self.short_rest))
-            if not len(need):
-                continue
-            parts = np.split(
-                need, np.flatnonzero(np.diff(time[need]) > 2 * self._settings.overlap) + 1
-            )
-            for part in parts:
-                stretch = slice(part[0], part[-1] + 1)
-                curve = run.curve(time[stretch], self._settings.overlap, self._noise_rad)
-                for target, values in zip(
-                    motion,
-                    (curve.position, curve.rate, curve.acceleration, curve.jerk),
-                    strict=True,
-                ):
-                    target[stretch] = values
-
-    def _after_gaps(self, stamp_ns, limit):
-        before = stamp_ns[0] - (1 << 40) if self._previous_ns is None else self._previous_ns
-        self._previous_ns = int(stamp_ns[-1])
-        return np.diff(np.concatenate([[before], stamp_ns])) > _ns(limit)
-
-    def _warmth(self, stamp_ns, last_ns):
-        """Return (temperatures, thermal branches, slopes of the temperature) at the stamps."""
-        readings = self._temperature.between(-NEVER, last_ns)
-        if readings is None or not len(readings):
-            return np.full((3, len(stamp_ns)), np.nan)
-        at = (stamp_ns - self._start_ns) / 1e9
-        known = (readings.stamp_ns - self._start_ns) / 1e9
-        series = (readings.temperature_c, readings.branch, readings.rate)
-        return [np.interp(at, known, values) for values in series]
-
-    def _at_edge(self, stamp_ns, limit, final):
-        """
-        Return a mask of the samples close before the first joint state or after the last one.
-
-        Where no joint state is missing.
-        """
-        if self._first_joint_ns is None:
-            return np.zeros(len(stamp_ns), bool)
-        edge = (stamp_ns < self._first_joint_ns) & (stamp_ns >= self._first_joint_ns - _ns(limit))
-        if final and self._joints.newest_ns is not None:
-            edge |= (stamp_ns > self._joints.newest_ns) & (
-                stamp_ns <= self._joints.newest_ns + _ns(limit)
-            )
-        return edge
-
-    def _without_lost(self, samples, edge):
-        lost = samples.phase == LOST
-        before = np.concatenate([[self._after_loss], lost[:-1]])
-        self._after_loss = bool(lost[-1])
-        samples.after_gap[before] = True
-        samples.after_loss[before] = True
+        samples = PhasedSamples(
+            stamp_ns,
+            imu.force_s[core],
+            imu.rate_s[core],
+            motion,
+            temperature.temperature_c,
+            joints.phase[core],
+            quiet[core],
+            after_gap,
+            after_loss,
+            joints.step[core],
+            None if imu.corrected is None else imu.corrected[core],
+            imu.absent,
+        )
         if not lost.any():
             return samples
+        edge = self._at_edge(stamp_ns, longest_step, final)
         self._count('no joint state', np.count_nonzero(lost & ~edge))
         self._count('edge of joints', np.count_nonzero(lost & edge))
         return None if lost.all() else samples.select(~lost)
 
+    def _seconds(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return times since the first IMU sample of this epoch, s."""
+        assert self._start_ns is not None
+        return (stamp_ns - self._start_ns) / 1e9
 
-def _ns(seconds):
+    def _joint_runs(self, first_ns: int, last_ns: int, longest_step: float) -> list[JointRun]:
+        """
+        Return joint readings between two stamps as stretches without gaps.
+
+        A gap is longer than `longest_step`, s, and than three periods of the joints.
+        """
+        joints = self._joints.between(first_ns, last_ns)
+        if joints is None or not len(joints):
+            return []
+        time = self._seconds(joints.stamp_ns)
+        step = np.diff(time)
+        if len(step):
+            longest_step = max(longest_step, 3 * float(np.median(step)))
+        runs = []
+        for start, stop in runs_of(np.ones(len(time)), step > longest_step):
+            if stop - start >= LEAST_READINGS:
+                runs.append(
+                    JointRun(
+                        time[start:stop],
+                        joints.position[start:stop],
+                        joints.velocity[start:stop],
+                        settings=self._settings,
+                        noise_rad=self._noise_rad,
+                    )
+                )
+        return runs
+
+    def _joints_at(self, time: np.ndarray, runs: list[JointRun], final: bool) -> _JointsAtImu:
+        """Return the joints at the times of IMU samples, s, from readings without gaps."""
+        phase = np.full(len(time), LOST, np.int8)
+        level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
+        step = np.zeros(level.shape)
+        assert self._start_ns is not None
+        for k, run in enumerate(runs):
+            is_first = (
+                self._first_joint_ns is not None
+                and run.time[0] <= (self._first_joint_ns - self._start_ns) / 1e9
+            )
+            is_last = final and k == len(runs) - 1
+            inside = run.covered(time, before=is_first, after=is_last)
+            phase[inside], level[inside] = run.at(time[inside])
+            step[inside] = run.step
+        return _JointsAtImu(phase, level, step)
+
+    def _joint_derivatives(
+        self, level: np.ndarray, time: np.ndarray, phase: np.ndarray, runs: list[JointRun]
+    ) -> np.ndarray:
+        """
+        Return position, rate, acceleration and jerk of the joints, shape (4, n, n_joints).
+
+        Those of a smooth curve near moving joints, elsewhere `level` and zeros.
+        """
+        derivatives = np.zeros((4,) + level.shape)
+        derivatives[0] = level
+        for run in runs:
+            near = np.flatnonzero((phase != LOST) & run.near_motion(time, self.short_rest))
+            if not len(near):
+                continue
+            # One curve for each motion; motions at a distance above two overlaps are independent.
+            is_apart = np.diff(time[near]) > 2 * self._settings.overlap
+            for part in np.split(near, np.flatnonzero(is_apart) + 1):
+                stretch = slice(part[0], part[-1] + 1)
+                curve = run.curve(time[stretch], self._settings.overlap, self._noise_rad)
+                derivatives[0, stretch] = curve.position
+                derivatives[1, stretch] = curve.rate
+                derivatives[2, stretch] = curve.acceleration
+                derivatives[3, stretch] = curve.jerk
+        return derivatives
+
+    def _after_gaps(self, stamp_ns: np.ndarray, longest_step: float) -> np.ndarray:
+        """Return where the step before a sample is longer than `longest_step` s, shape (n,)."""
+        # A gap precedes the first sample of the epoch.
+        before_ns = stamp_ns[0] - (1 << 40) if self._previous_ns is None else self._previous_ns
+        self._previous_ns = int(stamp_ns[-1])
+        return np.diff(np.concatenate([[before_ns], stamp_ns])) > _ns(longest_step)
+
+    def _temperature_at(self, stamp_ns: np.ndarray, last_ns: int) -> TemperatureSamples:
+        """
+        Return temperature, thermal branch and slope at the stamps, NaN where there are none.
+
+        They are interpolated between the readings up to `last_ns`.
+        """
+        readings = self._temperature.between(-NEVER, last_ns)
+        if readings is None or not len(readings):
+            unknown = np.full((3, len(stamp_ns)), np.nan)
+            return TemperatureSamples(stamp_ns, *unknown)
+        time = self._seconds(stamp_ns)
+        reading_time = self._seconds(readings.stamp_ns)
+        return TemperatureSamples(
+            stamp_ns,
+            np.interp(time, reading_time, readings.temperature_c),
+            np.interp(time, reading_time, readings.branch),
+            np.interp(time, reading_time, readings.rate),
+        )
+
+    def _at_edge(self, stamp_ns: np.ndarray, longest_step: float, final: bool) -> np.ndarray:
+        """
+        Return a mask of the samples close before the first joint state or after the last one.
+
+        At most `longest_step` s from it: there no joint state is missing.
+        """
+        if self._first_joint_ns is None:
+            return np.zeros(len(stamp_ns), bool)
+        reach_ns = _ns(longest_step)
+        edge = (stamp_ns < self._first_joint_ns) & (stamp_ns >= self._first_joint_ns - reach_ns)
+        last_joint_ns = self._joints.newest_ns
+        if final and last_joint_ns is not None:
+            edge |= (stamp_ns > last_joint_ns) & (stamp_ns <= last_joint_ns + reach_ns)
+        return edge
+
+
+def _ns(seconds: float) -> int:
     return int(round(seconds * 1e9))

@@ -215,7 +215,7 @@ class MotionGatherer:
     def _follow(self, old):
         """Continue streams without a clock reset in the new epoch: only one clock was reset."""
         if not self._queue['joints']:
-            self._chunks.add(joints=old.joints_left())
+            self._chunks.add(joints=old.remaining_joints())
         for name in STREAMS:
             if not self._queue[name]:
                 self._epoch_shift[name] = self._epoch - self.cleaner.epoch(name)
