@@ -120,7 +120,7 @@ class OtherSensor:
     """Frame of the accelerometer, in which both sensors are calibrated."""
 
     def known(self, stamp_ns: np.ndarray) -> np.ndarray:
-        """Return at which stamps there is a reading to interpolate, bool, shape (n,)."""
+        """Return whether the readings can be interpolated to each stamp, bool, shape (n,)."""
         return interpolated(self.stream, stamp_ns)[1]
 
     def added_to(self, imu: ImuSamples) -> ImuSamples:
@@ -159,9 +159,9 @@ def join_sensors(
         When the two hardly overlap in time.
 
     """
-    n_least = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
+    n_fewer = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
     slower, stamp_ns = 'gyroscope', gyroscope.stamp_ns
-    if n_least >= 2 and accelerometer.period_ns >= gyroscope.period_ns:
+    if n_fewer >= 2 and accelerometer.period_ns >= gyroscope.period_ns:
         slower, stamp_ns = 'accelerometer', accelerometer.stamp_ns
     force, has_force = interpolated(accelerometer, stamp_ns)
     rate, has_rate = interpolated(gyroscope, stamp_ns)
@@ -186,16 +186,17 @@ def interpolated(stream: SensorStream, stamp_ns: np.ndarray) -> tuple[np.ndarray
     n = len(stream.stamp_ns)
     if n < 2:
         return np.zeros((len(stamp_ns), 3)), np.zeros(len(stamp_ns), bool)
+    # Readings after - 1 and after are the neighbours of a stamp.
     after = np.searchsorted(stream.stamp_ns, stamp_ns)
     inside = (stamp_ns >= stream.stamp_ns[0]) & (stamp_ns <= stream.stamp_ns[-1])
     after = np.clip(after, 1, n - 1)
-    first = stream.stamp_ns[after - 1]
-    last = stream.stamp_ns[after]
-    step = last - first
-    share = ((stamp_ns - first) / step)[:, None]
+    before_ns = stream.stamp_ns[after - 1]
+    after_ns = stream.stamp_ns[after]
+    step_ns = after_ns - before_ns
+    share = ((stamp_ns - before_ns) / step_ns)[:, None]
     values = (1.0 - share) * stream.values[after - 1] + share * stream.values[after]
-    known = inside & ((step <= MAX_GAP_PERIODS * stream.period_ns) | (stamp_ns == last))
-    return values, known
+    not_in_gap = (step_ns <= MAX_GAP_PERIODS * stream.period_ns) | (stamp_ns == after_ns)
+    return values, inside & not_in_gap
 
 
 def delay_of(imu: ImuSamples) -> GyroscopeDelay | None:
@@ -219,61 +220,112 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
     A (3 x 3) and b are fitted for each d, so that neither units nor axes nor biases matter; d has
     the least squared residual.
     """
-    windows = _windows(accelerometer)
-    if windows is None:
+    windows = _gravity_windows(accelerometer)
+    if windows is None or windows.rotation.sum() < MIN_DELAY_ROTATION:
         return None
-    start, stop, middle, change = windows
-    if np.linalg.norm(change, axis=1).sum() < MIN_DELAY_ROTATION:
-        return None
-    delay = _found_delay(gyroscope, accelerometer.stamp_ns[0], windows, MAX_DELAY)
+    delay = _delay_within(gyroscope, accelerometer.stamp_ns[0], windows, MAX_DELAY)
     if delay is None:
-        delay = _found_delay(gyroscope, accelerometer.stamp_ns[0], windows, WIDE_DELAY)
+        delay = _delay_within(gyroscope, accelerometer.stamp_ns[0], windows, WIDE_DELAY)
     return delay
 
 
-def _found_delay(gyroscope, origin_ns, windows, reach):
-    """Return the GyroscopeDelay up to `reach` s that explains the rotation of gravity, or None."""
-    start, stop, middle, change = windows
+@dataclass(frozen=True, eq=False)
+class _GravityWindows:
+    """Rotation of the direction u of the specific force in short windows."""
+
+    start: np.ndarray
+    """Time since the first reading of the accelerometer, s, shape (n,)."""
+    stop: np.ndarray
+    """s, shape (n,)."""
+    middle: np.ndarray
+    """u in the middle of the window, shape (n, 3)."""
+    change: np.ndarray
+    """u at its end minus u at its start, shape (n, 3)."""
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """Rotation of gravity, rad (small angles), shape (n,)."""
+        return np.linalg.norm(self.change, axis=1)
+
+    def select(self, index: np.ndarray) -> '_GravityWindows':
+        """Return the windows at `index`."""
+        return _GravityWindows(
+            self.start[index], self.stop[index], self.middle[index], self.change[index]
+        )
+
+
+def _gravity_windows(accelerometer: SensorStream) -> _GravityWindows | None:
+    """Return windows of `DELAY_WINDOW` s, half overlapping, without gaps; None if too short."""
+    if len(accelerometer.stamp_ns) < 20:
+        return None
+    time = (accelerometer.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
+    half = max(int(round(0.5 * DELAY_WINDOW / (accelerometer.period_ns * 1e-9))), 1)
+    length = np.linalg.norm(accelerometer.values, axis=1)
+    median_length = np.median(length)
+    if not median_length > 0.0 or len(time) < 4 * half:
+        return None
+    # A specific force near zero has no direction.
+    has_direction = (length > 0.1 * median_length)[:, None]
+    direction = unit_rows(np.where(has_direction, accelerometer.values, 1.0))
+
+    start = np.arange(0, len(time) - 2 * half, half)
+    middle = start + half
+    stop = start + 2 * half
+    longest = 2.0 * DELAY_WINDOW + 4e-9 * accelerometer.period_ns
+    without_gap = time[stop] - time[start] < longest
+    start = start[without_gap]
+    middle = middle[without_gap]
+    stop = stop[without_gap]
+    change = direction[stop] - direction[start]
+    return _GravityWindows(time[start], time[stop], direction[middle], change)
+
+
+def _delay_within(
+    gyroscope: SensorStream, origin_ns: int, windows: _GravityWindows, reach: float
+) -> GyroscopeDelay | None:
+    """
+    Return the delay up to `reach` s whose fit explains the rotation of gravity, or None.
+
+    Times of the windows count from the stamp `origin_ns`.
+    """
     time = (gyroscope.stamp_ns - origin_ns) * 1e-9
-    inside = (start > time[0] + reach) & (stop < time[-1] - reach)
+    inside = (windows.start > time[0] + reach) & (windows.stop < time[-1] - reach)
     if np.count_nonzero(inside) < 20 * DELAY_PARTS:
         return None
     # Windows in which gravity rotates most determine the delay.
-    rotation = np.where(inside, np.linalg.norm(change, axis=1), 0.0)
-    most = np.sort(np.argsort(rotation)[-MOST_COMPARED_WINDOWS:])
-    used = most[rotation[most] > 0.0]
-    cost = _DelayCost(
-        gyroscope,
-        time,
-        start=start[used],
-        stop=stop[used],
-        middle=middle[used],
-        change=change[used],
-    )
+    rotation = np.where(inside, windows.rotation, 0.0)
+    largest = np.sort(np.argsort(rotation)[-MOST_COMPARED_WINDOWS:])
+    windows = windows.select(largest[rotation[largest] > 0.0])
+    cost = _DelayCost(gyroscope, time, windows)
 
     # The least residual, first among widely spaced delays, then near the best of them.
-    near, around = 0.0, reach
+    best, around = 0.0, reach
     steps = [DELAY_STEP]
     if reach > MAX_DELAY:
         steps = [WIDE_STEP, DELAY_STEP]
     for step in steps:
-        coarse = near + np.arange(-around, around + step / 2, step)
-        near = coarse[int(np.argmin([cost.residual(delay) for delay in coarse]))]
+        delays = best + np.arange(-around, around + step / 2, step)
+        best = delays[int(np.argmin([cost.residual(delay) for delay in delays]))]
         around = step
-    fine = near + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)
-    residuals = np.array([cost.without_each_part(delay) for delay in fine])
-    total = float(np.sum(change[used] ** 2))
+    fine_delays = best + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)
+    # Column 0: of all windows; column 1 + k: without part k.
+    residuals = np.array([cost.residuals_without_parts(delay) for delay in fine_delays])
+    total = float(np.sum(windows.change**2))
     if residuals[:, 0].min() > (1.0 - MIN_EXPLAINED) * total:
         return None
-    if reach > MAX_DELAY and cost.prediction_error(near) > (1.0 - MIN_PREDICTED) * total:
+    if reach > MAX_DELAY and cost.prediction_error(best) > (1.0 - MIN_PREDICTED) * total:
         return None
-    delay = _least_place(fine, residuals[:, 0])
+    delay = _minimum_of_parabola(fine_delays, residuals[:, 0])
+    # A minimum at the end of the searched delays may be a slope of one beyond.
     if abs(delay) > reach - steps[0]:
         return None
 
     # Jackknife over parts of the recording, because the residuals are correlated in time.
-    without = np.array([_least_place(fine, left_out) for left_out in residuals[:, 1:].T])
-    variance = (DELAY_PARTS - 1) / DELAY_PARTS * np.sum((without - without.mean()) ** 2)
+    delays_without_parts = np.array(
+        [_minimum_of_parabola(fine_delays, column) for column in residuals[:, 1:].T]
+    )
+    deviation = delays_without_parts - delays_without_parts.mean()
+    variance = (DELAY_PARTS - 1) / DELAY_PARTS * np.sum(deviation**2)
     return GyroscopeDelay(delay, float(np.sqrt(variance)))
 
 
@@ -281,43 +333,39 @@ class _DelayCost:
     """
     Squared residuals of the windows for a delay, with A and b of `gyroscope_delay` fitted.
 
-    A row of the fit is ``u x (A turned)``: linear in the 12 numbers of (A, b), with the products of
-    `lever` = [u x] and `turned` as coefficients. The normal equations therefore need only the
-    products of ``lever.T lever`` and ``turned turned.T``, summed over the windows of each part.
+    The model of a window is ``change = [u x] (A, b) turned``, with the direction u of gravity in
+    its middle, and `turned`: the integral of the rates over the window shifted by the delay, and
+    its duration, (4,). It is linear in the 12 numbers of (A, b), whose coefficients are products
+    of a number of [u x] and one of `turned`. The normal equations are therefore sums over windows
+    of products of ``[u x].T [u x]``, which is the same for all delays, with ``turned turned.T``.
     """
 
-    def __init__(
-        self,
-        gyroscope: SensorStream,
-        time: np.ndarray,
-        *,
-        start: np.ndarray,
-        stop: np.ndarray,
-        middle: np.ndarray,
-        change: np.ndarray,
-    ):
+    def __init__(self, gyroscope: SensorStream, time: np.ndarray, windows: _GravityWindows):
+        # Times of the gyroscope, s, and integral of its rates up to them, rad, shape (n, 3).
         self._time = time
-        self._start = start
-        self._stop = stop
         steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
         self._theta = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        lever = skew(middle)
-        squared = np.einsum('nij,nik->njk', lever, lever).reshape(-1, 9)
-        applied = np.einsum('nij,ni->nj', lever, change)
-        # Sums over the parts are products with the windows of one part after another.
-        first = np.arange(DELAY_PARTS + 1) * len(start) // DELAY_PARTS
-        self._parts = [slice(a, b) for a, b in zip(first[:-1], first[1:], strict=True)]
+        self._windows = windows
+
+        # Parts of the windows, in order. A sum over the windows of a part is a matrix product.
+        n_windows = len(windows.start)
+        bounds = np.arange(DELAY_PARTS + 1) * n_windows // DELAY_PARTS
+        self._parts = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        # Of each part: the 9 numbers of [u x].T [u x], the 3 of [u x].T change, and |change|^2.
+        cross = skew(windows.middle)
+        squared = np.einsum('nij,nik->njk', cross, cross).reshape(-1, 9)
+        applied = np.einsum('nij,ni->nj', cross, windows.change)
         self._squared = [squared[part].T for part in self._parts]
         self._applied = [applied[part].T for part in self._parts]
-        self._observed = np.array([np.sum(change[part] ** 2) for part in self._parts])
+        self._observed = np.array([np.sum(windows.change[part] ** 2) for part in self._parts])
 
     def residual(self, delay: float) -> float:
         """Return the least sum of squares of all windows."""
         normal, applied, observed = (of_parts.sum(axis=0) for of_parts in self._equations(delay))
         return float(_least_squares_residual(normal, applied, observed))
 
-    def without_each_part(self, delay: float) -> np.ndarray:
-        """Return the least sums of squares of all windows, then without each part in turn."""
+    def residuals_without_parts(self, delay: float) -> np.ndarray:
+        """Return the least sums of squares of all windows, then without each part, (k + 1,)."""
         normal, applied, observed = self._equations(delay)
         return _least_squares_residual(
             _all_and_without_each(normal),
@@ -335,100 +383,91 @@ class _DelayCost:
 
     def _equations(self, delay: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return (N, b, y'y) of the normal equations of each part, (k, 12, 12), (k, 12), (k,)."""
-        turned = np.empty((len(self._start), 4))
+        start, stop = self._windows.start, self._windows.stop
+        turned = np.empty((len(start), 4))
         for axis in range(3):
-            turned[:, axis] = np.interp(self._stop + delay, self._time, self._theta[:, axis])
-            turned[:, axis] -= np.interp(self._start + delay, self._time, self._theta[:, axis])
-        turned[:, 3] = self._stop - self._start
+            turned[:, axis] = np.interp(stop + delay, self._time, self._theta[:, axis])
+            turned[:, axis] -= np.interp(start + delay, self._time, self._theta[:, axis])
+        turned[:, 3] = stop - start
         products = (turned[:, :, None] * turned[:, None, :]).reshape(-1, 16)
         normal = np.empty((DELAY_PARTS, 12, 12))
         applied = np.empty((DELAY_PARTS, 12))
         for number, part in enumerate(self._parts):
+            # Unknown 4 j + l is the number (j, l) of (A, b): N[(j, l), (k, m)].
             blocks = (self._squared[number] @ products[part]).reshape(3, 3, 4, 4)
             normal[number] = blocks.transpose(0, 2, 1, 3).reshape(12, 12)
             applied[number] = (self._applied[number] @ turned[part]).reshape(12)
         return normal, applied, self._observed
 
 
-def _all_and_without_each(of_parts):
+def _all_and_without_each(of_parts: np.ndarray) -> np.ndarray:
     """Return the sum over the parts, then without each part in turn, shape (k + 1, ...)."""
     total = of_parts.sum(axis=0)
     return np.concatenate([total[None], total - of_parts])
 
 
 @dataclass(frozen=True, eq=False)
-class _Directions:
-    """Eigenvectors of normal equations ``N x = b`` in unknowns of equal size."""
+class _EigenForm:
+    """
+    Normal equations ``N x = b`` along the eigenvectors of N, in unknowns of equal size.
+
+    Shapes: N (..., n, n), b (..., n). With ``z = x scale`` and an eigenvector v of the scaled N,
+    ``value (v . z) = v . (b / scale)``.
+    """
 
     scale: np.ndarray
     """Square roots of the diagonal of N, shape (..., n)."""
     vectors: np.ndarray
     """Eigenvectors in the columns, shape (..., n, n)."""
-    along: np.ndarray
-    """Component of ``b / scale`` along each, shape (..., n)."""
-    determined: np.ndarray
-    """Whether the windows determine it."""
     values: np.ndarray
-    """Its eigenvalue; 1 where it is not determined."""
+    """Eigenvalues, 1 where the windows do not determine the direction, shape (..., n)."""
+    determined: np.ndarray
+    """Whether they determine it, bool, shape (..., n)."""
+    right_side: np.ndarray
+    """Components of ``b / scale`` along the eigenvectors, shape (..., n)."""
 
     @classmethod
-    def of(cls, normal: np.ndarray, applied: np.ndarray) -> '_Directions':
-        """Return those of equations of shapes (..., n, n), (..., n)."""
+    def of(cls, normal: np.ndarray, applied: np.ndarray) -> '_EigenForm':
+        """Return the form of equations with N and b."""
         diagonal = np.diagonal(normal, axis1=-2, axis2=-1)
         scale = np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(normal / (scale[..., :, None] * scale[..., None, :]))
-        along = np.einsum('...ij,...i->...j', vectors, applied / scale)
+        right_side = np.einsum('...ij,...i->...j', vectors, applied / scale)
         determined = values > MIN_EIGENVALUE
-        return cls(scale, vectors, along, determined, np.where(determined, values, 1.0))
+        return cls(scale, vectors, np.where(determined, values, 1.0), determined, right_side)
 
 
-def _least_squares(normal, applied):
-    """Return the solution of ``N x = b``, zero along what the windows do not determine."""
-    found = _Directions.of(normal, applied)
-    length = np.where(found.determined, found.along / found.values, 0.0)
-    return np.einsum('...ij,...j->...i', found.vectors, length) / found.scale
+def _least_squares(normal: np.ndarray, applied: np.ndarray) -> np.ndarray:
+    """Return the solution of ``N x = b``, zero along directions that are not determined."""
+    form = _EigenForm.of(normal, applied)
+    components = np.where(form.determined, form.right_side / form.values, 0.0)
+    return np.einsum('...ij,...j->...i', form.vectors, components) / form.scale
 
 
-def _least_squares_residual(normal, applied, observed):
+def _least_squares_residual(
+    normal: np.ndarray, applied: np.ndarray, observed: np.ndarray
+) -> np.ndarray:
     """
-    Return ``y.T y - b.T N^-1 b`` of normal equations ``N x = b``, shapes (..., n, n), (..., n).
+    Return ``y.T y - b.T N^-1 b`` of normal equations ``N x = b``, without undetermined directions.
 
-    Directions that the windows do not determine are left out.
+    Shapes of N, b and ``y.T y``: (..., n, n), (..., n), (...).
     """
-    found = _Directions.of(normal, applied)
-    explained = np.where(found.determined, found.along**2 / found.values, 0.0)
+    form = _EigenForm.of(normal, applied)
+    explained = np.where(form.determined, form.right_side**2 / form.values, 0.0)
     return observed - explained.sum(axis=-1)
 
 
-def _least_place(places: np.ndarray, costs: np.ndarray) -> float:
-    """Return the place of the least cost: the vertex of the parabola through its neighbours."""
+def _minimum_of_parabola(delays: np.ndarray, costs: np.ndarray) -> float:
+    """
+    Return the delay at the vertex of the parabola through the least cost and its neighbours.
+
+    It is limited to one step, and is the delay of the least cost without a positive curvature.
+    """
     least = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
-    before, here, after = costs[least - 1 : least + 2]
-    curvature = before - 2.0 * here + after
+    before, at_least, after = costs[least - 1 : least + 2]
+    curvature = before - 2.0 * at_least + after
     if curvature <= 0.0:
-        return float(places[int(np.argmin(costs))])
-    step = places[least] - places[least - 1]
-    return float(places[least] + np.clip(0.5 * (before - after) / curvature, -1.0, 1.0) * step)
-
-
-def _windows(accelerometer):
-    """Return (start, end, direction in the middle, change of the direction) of windows, or None."""
-    if len(accelerometer.stamp_ns) < 20:
-        return None
-    time = (accelerometer.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
-    half = max(int(round(0.5 * DELAY_WINDOW / (accelerometer.period_ns * 1e-9))), 1)
-    length = np.linalg.norm(accelerometer.values, axis=1)
-    usual = np.median(length)
-    if not usual > 0.0 or len(time) < 4 * half:
-        return None
-    direction = unit_rows(np.where((length > 0.1 * usual)[:, None], accelerometer.values, 1.0))
-    start = np.arange(0, len(time) - 2 * half, half)
-    middle = half
-    begin = start
-    centre = start + middle
-    end = start + 2 * half
-    whole = time[end] - time[begin] < 2.0 * DELAY_WINDOW + 4e-9 * accelerometer.period_ns
-    begin = begin[whole]
-    centre = centre[whole]
-    end = end[whole]
-    return time[begin], time[end], direction[centre], direction[end] - direction[begin]
+        return float(delays[int(np.argmin(costs))])
+    step = delays[least] - delays[least - 1]
+    n_steps = np.clip(0.5 * (before - after) / curvature, -1.0, 1.0)
+    return float(delays[least] + n_steps * step)
