@@ -23,49 +23,54 @@ class SensorPresence:
     """
     Finds which sensors an IMU stream has, independent of its division into pieces.
 
-    The first samples are held until both sensors have a finite reading, or one of them counts as
-    absent. A message states absence by a covariance of -1, a text log by missing columns; both are
+    The first samples are buffered until both sensors have a finite reading, or one is absent.
+    A message states absence by a covariance of -1, a text log by missing columns; both are
     NaN in the samples.
     """
 
     def __init__(self) -> None:
         self.absent: tuple[str, ...] = ()
+        """The sensor that counts as absent."""
         self.n_late = 0
+        """Samples with a reading of the absent sensor, which is not used."""
+        # Whether it is known which sensors exist, and the samples that were received before.
         self._decided = False
-        self._held: ImuSamples | None = None
+        self._first: ImuSamples | None = None
 
     def push(self, samples: ImuSamples) -> ImuSamples:
         """Return the samples that can be processed, none while it is not known which exist."""
         if self._decided:
             return self._without_absent(samples)
-        if self._held is not None:
-            samples = ImuSamples.concatenate([self._held, samples])
+        if self._first is not None:
+            samples = ImuSamples.concatenate([self._first, samples])
         missing = missing_sensors(samples.select(slice(MIN_ABSENT_SAMPLES)))
         if missing and len(samples) < MIN_ABSENT_SAMPLES:
-            self._held = samples
+            self._first = samples
             return samples.select(slice(0))
         return self._decide(missing, samples)
 
     def finish(self) -> ImuSamples | None:
-        """Return the samples that were held, or None."""
-        if self._held is None:
+        """Return the buffered samples, or None."""
+        if self._first is None:
             return None
-        return self._decide(missing_sensors(self._held), self._held)
+        return self._decide(missing_sensors(self._first), self._first)
 
-    def _decide(self, missing, samples):
-        self._decided, self._held = True, None
+    def _decide(self, missing: tuple[str, ...], samples: ImuSamples) -> ImuSamples:
+        """Decide by the sensors that are missing in the first samples, and return these."""
+        self._decided = True
+        self._first = None
         # Without a reading of either sensor the samples are not finite, and none is absent.
         if len(missing) == 1:
             self.absent = missing
         return self._without_absent(samples)
 
-    def _without_absent(self, samples):
+    def _without_absent(self, samples: ImuSamples) -> ImuSamples:
         """Return samples with placeholders for the readings of the absent sensor."""
         if not self.absent:
             return samples
         sensor = self.absent[0]
-        own = samples.force_s if sensor == 'accelerometer' else samples.rate_s
-        self.n_late += int(np.count_nonzero(np.isfinite(own).all(axis=1)))
+        readings = samples.force_s if sensor == 'accelerometer' else samples.rate_s
+        self.n_late += int(np.count_nonzero(np.isfinite(readings).all(axis=1)))
         return without_sensor(samples, sensor)
 
 

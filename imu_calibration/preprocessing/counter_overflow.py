@@ -1,4 +1,4 @@
-"""Stamps from a counter that overflows: the steps back are undone."""
+"""Stamps from a counter that overflows: the steps back are removed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ SIZES_NS = sizes_of_counters(TICKS_NS)
 LOST_PERIODS = 5
 """An overflow may coincide with the loss of so many samples."""
 PERIOD_STEPS = 20
-"""The period is the median of the first steps forward; before, no overflow is undone."""
+"""The period is the median of the first steps forward; before, no overflow is removed."""
 LONGEST_GAP_NS, GAP_SHARE = 60_000_000_000, 0.02
 """
 Longest gap that an overflow may coincide with where the counter is known, ns and as a share of its
@@ -42,7 +42,7 @@ class CounterStamps:
     stamp_ns: np.ndarray
     """ns, int64, shape (n,)."""
     n_overflows: int
-    """Overflows that are undone."""
+    """Number of overflows that were removed."""
     size_ns: int
     """
     Size of the counter, ns; 0 where it does not overflow. A gap may be longer by multiples of it.
@@ -69,7 +69,7 @@ def overflow_size(step_ns: int, period_ns: float, sizes_ns: Sequence[int] = SIZE
 
 
 class OverflowSearch:
-    """Undoes overflows in the stamps of one stream; the division into pieces has no influence."""
+    """Removes overflows of the stamps of one stream; its division into pieces has no influence."""
 
     def __init__(self, tick_ns: float = 1.0) -> None:
         self.sizes_ns = sizes_of_counters((*TICKS_NS, tick_ns))
@@ -78,11 +78,13 @@ class OverflowSearch:
         """Overflows until now."""
         self.size_ns = 0
         """Size of the counter, ns; 0 before the first overflow."""
+        # Sum of the sizes of all overflows, which is added to later stamps.
         self._shift_ns = 0
+        # Last returned stamp, and the first steps forward, up to `PERIOD_STEPS`, ns.
         self._last: int | None = None
         self._first_steps = np.zeros(0, np.int64)
 
-    def undone(self, stamp_ns: np.ndarray) -> np.ndarray:
+    def removed(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return the next stamps without overflows, ns, shape (n,)."""
         stamps = stamp_ns + self._shift_ns
         first = stamps[0] if self._last is None else self._last
@@ -132,8 +134,10 @@ def without_overflows(
         its end to its beginning.
 
     """
+    # 1. Overflows of counters of known sizes.
     search = OverflowSearch(tick_ns)
-    stamps = search.undone(stamp_ns)
+    stamps = search.removed(stamp_ns)
+    # 2. Overflows in gaps, with the size found in step 1 or with the readings of the counter.
     if search.count >= LEAST_EQUAL_STEPS:
         # A gap of nearly the size of the counter leaves a small step back. After a late sample the
         # stamps return, after an overflow they continue from there.
@@ -148,9 +152,12 @@ def without_overflows(
     elif counter_ns is not None:
         for place in np.flatnonzero(np.diff(stamps) < -LEAST_STEP_NS):
             size = _size_in_gap(counter_ns[place], counter_ns[place + 1], search.sizes_ns)
-            stamps[place + 1 :] += size
-            search.count += bool(size)
-            search.size_ns = size or search.size_ns
+            if size:
+                stamps[place + 1 :] += size
+                search.count += 1
+                search.size_ns = size
+
+    # 3. A counter of another size: all remaining steps back are equal and begin at its end.
     steps = np.diff(stamps)
     forward = steps[steps > 0]
     back = np.flatnonzero(steps < -LEAST_STEP_NS)
@@ -159,17 +166,16 @@ def without_overflows(
     period = np.median(forward)
     sizes = period - steps[back]
     size = np.median(sizes)
-    equal = np.abs(sizes - size) < LOST_PERIODS * period
-    # a counter always steps back from its end
-    whole = np.abs(np.diff(stamps[back])) < LOST_PERIODS * period
-    if not equal.all() or not whole.all():
+    has_one_size = np.abs(sizes - size) < LOST_PERIODS * period
+    has_one_end = np.abs(np.diff(stamps[back])) < LOST_PERIODS * period
+    if not has_one_size.all() or not has_one_end.all():
         return CounterStamps(stamps, search.count, search.size_ns)
     shift = np.zeros(len(stamps), np.int64)
     shift[back + 1] = np.round(sizes).astype(np.int64)
     return CounterStamps(stamps + np.cumsum(shift), search.count + len(back), round(float(size)))
 
 
-def _size_in_gap(before_ns, after_ns, sizes_ns):
+def _size_in_gap(before_ns: int, after_ns: int, sizes_ns: Sequence[int]) -> int:
     """Return the size of the counter that overflows between two of its readings; 0 for none."""
     for size in sizes_ns:
         longest_gap = min(LONGEST_GAP_NS, GAP_SHARE * size)

@@ -46,8 +46,8 @@ class StreamCheck:
     Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is
     kept), 'backward stamp' (a late sample), 'stray stamp' (one sample far from both neighbours), of
     an IMU also 'zero' (`zero_filter`) and 'spike' (`spike_filter`). 'clock reset' counts the jumps,
-    each of which starts a new epoch; an overflow of the counter from which stamps are made is
-    undone. Where the stamps of an IMU follow a clock only loosely (packets, times of arrival,
+    each of which starts a new epoch; overflows of the counter from which stamps are made are
+    removed. Where the stamps of an IMU follow a clock only loosely (packets, times of arrival,
     milliseconds, jitter), the times of its samples are computed first (see `sample_times`).
 
     Parameters
@@ -60,21 +60,32 @@ class StreamCheck:
 
     def __init__(self, *, one_sensor: bool = False) -> None:
         self.counts = Counter()
+        """Reason -> number of samples dropped; 'clock reset' -> number of jumps."""
         self.presence = SensorPresence() if one_sensor else None
-        """Which sensors an IMU stream has."""
-        self._unread = set(SENSORS)
+        """Which sensors an IMU stream has; None where both are required."""
         self.sources = TwoSourceSearch()
         """Whether an IMU stream holds the readings of two sensors."""
         self.epoch = 0
-        self._overflows = OverflowSearch()
+        """Number of clock resets so far."""
+        # Sensors that are missing in all pieces with samples that are not finite.
+        self._unread = set(SENSORS)
+
+        # Statistics of the accepted samples: their number, the time from the first to the last one
+        # summed over the epochs, the smallest and the largest stamp.
         self._steps = StepHistogram()
         self._n_accepted = 0
         self._span_ns = 0
-        self._extent_ns = NEVER_NS, -NEVER_NS
-        self._newest = None
-        self._before_held = None
-        self._held = None
-        self._newest_raw = None
+        self._first_ns = NEVER_NS
+        self._last_ns = -NEVER_NS
+
+        # Stray stamps: the newest sample, while it may be one, and the stamp before it.
+        self._undecided: Any = None
+        self._stamp_before_ns: int | None = None
+        # Largest stamp of this epoch as recorded, and after the times were computed.
+        self._newest_recorded_ns: int | None = None
+        self._newest_ns: int | None = None
+
+        self._overflows = OverflowSearch()
         self._times: SampleTimes | None = None
         self._wraps = WrapFilter()
         self._spikes = SpikeFilter()
@@ -102,8 +113,8 @@ class StreamCheck:
             samples = self.presence.push(samples)
         return self._checked(samples)
 
-    def _checked(self, samples):
-        """Return the accepted samples of a piece with known sensors, as `push` does."""
+    def _checked(self, samples: Any) -> list[tuple[int, Any]]:
+        """Return the accepted samples of a piece whose sensors are known, as `push` does."""
         if not len(samples):
             return []
         samples = self._finite(samples)
@@ -112,20 +123,24 @@ class StreamCheck:
             samples = self._zeros.push(samples)
             self._count('zero', self._zeros.n_dropped - n_before)
         if len(samples):
-            samples = replace(samples, stamp_ns=self._overflows.undone(samples.stamp_ns))
+            samples = replace(samples, stamp_ns=self._overflows.removed(samples.stamp_ns))
         if isinstance(samples, ImuSamples):
             self.sources.push(samples)
         return self._without_spikes(self._accept(self._without_strays(samples)))
 
     def finish(self) -> list[tuple[int, Any]]:
         """Return the buffered samples, as `push` does."""
-        waiting = None if self.presence is None else self.presence.finish()
-        accepted = [] if waiting is None else self._checked(waiting)
+        accepted = []
+        buffered = None if self.presence is None else self.presence.finish()
+        if buffered is not None:
+            accepted += self._checked(buffered)
         self._count('zero', self._zeros.finish())
-        held, self._held = self._held, None
-        return accepted + self._without_spikes(
-            ([] if held is None else self._accept(held)) + self._end_epoch(), ended=True
-        )
+        last = []
+        if self._undecided is not None:
+            last += self._accept(self._undecided)
+            self._undecided = None
+        last += self._end_epoch()
+        return accepted + self._without_spikes(last, ended=True)
 
     def statistics(self, gap: float = 0.1) -> 'StreamStatistics':
         """
@@ -137,13 +152,20 @@ class StreamCheck:
             Steps longer than this, and than five median periods, are counted as gaps, s.
 
         """
+        steps = self._steps.summary(gap)
         return StreamStatistics(
-            self._n_accepted,
-            dict(self.counts),
-            self._span_ns / 1e9,
-            *self._steps.summary(gap),
-            *self._extent_ns,
-            None if self._times is None else self._times.odd_line(self._n_accepted),
+            count=self._n_accepted,
+            dropped=dict(self.counts),
+            duration=self._span_ns / 1e9,
+            period=steps.period,
+            stamp_step_ns=steps.common_step_ns,
+            n_gaps=steps.n_gaps,
+            gap_total=steps.gap_total,
+            longest_step=steps.longest,
+            irregular=steps.irregular,
+            first_ns=self._first_ns,
+            last_ns=self._last_ns,
+            stamping=None if self._times is None else self._times.odd_line(self._n_accepted),
             two_sources=self.sources.requirement if self.sources.found else '',
             absent=self._absent(),
             n_late=0 if self.presence is None else self.presence.n_late,
@@ -151,7 +173,7 @@ class StreamCheck:
             counter_size_ns=self._overflows.size_ns,
         )
 
-    def _absent(self):
+    def _absent(self) -> tuple[str, ...]:
         """Return the sensor without any reading; an accepted sample has readings of both."""
         if self.presence is not None:
             return self.presence.absent
@@ -159,8 +181,14 @@ class StreamCheck:
             return ()
         return tuple(self._unread)
 
-    def _without_spikes(self, accepted, ended=False):
-        """Pass the samples of an IMU through the filter; each epoch of the clock is one stream."""
+    def _without_spikes(
+        self, accepted: list[tuple[int, Any]], ended: bool = False
+    ) -> list[tuple[int, Any]]:
+        """
+        Return (epoch, samples) that pass the filters of an IMU, and count the dropped samples.
+
+        Each epoch of the clock is one stream; with `ended` also the buffered samples are returned.
+        """
         passed = []
         for epoch, samples in accepted:
             if not isinstance(samples, ImuSamples):
@@ -178,7 +206,8 @@ class StreamCheck:
     def _count(self, reason, number):
         self.counts += Counter({reason: int(number)})  # without zeros
 
-    def _finite(self, samples):
+    def _finite(self, samples: Any) -> Any:
+        """Return the samples with finite readings."""
         columns = [
             getattr(samples, name).reshape(len(samples), -1) for name in _NEEDED[type(samples)]
         ]
@@ -190,93 +219,105 @@ class StreamCheck:
         self._count('not finite', len(finite) - np.count_nonzero(finite))
         return samples.select(finite)
 
-    def _without_strays(self, samples):
-        if self._held is not None:
-            samples, self._held = type(samples).concatenate([self._held, samples]), None
+    def _without_strays(self, samples: Any) -> Any:
+        """
+        Return samples without stray stamps, which are far from both neighbours.
+
+        The neighbours are closer to each other than to the stray; after a reset of the clock they
+        are not. A last sample far from the one before is buffered until the next one is received.
+        """
+        if self._undecided is not None:
+            samples = type(samples).concatenate([self._undecided, samples])
+            self._undecided = None
         if not len(samples):
             return samples
-        started = self._before_held is not None
-        stamps = (
-            np.concatenate([[self._before_held], samples.stamp_ns]) if started else samples.stamp_ns
-        )
+        stamps = samples.stamp_ns
+        if self._stamp_before_ns is not None:
+            stamps = np.concatenate([[self._stamp_before_ns], stamps])
         step = np.diff(stamps)
-        far = np.abs(step) > BACKWARD_RESET_NS
+        size = np.abs(step)
+        is_far = size > BACKWARD_RESET_NS
+        step_of_neighbours = np.abs(step[:-1] + step[1:])
+
         stray = np.zeros(len(stamps), bool)
-        stray[1:-1] = (
-            far[:-1]
-            & far[1:]
-            & (np.abs(step[:-1] + step[1:]) < np.minimum(np.abs(step[:-1]), np.abs(step[1:])))
-        )
-        if not started and len(step):
+        stray[1:-1] = is_far[:-1] & is_far[1:]
+        stray[1:-1] &= step_of_neighbours < np.minimum(size[:-1], size[1:])
+        if self._stamp_before_ns is not None:
+            stray = stray[1:]
+        elif len(step):
+            # The first sample of the stream has one neighbour only.
             stray[0] = _is_reset(step[0])
-        stray = stray[started:]
-        undecided = far[-1] if len(step) else True
-        if undecided:
-            self._held = samples.select(slice(len(samples) - 1, None))
-            samples = samples.select(slice(0, len(samples) - 1))
+
+        if not len(step) or is_far[-1]:
+            n_decided = len(samples) - 1
+            self._undecided = samples.select(slice(n_decided, None))
+            samples = samples.select(slice(0, n_decided))
             stray = stray[:-1]
         if len(samples):
-            self._before_held = samples.stamp_ns[-1]
+            self._stamp_before_ns = samples.stamp_ns[-1]
         self._count('stray stamp', np.count_nonzero(stray))
         return samples.select(~stray) if stray.any() else samples
 
-    def _accept(self, samples):
+    def _accept(self, samples: Any) -> list[tuple[int, Any]]:
+        """Return the (epoch, samples) in order with their times; a reset begins an epoch."""
         if self._times is None and isinstance(samples, ImuSamples):
             self._times = SampleTimes()
         accepted = []
         while len(samples):
+            # The samples up to the first reset of the clock are of this epoch.
             stamps = samples.stamp_ns
-            before = _newest_before(stamps, self._newest_raw)
-            reset = _is_reset(stamps - before)
-            end = int(np.argmax(reset)) if reset.any() else len(stamps)
+            newest_before = _newest_before(stamps, self._newest_recorded_ns)
+            is_reset = _is_reset(stamps - newest_before)
+            end = int(np.argmax(is_reset)) if is_reset.any() else len(stamps)
             if end:
-                self._newest_raw = max(before[end - 1], stamps[end - 1])
+                self._newest_recorded_ns = max(newest_before[end - 1], stamps[end - 1])
                 accepted += self._in_order(self._timed(samples.select(slice(0, end))))
             if end < len(stamps):
                 accepted += self._end_epoch()
                 self._count('clock reset', 1)
                 self.epoch += 1
-                self._newest = None
-                self._newest_raw = None
+                self._newest_ns = None
+                self._newest_recorded_ns = None
             samples = samples.select(slice(end, None))
         return accepted
 
-    def _timed(self, samples):
+    def _timed(self, samples: Any) -> Any:
+        """Return the samples whose times are determined now, None for none."""
         if self._times is None:
             return samples
-        repeated = self._times.n_repeated
+        n_before = self._times.n_repeated
         samples = self._times.push(samples)
-        self._count('repeated stamp', self._times.n_repeated - repeated)
+        self._count('repeated stamp', self._times.n_repeated - n_before)
         return samples
 
-    def _end_epoch(self):
+    def _end_epoch(self) -> list[tuple[int, Any]]:
+        """Return the (epoch, samples) whose times were not determined before."""
         return [] if self._times is None else self._in_order(self._times.finish())
 
-    def _in_order(self, samples):
+    def _in_order(self, samples: Any) -> list[tuple[int, Any]]:
         """Return [(epoch, samples)] without repeated and backward stamps, [] for none."""
         if samples is None or not len(samples):
             return []
         stamps = samples.stamp_ns
-        before = _newest_before(stamps, self._newest)
-        self._count('repeated stamp', np.count_nonzero(stamps == before))
-        self._count('backward stamp', np.count_nonzero(stamps < before))
-        keep = stamps > before
-        samples = samples if keep.all() else samples.select(keep)
+        newest_before = _newest_before(stamps, self._newest_ns)
+        self._count('repeated stamp', np.count_nonzero(stamps == newest_before))
+        self._count('backward stamp', np.count_nonzero(stamps < newest_before))
+        is_later = stamps > newest_before
+        samples = samples if is_later.all() else samples.select(is_later)
         if len(samples):
-            joined = (
-                samples.stamp_ns
-                if self._newest is None
-                else np.concatenate([[self._newest], samples.stamp_ns])
-            )
-            self._steps.add(np.diff(joined))
-            self._span_ns += int(joined[-1] - joined[0])
-            self._extent_ns = (
-                min(self._extent_ns[0], int(samples.stamp_ns[0])),
-                max(self._extent_ns[1], int(samples.stamp_ns[-1])),
-            )
-            self._newest = joined[-1]
-            self._n_accepted += len(samples)
+            self._add_statistics(samples.stamp_ns)
         return [(self.epoch, samples)]
+
+    def _add_statistics(self, stamps: np.ndarray) -> None:
+        """Add accepted stamps, increasing, ns, to the statistics of the stream."""
+        self._n_accepted += len(stamps)
+        self._first_ns = min(self._first_ns, int(stamps[0]))
+        self._last_ns = max(self._last_ns, int(stamps[-1]))
+        if self._newest_ns is not None:
+            stamps = np.concatenate([[self._newest_ns], stamps])
+        self._steps.add(np.diff(stamps))
+        self._span_ns += int(stamps[-1] - stamps[0])
+        self._newest_ns = stamps[-1]
 
 
 class ImuFilter(Protocol):
@@ -294,6 +335,7 @@ class EpochFilters:
 
     def __init__(self, *filters: ImuFilter) -> None:
         self._filters = filters
+        # Epoch of the samples in the filters.
         self._epoch = 0
 
     def push(self, epoch: int, samples: ImuSamples) -> list[tuple[int, ImuSamples]]:
@@ -308,13 +350,14 @@ class EpochFilters:
     def finish(self) -> list[tuple[int, ImuSamples]]:
         """Return the buffered (epoch, samples)."""
         passed = []
+        # The buffered samples of a filter pass through the later filters, before these end.
         for number, imu_filter in enumerate(self._filters):
             passed += self._through(self._filters[number + 1 :], imu_filter.finish())
         return [(self._epoch, part) for part in passed]
 
     @staticmethod
-    def _through(filters, parts):
-        """Return the samples that pass all of some filters."""
+    def _through(filters: Sequence[ImuFilter], parts: list[ImuSamples]) -> list[ImuSamples]:
+        """Return the samples that pass all given filters, in their order."""
         for imu_filter in filters:
             passed = []
             for part in parts:
@@ -329,7 +372,8 @@ def _newest_before(stamps: np.ndarray, newest: int | None) -> np.ndarray:
     return np.maximum.accumulate(np.concatenate([[first], stamps]))[:-1]
 
 
-def _is_reset(step):
+def _is_reset(step: np.ndarray) -> np.ndarray:
+    """Return which steps of stamps, ns, are resets of the clock."""
     return (step < -BACKWARD_RESET_NS) | (step > FORWARD_RESET_NS)
 
 
@@ -372,7 +416,7 @@ class StreamStatistics:
     n_late: int = 0
     """Samples with readings of a sensor that had none at first; they are not used."""
     overflows: int = 0
-    """Overflows of the counter from which the stamps are made; they are undone."""
+    """Overflows of the counter from which the stamps are made; the stamps are without them."""
     counter_size_ns: int = 0
     """Size of that counter, ns; 0 where it does not overflow."""
 
@@ -389,15 +433,31 @@ class StreamStatistics:
 
 
 _BINS_PER_E = 100
-
-
+"""Bins of the histogram of steps per factor e: each is one per cent wide."""
 _N_BINS = 4500
-"""One per cent wide, up to the longest step that 64 bits of nanoseconds hold."""
-
-
+"""They reach to the longest step that 64 bits of nanoseconds hold."""
 _FINE_STEP_NS = 100
+"""A common divisor of the steps of at most this is not refined: the stamps are not rounded."""
 MAX_STEP_DEVIATION = 0.1
 """Steps farther than this share from the median count as irregular."""
+
+
+@dataclass(frozen=True)
+class StepSummary:
+    """Statistics of the steps between stamps; fields as in `StreamStatistics`."""
+
+    period: float
+    """Median step, s."""
+    common_step_ns: int
+    """Greatest common divisor, ns; 0 when unknown."""
+    n_gaps: int
+    """Number of gaps."""
+    gap_total: float
+    """Their total length, s."""
+    longest: float
+    """Longest step, s."""
+    irregular: float
+    """Share of the steps that are off the median by more than a tenth."""
 
 
 class StepHistogram:
@@ -409,6 +469,8 @@ class StepHistogram:
 
     def __init__(self) -> None:
         self.common_step_ns = 0
+        """Greatest common divisor of the steps, while it is not fine, ns; 0 before the first."""
+        # Of each bin: number of steps, and their sum.
         self._number = np.zeros(_N_BINS, np.int64)
         self._sum_ns = np.zeros(_N_BINS, np.int64)
         self._longest_ns = 0
@@ -424,27 +486,25 @@ class StepHistogram:
         if self.common_step_ns == 0 or self.common_step_ns > _FINE_STEP_NS:
             self.common_step_ns = int(np.gcd(self.common_step_ns, np.gcd.reduce(step_ns)))
 
-    def summary(self, gap: float) -> tuple[float, int, int, float, float, float]:
+    def summary(self, gap: float) -> StepSummary:
         """
-        Return the fields of `StreamStatistics` from `period` to `irregular`.
+        Return the statistics; gaps are longer than `gap` s and than five median steps.
 
         The median is exact to one per cent, and exactly when the steps are equal; all steps of a
         bin count alike.
         """
-        mean = self._sum_ns / np.maximum(self._number, 1)
+        mean_ns = self._sum_ns / np.maximum(self._number, 1)
         total = int(self._number.sum())
-        median = mean[np.searchsorted(np.cumsum(self._number), (total + 1) // 2)]
-        longer = mean > max(gap * 1e9, 5 * median)
-        irregular = self._number[np.abs(mean - median) > MAX_STEP_DEVIATION * median].sum() / max(
-            total, 1
-        )
-        return (
-            float(median / 1e9),
-            self.common_step_ns,
-            int(self._number[longer].sum()),
-            float(self._sum_ns[longer].sum() / 1e9),
-            self._longest_ns / 1e9,
-            float(irregular),
+        median_ns = mean_ns[np.searchsorted(np.cumsum(self._number), (total + 1) // 2)]
+        is_gap = mean_ns > max(gap * 1e9, 5 * median_ns)
+        is_irregular = np.abs(mean_ns - median_ns) > MAX_STEP_DEVIATION * median_ns
+        return StepSummary(
+            period=float(median_ns / 1e9),
+            common_step_ns=self.common_step_ns,
+            n_gaps=int(self._number[is_gap].sum()),
+            gap_total=float(self._sum_ns[is_gap].sum() / 1e9),
+            longest=self._longest_ns / 1e9,
+            irregular=float(self._number[is_irregular].sum() / max(total, 1)),
         )
 
 
@@ -482,7 +542,7 @@ def outside(ranges: np.ndarray, place: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class CleanedBlock:
     """
-    Usable samples of one or several blocks: per stream (epoch of the clock, samples), ... in order.
+    Usable samples of one or several blocks: of each stream (epoch of the clock, samples), in order.
     """
 
     imu: Sequence[tuple[int, ImuSamples]] = ()
@@ -509,6 +569,7 @@ class ContinuedStamps:
 
     def __init__(self, pause_ns: int = RESET_PAUSE_NS):
         self._pause_ns = pause_ns
+        # Epoch and moved stamp of the last sample; None before the first.
         self._epoch = 0
         self._last_ns: int | None = None
         self.shift_ns = 0
@@ -573,12 +634,15 @@ class BlockCleaner:
         without: np.ndarray = NO_RANGES,
         unusable: Sequence[str] = (),
     ):
-        self._without, self._n_imu = without, 0
+        self._without = without
+        # Number of cleaned samples of the IMU until now, in which `without` counts.
+        self._n_imu = 0
         self._unusable = unusable
         self._names = tuple(joint_names)
         self._nominal = nominal
         self._watchers = watchers
         self._checks = {name: StreamCheck(one_sensor=one_sensor) for name in STREAMS}
+        # Samples that are not cleaned yet, and (epoch, samples) that are not returned yet.
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
         self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
         self.lost: Counter[str] = Counter()
@@ -593,7 +657,7 @@ class BlockCleaner:
 
     @property
     def n_buffered(self) -> int:
-        """Samples held at the moment."""
+        """Number of samples that were added and not returned."""
         n_buffered = 0
         for stream in STREAMS:
             n_buffered += sum(len(part) for _, part in self._ready[stream])
@@ -621,12 +685,11 @@ class BlockCleaner:
     def statistics(self, gap: float = 0.1) -> dict[str, StreamStatistics]:
         """Return stream name -> `StreamStatistics`; `gap` as for `StreamCheck.statistics`."""
         self._clean()
-        found = {}
+        statistics = {}
         for name, check in self._checks.items():
-            found[name] = replace(
-                check.statistics(gap), unstamped=self.notes.get(f'{MESSAGES[name]} zero stamp', 0)
-            )
-        return found
+            unstamped = self.notes.get(f'{MESSAGES[name]} zero stamp', 0)
+            statistics[name] = replace(check.statistics(gap), unstamped=unstamped)
+        return statistics
 
     @property
     def sources(self) -> TwoSourceSearch:
@@ -657,18 +720,20 @@ class BlockCleaner:
             if samples is not None and len(samples):
                 if name == 'imu' and self._nominal is not None:
                     samples = self._nominal.apply(samples)
-                self._raw[name].append(self._in_order(samples) if name == 'joints' else samples)
+                if name == 'joints':
+                    samples = self._in_requested_order(samples)
+                self._raw[name].append(samples)
         if self.n_buffered < CLEANING_BATCH:
             return CleanedBlock()
         self._clean()
-        return self._hand_on()
+        return self._take_ready()
 
     def finish(self) -> CleanedBlock:
         """Return the buffered samples; no block may be added after this."""
         self._clean()
         for name, check in self._checks.items():
             self._ready[name] += check.finish()
-        cleaned = self._hand_on()
+        cleaned = self._take_ready()
         for watcher in self._watchers:
             watcher.finish(self)
         return cleaned
@@ -680,6 +745,7 @@ class BlockCleaner:
         yield self.finish()
 
     def _clean(self) -> None:
+        """Clean the samples that were collected."""
         for name, parts in self._raw.items():
             if parts:
                 samples = parts[0]
@@ -688,14 +754,15 @@ class BlockCleaner:
                 self._ready[name] += self._checks[name].push(samples)
                 self._raw[name] = []
 
-    def _hand_on(self):
+    def _take_ready(self) -> CleanedBlock:
+        """Return the cleaned samples, without those to leave out, and pass them to the watchers."""
         filled = {}
         for name, parts in self._ready.items():
             filled[name] = [(epoch, part) for epoch, part in parts if len(part)]
         cleaned = CleanedBlock(**filled)
         self._ready = {name: [] for name in STREAMS}
         if len(self._without):
-            cleaned = replace(cleaned, imu=self._readings_only(cleaned.imu))
+            cleaned = replace(cleaned, imu=self._without_ranges(cleaned.imu))
         for sensor in self._unusable:
             parts = [(epoch, without_sensor(imu, sensor)) for epoch, imu in cleaned.imu]
             cleaned = replace(cleaned, imu=parts)
@@ -703,7 +770,9 @@ class BlockCleaner:
             watcher.push(cleaned)
         return cleaned
 
-    def _readings_only(self, parts):
+    def _without_ranges(
+        self, parts: Sequence[tuple[int, ImuSamples]]
+    ) -> list[tuple[int, ImuSamples]]:
         """Return the (epoch, samples) without the ranges to leave out."""
         kept_parts = []
         for epoch, imu in parts:
@@ -714,7 +783,8 @@ class BlockCleaner:
                 kept_parts.append((epoch, imu if kept.all() else imu.select(kept)))
         return kept_parts
 
-    def _in_order(self, joints):
+    def _in_requested_order(self, joints: JointSamples) -> JointSamples:
+        """Return joint samples with their columns in the requested order of names."""
         if not self._names or not joints.names or tuple(joints.names) == self._names:
             return joints
         missing = [name for name in self._names if name not in joints.names]

@@ -40,25 +40,31 @@ class TwoSourceSearch:
     """
 
     def __init__(self) -> None:
-        self.n_runs, self.n_double = 0, 0
-        self.n_steps, self.n_equal_stamps = 0, 0
-        self._rest: ImuSamples | None = None
+        self.n_runs = 0
+        """Runs of `RUN_SAMPLES` samples."""
+        self.n_double = 0
+        """Runs with two clusters."""
+        self.n_steps = 0
+        """Steps between stamps."""
+        self.n_equal_stamps = 0
+        """Steps of zero."""
+        # Samples that do not fill a run yet.
+        self._incomplete_run: ImuSamples | None = None
         self._last_stamp: int | None = None
 
     def push(self, samples: ImuSamples) -> None:
         """Process samples as they were received, with finite readings."""
         self._count_stamps(samples.stamp_ns)
-        if self._rest is not None:
-            samples = ImuSamples.concatenate([self._rest, samples])
+        if self._incomplete_run is not None:
+            samples = ImuSamples.concatenate([self._incomplete_run, samples])
         n_runs = len(samples) // RUN_SAMPLES
         used = n_runs * RUN_SAMPLES
-        self._rest = samples.select(slice(used, None))
+        self._incomplete_run = samples.select(slice(used, None))
         if n_runs:
             outputs = np.concatenate([samples.force_s[:used], samples.rate_s[:used]], axis=1)
+            is_double = two_clusters(outputs.reshape(n_runs, RUN_SAMPLES, 6))
             self.n_runs += n_runs
-            self.n_double += int(
-                np.count_nonzero(two_clusters(outputs.reshape(n_runs, RUN_SAMPLES, 6)))
-            )
+            self.n_double += int(np.count_nonzero(is_double))
 
     @property
     def found(self) -> bool:
@@ -90,7 +96,8 @@ class TwoSourceSearch:
         if self.found:
             raise InputError(self.requirement, code=CHECK, key=key)
 
-    def _count_stamps(self, stamp_ns):
+    def _count_stamps(self, stamp_ns: np.ndarray) -> None:
+        """Count the steps between stamps, and those of zero."""
         if self._last_stamp is not None:
             stamp_ns = np.concatenate([[self._last_stamp], stamp_ns])
         self.n_steps += max(len(stamp_ns) - 1, 0)

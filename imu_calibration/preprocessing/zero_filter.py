@@ -7,7 +7,7 @@ from imu_calibration.core.samples import ImuSamples, runs_of
 LONGEST_HELD_RUN_NS = 1_000_000_000
 """ns; longer runs pass and are found as a frozen sensor, with their time."""
 MOST_HELD = 10_000
-"""Samples of a run that are held, at most: stamps may stand still."""
+"""Samples of a run that are buffered, at most: stamps may be equal."""
 
 
 class ZeroFilter:
@@ -20,20 +20,23 @@ class ZeroFilter:
 
     def __init__(self) -> None:
         self.n_dropped = 0
+        """Samples dropped so far."""
+        # Whether the accelerometer has measured a force before.
         self._has_measured = False
-        self._held: ImuSamples | None = None
+        # Run of zeros at the end, which may become a long one, and whether a long one is open.
+        self._open_run: ImuSamples | None = None
         self._in_long_run = False
 
     def push(self, samples: ImuSamples) -> ImuSamples:
-        """Return the samples that pass; a run at the end is held until its length is known."""
-        if self._held is not None:
-            samples = ImuSamples.concatenate([self._held, samples])
-            self._held = None
-        pulls = np.asarray(samples.force_s.any(axis=1))
-        zero = np.asarray(~pulls & ~samples.rate_s.any(axis=1))
+        """Return the samples that pass; a run at the end waits until its length is known."""
+        if self._open_run is not None:
+            samples = ImuSamples.concatenate([self._open_run, samples])
+            self._open_run = None
+        has_force = np.asarray(samples.force_s.any(axis=1))
+        zero = np.asarray(~has_force & ~samples.rate_s.any(axis=1))
         if not self._has_measured:
             # Zeros at the beginning may be an accelerometer that is absent.
-            first = int(np.argmax(pulls)) if pulls.any() else len(samples)
+            first = int(np.argmax(has_force)) if has_force.any() else len(samples)
             zero[:first] = False
             self._has_measured = first < len(samples)
         if not zero.any():
@@ -51,14 +54,14 @@ class ZeroFilter:
                 continue
             kept[start:stop] = False
             if is_open:
-                self._held = samples.select(slice(start, stop))
+                self._open_run = samples.select(slice(start, stop))
             else:
                 self.n_dropped += stop - start
         return samples.select(kept)
 
     def finish(self) -> int:
         """Drop the run at the end of the stream; return its number of samples."""
-        n_held = 0 if self._held is None else len(self._held)
-        self.n_dropped += n_held
-        self._held = None
-        return n_held
+        n_open = 0 if self._open_run is None else len(self._open_run)
+        self.n_dropped += n_open
+        self._open_run = None
+        return n_open

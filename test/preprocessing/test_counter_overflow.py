@@ -37,7 +37,7 @@ def test_an_overflow_is_undone_whatever_the_pieces(bits, tick_ns):
     assert (np.diff(stamps) < 0).any()
     for cut in (len(stamps), 211):
         search = OverflowSearch()
-        parts = [search.undone(stamps[a : a + cut]) for a in range(0, len(stamps), cut)]
+        parts = [search.removed(stamps[a : a + cut]) for a in range(0, len(stamps), cut)]
         assert np.array_equal(np.diff(np.concatenate(parts)), np.diff(true))
         assert search.count == np.count_nonzero(np.diff(stamps) < 0)
 
@@ -45,7 +45,7 @@ def test_an_overflow_is_undone_whatever_the_pieces(bits, tick_ns):
 def test_other_steps_back_remain():
     stamps = regular()
     stamps[3000:] -= 17_300_000_000
-    assert np.array_equal(OverflowSearch().undone(stamps), stamps)
+    assert np.array_equal(OverflowSearch().removed(stamps), stamps)
     assert np.array_equal(without_overflows(stamps).stamp_ns, stamps)
 
 
