@@ -42,18 +42,38 @@ def believed_factor(missed: Callable[[float], float]) -> float:
         Factor -> typical angle by which gravity misses its direction after a turn, rad.
 
     """
-    as_it_is = missed(1.0)
-    if as_it_is < MIN_MISSED_ANGLE:
+    angle_of_one = missed(1.0)
+    if angle_of_one < MIN_MISSED_ANGLE:
         return 1.0
     angles = [missed(factor) for factor in FACTORS]
     best = int(np.argmin(angles))
-    return nearest_power(FACTORS[best]) if angles[best] < MAX_ANGLE_SHARE * as_it_is else 1.0
+    return nearest_power(FACTORS[best]) if angles[best] < MAX_ANGLE_SHARE * angle_of_one else 1.0
 
 
 def nearest_power(factor: float) -> float:
     """Return the power of two that a factor is within `NEAR_POWER` of, else the factor itself."""
     power = 2.0 ** np.round(np.log2(factor))
     return float(power if abs(factor / power - 1) < NEAR_POWER else factor)
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """Rotation from one rest to the next, as measured by the gyroscope."""
+
+    rotations: np.ndarray
+    """Mean rate minus bias, times the duration, of each chunk in between, rad, shape (n, 3)."""
+    before: np.ndarray
+    """Direction of the specific force at the first rest, shape (3,)."""
+    after: np.ndarray
+    """The same at the next rest."""
+
+    def missed_angle(self, factor: float) -> float:
+        """Return the angle from gravity to its prediction with rates divided by `factor`, rad."""
+        # Gravity turns the other way in the sensor's axes.
+        turned = self.before
+        for step in rotation(-(self.rotations / factor)):
+            turned = step @ turned
+        return np.arccos(np.clip(turned @ self.after, -1.0, 1.0))
 
 
 def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
@@ -69,44 +89,31 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
         return None
     centre = rest.sphere.centre if rest.sphere is not None else np.zeros(3)
     up = unit_rows(rest.force - centre)
-    whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
+    usual_duration = np.median(chunks.duration)
+    is_whole = _whole_chunks(chunks)
     turns = []
-    for first, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
+    for k, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
+        if stop <= start:
+            continue
         span = chunks.time[stop] - chunks.time[start - 1]
-        unbroken = whole[start:stop].all() and span < 1.5 * np.median(chunks.duration) * (
-            stop - start + 1
-        )
-        if (
-            stop > start
-            and unbroken
-            and span < MAX_TURN_SECONDS
-            and up[first] @ up[first + 1] < np.cos(LEAST_ANGLE)
-        ):
-            turns.append(
-                (
-                    (chunks.mean[start:stop, 3:] - rest.rate) * chunks.duration[start:stop, None],
-                    up[first],
-                    up[first + 1],
-                )
-            )
+        has_gap = span >= 1.5 * usual_duration * (stop - start + 1)
+        if has_gap or not is_whole[start:stop].all() or span >= MAX_TURN_SECONDS:
+            continue
+        if up[k] @ up[k + 1] < np.cos(LEAST_ANGLE):
+            rate = chunks.mean[start:stop, 3:] - rest.rate
+            rotations = rate * chunks.duration[start:stop, None]
+            turns.append(_Turn(rotations, up[k], up[k + 1]))
     if len(turns) < LEAST_TURNS:
         return None
     turns = turns[:: max(len(turns) // MOST_TURNS, 1)]
     return believed_factor(
-        lambda factor: float(
-            np.median(
-                [_missed(vectors / factor, before, after) for vectors, before, after in turns]
-            )
-        )
+        lambda factor: float(np.median([turn.missed_angle(factor) for turn in turns]))
     )
 
 
-def _missed(vectors, before, after):
-    # Gravity turns the other way in the sensor's axes.
-    turned = before
-    for step in rotation(-vectors):
-        turned = step @ turned
-    return np.arccos(np.clip(turned @ after, -1.0, 1.0))
+def _whole_chunks(chunks: Chunks) -> np.ndarray:
+    """Return which chunks have about the usual duration, and therefore no gap, bool, (n,)."""
+    return np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
 
 
 COUNTED_OUTPUTS = 24
@@ -126,9 +133,14 @@ class Extremes:
 
     def __init__(self) -> None:
         self.level = -np.inf
+        """Largest value so far."""
         self.count = 0
+        """Samples with this value."""
         self.n_jumps = 0
-        self._below, self._last = {}, np.inf
+        """Samples of these after a value that is smaller by more than `JUMP`."""
+        # Value -> samples, of the `COUNTED_OUTPUTS` largest values below the largest.
+        self._below: dict[float, int] = {}
+        self._last = np.inf
 
     def push(self, values: np.ndarray) -> None:
         """Process values, shape (n,)."""
@@ -140,16 +152,17 @@ class Extremes:
         if largest > self.level:
             if np.isfinite(self.level):
                 self._below[self.level] = self.count
-            self.level, self.count, self.n_jumps = float(largest), 0, 0
+            self.level = float(largest)
+            self.count = 0
+            self.n_jumps = 0
         near = values[values > NEAR_LARGEST_SHARE * self.level]
         below = near < self.level
         self.count += len(near) - int(np.count_nonzero(below))
         near = near[below]
         if largest == self.level:
             at = np.flatnonzero(values == largest)
-            self.n_jumps += int(
-                np.count_nonzero(np.where(at > 0, values[at - 1], before) < (1 - JUMP) * largest)
-            )
+            value_before = np.where(at > 0, values[at - 1], before)
+            self.n_jumps += int(np.count_nonzero(value_before < (1 - JUMP) * largest))
         if len(near) > MAX_NEAR_OUTPUTS:
             near = np.partition(near, len(near) - MAX_NEAR_OUTPUTS)[-MAX_NEAR_OUTPUTS:]
         for value, count in zip(*np.unique(near, return_counts=True)):
@@ -172,11 +185,10 @@ class Extremes:
 
         Their number must be far above that of neighbouring values.
         """
-        counts = [
-            count for value, count in self._below.items() if value > NEAR_LARGEST_SHARE * self.level
-        ][:10]
-        usual = sum(counts) / len(counts) if counts else 1.0
-        return self.count if self.count >= max(MIN_CLIPPED_SAMPLES, PILE * usual) else 0
+        near = [value for value in self._below if value > NEAR_LARGEST_SHARE * self.level]
+        counts = [self._below[value] for value in near[:10]]
+        mean_count = sum(counts) / len(counts) if counts else 1.0
+        return self.count if self.count >= max(MIN_CLIPPED_SAMPLES, PILE * mean_count) else 0
 
 
 LARGEST_TURN = 0.7
@@ -225,10 +237,9 @@ class Turning:
 
     @property
     def factor(self) -> float:
-        """True rate over measured rate: 1, or pi / 180 for deg/s."""
-        return float(
-            np.median(np.linalg.svd(self.matrix, compute_uv=False)[: round(np.trace(self.seen))])
-        )
+        """True rate over measured rate: 1, or pi / 180 for deg/s; median of the directions."""
+        n_directions = round(np.trace(self.seen))
+        return float(np.median(np.linalg.svd(self.matrix, compute_uv=False)[:n_directions]))
 
 
 def relate_turns(chunks: Chunks) -> Turning | None:
@@ -240,82 +251,99 @@ def relate_turns(chunks: Chunks) -> Turning | None:
     ``du/dt = u x (matrix @ rate + offset)`` for the direction u of specific force; no assumptions
     on units, axes or bias.
     """
-    pairs = _pairs(chunks)
+    pairs = _chunk_pairs(chunks)
     if pairs is None:
         return None
-    direction, change, turn_time, rate = pairs
-    spread, directions = np.linalg.eigh(rate.T @ rate / len(rate))
-    spread = np.sqrt(np.maximum(spread, 0.0))
-    if np.linalg.norm(change, axis=1).sum() < LEAST_TURN or not spread.max() > 0:
+    # Principal directions of the rates, and the rms rate along each.
+    rate = pairs.rate
+    variance, directions = np.linalg.eigh(rate.T @ rate / len(rate))
+    rms = np.sqrt(np.maximum(variance, 0.0))
+    if np.linalg.norm(pairs.change, axis=1).sum() < LEAST_TURN or not rms.max() > 0:
         return None
-    kept = spread > 1e-3 * spread.max()
-    while kept.any():
-        seen = directions[:, kept]
-        scale = spread[kept]
-        matrix, sure, explained = _fit(direction, change, turn_time, rate @ seen / scale)
-        if explained < LEAST_EXPLAINED:
+    used = rms > 1e-3 * rms.max()
+    while used.any():
+        seen = directions[:, used]
+        scale = rms[used]
+        fit = _fit(pairs, rate @ seen / scale)
+        if fit.explained < LEAST_EXPLAINED:
             return None
-        if sure.all():
-            return Turning(matrix / scale @ seen.T, seen @ seen.T)
+        if fit.determined.all():
+            return Turning(fit.matrix / scale @ seen.T, seen @ seen.T)
         # The direction with the smallest rates may be leakage of another direction, and then
         # degrades both.
-        kept = kept & (spread > spread[kept].min())
+        used = used & (rms > rms[used].min())
     return None
 
 
-def _fit(direction, change, turn_time, rate):
-    """Return (matrix (3, m), which of the m rates are sure, share explained) by least squares."""
-    lever = skew(direction) * turn_time[:, None, None]
-    inputs = np.column_stack([rate, np.ones(len(rate))])
-    width = inputs.shape[1]
-    design = (lever[:, :, :, None] * inputs[:, None, None, :]).reshape(-1, 3 * width)
-    target = change.ravel()
-    normal = design.T @ design
-    inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(3 * width))
-    solution = inverse @ (design.T @ target)
-    rest = float(((target - design @ solution) ** 2).sum())
-    sd = (
-        CHUNK_SD_FACTOR
-        * np.sqrt(np.diag(inverse) * rest / max(len(target) - 3 * width, 1)).reshape(3, width)[
-            :, :-1
-        ]
-    )
-    matrix = solution.reshape(3, width)[:, :-1]
-    return (
-        matrix,
-        np.linalg.norm(sd, axis=0) < DETERMINED_SD_SHARE * np.linalg.norm(matrix, axis=0),
-        1.0 - rest / float((target**2).sum()),
-    )
+@dataclass(frozen=True, eq=False)
+class _ChunkPairs:
+    """Rotation of gravity from one chunk to the next, and the rates."""
+
+    direction: np.ndarray
+    """Direction u of the specific force between both chunks, shape (n, 3)."""
+    change: np.ndarray
+    """Change of u from one chunk to the next, shape (n, 3)."""
+    seconds: np.ndarray
+    """Time between them, s, shape (n,)."""
+    rate: np.ndarray
+    """Mean measured rate of both minus its median, shape (n, 3)."""
 
 
-def _pairs(chunks):
-    """
-    Return (direction, its change, time between, rate), or None.
-
-    The values are for neighbouring chunks in which gravity rules the accelerometer.
-    """
+def _chunk_pairs(chunks: Chunks) -> _ChunkPairs | None:
+    """Return the pairs of neighbouring chunks without large accelerations, or None if too few."""
     if len(chunks) < 20:
         return None
     length = np.linalg.norm(chunks.mean[:, :3], axis=1)
-    usual = np.median(length)
-    if not usual > 0:
+    median_length = np.median(length)
+    if not median_length > 0:
         return None
-    direction = chunks.mean[:, :3] / np.maximum(length, 1e-9 * usual)[:, None]
-    step = np.diff(chunks.time)
+    direction = chunks.mean[:, :3] / np.maximum(length, 1e-9 * median_length)[:, None]
     change = np.diff(direction, axis=0)
-    whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
-    whole &= (np.abs(length / usual - 1) < FORCE_BAND) & (
-        np.linalg.norm(chunks.sd[:, :3], axis=1) < FORCE_BAND * usual
-    )
-    good = (
-        whole[1:]
-        & whole[:-1]
-        & (step > 0)
-        & (step < 1.5 * np.median(step))
-        & (np.linalg.norm(change, axis=1) < LARGEST_TURN)
-    )
-    if good.sum() < 20:
+    seconds = np.diff(chunks.time)
+
+    has_usual_length = np.abs(length / median_length - 1) < FORCE_BAND
+    is_calm = np.linalg.norm(chunks.sd[:, :3], axis=1) < FORCE_BAND * median_length
+    is_good = _whole_chunks(chunks) & has_usual_length & is_calm
+    used = is_good[1:] & is_good[:-1]
+    used &= (seconds > 0) & (seconds < 1.5 * np.median(seconds))
+    used &= np.linalg.norm(change, axis=1) < LARGEST_TURN
+    if used.sum() < 20:
         return None
     middle = unit_rows(direction[1:] + direction[:-1])
-    rate = 0.5 * (chunks.mean[1:, 3:] + chunks.mean[:-1, 3:])[good]
-    return middle[good], change[good], step[good], rate - np.median(rate, axis=0)
+    rate = 0.5 * (chunks.mean[1:, 3:] + chunks.mean[:-1, 3:])[used]
+    return _ChunkPairs(middle[used], change[used], seconds[used], rate - np.median(rate, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class _TurnFit:
+    """Least-squares fit of the rotation of gravity by rates along m directions."""
+
+    matrix: np.ndarray
+    """True rate per rate along each direction, shape (3, m)."""
+    determined: np.ndarray
+    """Whether the sd of each column is small against its length, bool, shape (m,)."""
+    explained: float
+    """Share of the squared changes of direction that the fit explains."""
+
+
+def _fit(pairs: _ChunkPairs, rate: np.ndarray) -> _TurnFit:
+    """
+    Fit ``change = [u x] (matrix @ rate + offset) seconds`` to rates of shape (n, m).
+
+    The 3 (m + 1) unknowns are the rows of (matrix, offset).
+    """
+    lever = skew(pairs.direction) * pairs.seconds[:, None, None]
+    inputs = np.column_stack([rate, np.ones(len(rate))])
+    width = inputs.shape[1]
+    design = (lever[:, :, :, None] * inputs[:, None, None, :]).reshape(-1, 3 * width)
+    target = pairs.change.ravel()
+    normal = design.T @ design
+    inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(3 * width))
+    solution = inverse @ (design.T @ target)
+    residual = float(((target - design @ solution) ** 2).sum())
+    n_spare = max(len(target) - 3 * width, 1)
+    sd = CHUNK_SD_FACTOR * np.sqrt(np.diag(inverse) * residual / n_spare)
+    column_sd = np.linalg.norm(sd.reshape(3, width)[:, :-1], axis=0)
+    matrix = solution.reshape(3, width)[:, :-1]
+    determined = column_sd < DETERMINED_SD_SHARE * np.linalg.norm(matrix, axis=0)
+    return _TurnFit(matrix, determined, 1.0 - residual / float((target**2).sum()))

@@ -36,10 +36,15 @@ class QuietFloor:
     """
 
     def __init__(self) -> None:
-        self._history = {}
+        # Length of the spans, s -> floors of the newest chunks.
+        self._history: dict[float, deque[np.ndarray]] = {}
 
     def update(self, key: float, value: np.ndarray | None) -> np.ndarray | None:
-        """Add the floor of one chunk (None: no rest) and return the running one, or None."""
+        """
+        Add the floor of one chunk (None: no rest) and return the running one, or None.
+
+        `key`: length of the spans, s.
+        """
         history = self._history.setdefault(key, deque(maxlen=9))
         if value is not None:
             history.append(value)
@@ -84,7 +89,7 @@ def quiet_beside_joints(
     cells = Cells(force_s, rate_s, period)
     quiet = quiet_samples(cells, ratio=ratio, longest=longest, floor=floors[0], resting=resting)
     width = 2 * int(round(BELOW / period / 2)) + 1
-    below = quiet_samples(
+    means_are_quiet = quiet_samples(
         Cells(low_passed(force_s, width), low_passed(rate_s, width), period),
         ratio=ratio,
         longest=longest,
@@ -94,7 +99,7 @@ def quiet_beside_joints(
     )
     if quiet[resting].all() or width < 3:
         return quiet
-    return quiet | (below & _steady(cells, ratio=ratio, resting=resting))
+    return quiet | (means_are_quiet & _steady(cells, ratio=ratio, resting=resting))
 
 
 def low_passed(values: np.ndarray, width: int) -> np.ndarray:
@@ -113,18 +118,18 @@ def low_passed(values: np.ndarray, width: int) -> np.ndarray:
     return means + origin
 
 
-def _low_passed_piece(values, first, last, width):
-    """Return `low_passed` of all values, from `first` to before `last`."""
+def _low_passed_piece(values: np.ndarray, first: int, last: int, width: int) -> np.ndarray:
+    """Return `low_passed` of all values, of the samples from `first` to before `last` only."""
     reach = 3 * (width // 2)
     start = max(first - reach, 0)
     return low_passed(values[start : last + reach], width)[first - start : last - start]
 
 
-def _steady(cells, *, ratio, resting):
+def _steady(cells: 'Cells', *, ratio: float, resting: np.ndarray) -> np.ndarray:
     """
-    Return a mask of the samples in a short span at rest with minimal variance.
+    Return a mask of the samples in a short span of steady vibration while the joints rest.
 
-    The variance of the span is about the minimum of the spans around.
+    Its variance is at most ``ratio^2`` times the least one of the spans within `STEADY_SECONDS`.
     """
     from scipy.ndimage import minimum_filter1d  # here, because its import is slow
 
@@ -132,11 +137,11 @@ def _steady(cells, *, ratio, resting):
     variance = cells.variance(width)
     at_rest = _free_of(~cells.all_of(resting), width)
     around = 2 * int(round(cells.cells_in(STEADY_SECONDS))) + 1
-    least = minimum_filter1d(
-        np.where(at_rest[:, None], variance, np.inf), around, axis=0, mode='nearest'
-    )
+    variance_at_rest = np.where(at_rest[:, None], variance, np.inf)
+    least = minimum_filter1d(variance_at_rest, around, axis=0, mode='nearest')
     floor = np.maximum(least, cells.least)
-    return cells.samples(_covered(at_rest & np.all(variance <= ratio**2 * floor, axis=1), width))
+    is_steady = at_rest & np.all(variance <= ratio**2 * floor, axis=1)
+    return cells.samples(_covered(is_steady, width))
 
 
 def quiet_samples(
@@ -178,53 +183,62 @@ def quiet_samples(
     """
     at_rest = None if resting is None else cells.all_of(resting)
     quiet = np.ones(len(cells.edges) - 1, bool)
-    shorter = np.full(2, np.inf)
+    # Floor of the next shorter spans, of force and rate.
+    shorter_floor = np.full(2, np.inf)
     for span in spans:
         width = cells.width(min(span, longest))
         variance = cells.variance(width)
-        limit = floor.update(span, _chunk_floor(variance, width, at_rest))
-        if limit is None and np.isinf(shorter).all():
+        running_floor = floor.update(span, _chunk_floor(variance, width, at_rest))
+        if running_floor is not None:
+            # At rest the variance hardly grows with the span; otherwise the quietest part was
+            # moving as well.
+            span_floor = np.minimum(running_floor, _GROWTH * shorter_floor)
+        elif np.isinf(shorter_floor).all():
             return np.zeros(cells.edges[-1], bool)
-        # at rest the variance hardly grows with the span; otherwise the quietest part was moving as
-        # well
-        shorter = limit = np.maximum(
-            shorter if limit is None else np.minimum(limit, _GROWTH * shorter), cells.least
-        )
-        calm = np.all(variance <= ratio**2 * limit, axis=1)
-        quiet &= _covered(calm, width)
+        else:
+            span_floor = shorter_floor
+        shorter_floor = span_floor = np.maximum(span_floor, cells.least)
+
+        is_calm = np.all(variance <= ratio**2 * span_floor, axis=1)
+        quiet &= _covered(is_calm, width)
         # A change of attitude between two samples: no quiet span contains it.
         if width > 1 and resting is None:
-            across = _covered(calm, width - 1)
+            across = _covered(is_calm, width - 1)
             quiet[:-1] &= across
             quiet[1:] &= across
     return cells.samples(quiet)
 
 
-def _chunk_floor(variance, width, at_rest):
-    separate = variance[::width]
+def _chunk_floor(variance: np.ndarray, width: int, at_rest: np.ndarray | None) -> np.ndarray | None:
+    """
+    Return a low quantile of the variances of disjoint spans of `width` cells, shape (2,).
+
+    Of the spans at rest, None if there are fewer than three; or of all, without `at_rest`.
+    """
+    disjoint = variance[::width]
     if at_rest is None:
-        return np.quantile(separate, 0.1, axis=0)
-    separate = separate[_free_of(~at_rest, width)[::width]]
-    return np.quantile(separate, 0.25, axis=0) if len(separate) >= 3 else None
+        return np.quantile(disjoint, 0.1, axis=0)
+    disjoint = disjoint[_free_of(~at_rest, width)[::width]]
+    return np.quantile(disjoint, 0.25, axis=0) if len(disjoint) >= 3 else None
 
 
-def _free_of(busy, width):
-    """Return whether the span of `width` cells from each cell on has no busy cell."""
-    sums = np.concatenate([[0], np.cumsum(busy)])
+def _free_of(flags: np.ndarray, width: int) -> np.ndarray:
+    """Return whether the span of `width` cells from each cell on has no flagged cell."""
+    sums = np.concatenate([[0], np.cumsum(flags)])
     return sums[width:] == sums[:-width]
 
 
 def least_variance(values: np.ndarray) -> float:
     """
-    Return the least variance, summed over axes.
+    Return the least variance of readings, (n, 3), summed over the axes.
 
-    Of half a converter step, or of 1e-5 of the readings.
+    It is that of an sd of half a converter step, plus that of an sd of 1e-5 of the readings.
     """
-    some = np.ascontiguousarray(values[:4000].T)
-    change = np.abs(np.diff(some, axis=1))
+    first = np.ascontiguousarray(values[:4000].T)
+    change = np.abs(np.diff(first, axis=1))
     step = np.where(change > 0, change, np.inf).min(axis=1, initial=np.inf)
     step = np.where(np.isfinite(step), step, 0.0)
-    return np.sum(step**2 / 4) + 3 * (1e-5 * np.abs(some).max(initial=1e-2)) ** 2
+    return np.sum(step**2 / 4) + 3 * (1e-5 * np.abs(first).max(initial=1e-2)) ** 2
 
 
 class Cells:
@@ -243,12 +257,15 @@ class Cells:
     def __init__(self, force_s: np.ndarray, rate_s: np.ndarray, period: float):
         n = len(force_s)
         self._period = period
+        # Samples of a cell.
         self._size = max(1, min(int(_GRID / period), n))
-        # The last cell has the remainder.
         self.edges = np.append(np.arange(0, n - self._size + 1, self._size), n)
+        """First sample of each cell, and the number of samples; the last cell has the remainder."""
         self.least = np.array([least_variance(values) for values in (force_s, rate_s)])
-        """Of force and rate."""
-        self._sums = []
+        """Least variance of force and rate, axes added, shape (2,)."""
+        # Of force and rate: running sums over the cells of the deviations of each axis from its
+        # mean, (3, n_cells + 1), and of their squares, axes added, (n_cells + 1,).
+        self._sums: list[tuple[np.ndarray, np.ndarray]] = []
         for values in (force_s, rate_s):
             sums = []
             squares = np.zeros(len(self.edges) - 1)
@@ -264,10 +281,8 @@ class Cells:
 
     def width(self, seconds: float) -> int:
         """Return the number of cells of a span, at least that of `_MIN_QUIET_SAMPLES`."""
-        return min(
-            max(int(np.ceil(_MIN_QUIET_SAMPLES / self._size)), int(round(self.cells_in(seconds)))),
-            len(self.edges) - 1,
-        )
+        least = int(np.ceil(_MIN_QUIET_SAMPLES / self._size))
+        return min(max(least, int(round(self.cells_in(seconds)))), len(self.edges) - 1)
 
     def variance(self, width: int) -> np.ndarray:
         """
@@ -280,10 +295,8 @@ class Cells:
         for sums, squares in self._sums:
             total = sums[:, width:] - sums[:, :-width]
             square = squares[width:] - squares[:-width]
-            variances.append(
-                np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0)
-                / np.maximum(count - 1, 1)
-            )
+            deviation = np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0)
+            variances.append(deviation / np.maximum(count - 1, 1))
         return np.stack(variances, axis=1)
 
     def all_of(self, flags: np.ndarray) -> np.ndarray:
@@ -292,20 +305,24 @@ class Cells:
 
     def samples(self, mask: np.ndarray) -> np.ndarray:
         """Return the samples of the cells of a mask, without a margin at its ends."""
-        return np.repeat(
-            shrunk_mask(mask, int(np.ceil(self.cells_in(_GUARD)))), np.diff(self.edges)
-        )
+        margin = int(np.ceil(self.cells_in(_GUARD)))
+        return np.repeat(shrunk_mask(mask, margin), np.diff(self.edges))
 
 
-def _running(values):
+def _running(values: np.ndarray) -> np.ndarray:
+    """Return the sums of the values before each place along the last axis, shape (..., n + 1)."""
     sums = np.zeros(values.shape[:-1] + (values.shape[-1] + 1,), values.dtype)
     np.cumsum(values, axis=-1, out=sums[..., 1:])
     return sums
 
 
-def _covered(calm, width):
-    """Return for each cell whether one of the calm spans of `width` cells contains it."""
-    padded = np.concatenate([calm, np.zeros(width - 1, bool)])
+def _covered(is_calm: np.ndarray, width: int) -> np.ndarray:
+    """
+    Return for each cell whether one of the calm spans of `width` cells contains it.
+
+    `is_calm`: whether the span from each cell on is calm, shape (n_cells - width + 1,).
+    """
+    padded = np.concatenate([is_calm, np.zeros(width - 1, bool)])
     return any_within(padded, width - 1, 0)
 
 
@@ -391,123 +408,144 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
         longest=settings.static_minimum,
         floor=QuietFloor(),
     )
-    found = []
-    for piece in _intervals(imu.stamp_ns, quiet, period, settings):
-        if _keeps_attitude(imu.force_s[piece], period):
-            found.append(piece)
-    found = _at_one_rate(imu.rate_s, found, period, settings.static_minimum)
-    return _not_turning(imu.rate_s, _trimmed(imu, found, period, settings.static_minimum))
+    rests = []
+    for rest in _intervals(imu.stamp_ns, quiet, period, settings):
+        if _keeps_attitude(imu.force_s[rest], period):
+            rests.append(rest)
+    rests = _at_one_rate(imu.rate_s, rests, period, settings.static_minimum)
+    rests = _trimmed(imu, rests, period, settings.static_minimum)
+    return _not_turning(imu.rate_s, rests)
 
 
-def _intervals(stamp_ns, quiet, period, settings):
+def _intervals(
+    stamp_ns: np.ndarray, quiet: np.ndarray, period: float, settings: WindowSettings
+) -> list[slice]:
+    """Return the quiet stretches without gaps, after `settling`, that are long enough."""
     time = (stamp_ns - stamp_ns[0]) / 1e9
-    found = []
+    intervals = []
     for first, stop in runs_of(quiet, np.diff(time) > max(settings.gap, 5 * period)):
-        start = first if first == 0 else int(np.searchsorted(time, time[first] + settings.settling))
+        start = first
+        if first > 0:
+            start = int(np.searchsorted(time, time[first] + settings.settling))
         if start < stop and time[stop - 1] - time[start] + period >= settings.static_minimum:
-            found.append(slice(int(start), int(stop)))
-    return found
+            intervals.append(slice(int(start), int(stop)))
+    return intervals
 
 
-def _keeps_attitude(force, period):
+def _keeps_attitude(force: np.ndarray, period: float) -> bool:
     """
     Return whether the scatter over the interval equals the scatter over short spans.
 
     Under vibration, slow turns are quiet.
     """
     width = min(max(10, int(round(SPANS[0] / period))), len(force))
-    pieces = force[: len(force) // width * width].reshape(-1, width, 3)
-    local = np.mean(pieces.var(axis=1, ddof=1).sum(axis=1)) + least_variance(force)
-    return force.var(axis=0).sum() <= _LARGEST_GROWTH * local
+    spans = force[: len(force) // width * width].reshape(-1, width, 3)
+    span_variance = np.mean(spans.var(axis=1, ddof=1).sum(axis=1)) + least_variance(force)
+    return force.var(axis=0).sum() <= _LARGEST_GROWTH * span_variance
 
 
-def _at_one_rate(rate, found, period, shortest):
+def _at_one_rate(
+    rate: np.ndarray, rests: list[slice], period: float, shortest: float
+) -> list[slice]:
     """
-    Divide intervals where the rate changes by its noise and a thousandth of the largest.
+    Divide intervals at transitions from rest to a slow turn; drop parts shorter than `shortest` s.
 
-    A transition from rest to a slow turn.
+    There the mean rate over `_STEP_SPAN` changes by more than the noise of a sample and more than a
+    thousandth of the largest rate.
     """
-    if not found:
-        return found
-    noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
-    least = np.maximum(
-        noise, 1e-3 * _farthest(rate, np.array([np.median(axis) for axis in rate.T]))
-    )
+    if not rests:
+        return rests
+    noise = np.median([rate[rest].std(axis=0) for rest in rests], axis=0)
+    median = np.array([np.median(axis) for axis in rate.T])
+    least_change = np.maximum(noise, 1e-3 * _farthest(rate, median))
     width = max(10, int(round(_STEP_SPAN / period)))
     parts = []
-    for piece in found:
-        count = (piece.stop - piece.start) // width
-        means = (
-            rate[piece.start : piece.start + count * width].reshape(count, width, 3).mean(axis=1)
-        )
-        steps = np.flatnonzero(np.any(np.abs(np.diff(means, axis=0)) > least, axis=1)) + 1
-        edges = [piece.start, *(piece.start + width * steps), piece.stop]
-        parts += [
-            slice(int(a), int(b))
-            for a, b in zip(edges, edges[1:])
-            if (b - a) * period >= shortest or len(edges) == 2
-        ]
+    for rest in rests:
+        n_means = (rest.stop - rest.start) // width
+        averaged = rate[rest.start : rest.start + n_means * width]
+        means = averaged.reshape(n_means, width, 3).mean(axis=1)
+        is_change = np.any(np.abs(np.diff(means, axis=0)) > least_change, axis=1)
+        changes = rest.start + width * (np.flatnonzero(is_change) + 1)
+        edges = [rest.start, *changes, rest.stop]
+        for start, stop in zip(edges, edges[1:]):
+            if (stop - start) * period >= shortest or len(edges) == 2:
+                parts.append(slice(int(start), int(stop)))
     return parts
 
 
-def _farthest(values, centre):
+def _farthest(values: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Return ``max |values - centre|`` of each column."""
     return np.maximum(values.max(axis=0) - centre, centre - values.min(axis=0))
 
 
-def _trimmed(imu, found, period, shortest):
+def _trimmed(imu: ImuSamples, rests: list[slice], period: float, shortest: float) -> list[slice]:
     """
-    Trim both ends of intervals where the low-passed readings exceed the scatter of the middle.
+    Return intervals without the slow begin and end of turns; drop those shorter than `shortest` s.
 
-    A turn begins below the noise.
+    A turn begins below the noise of the samples, but shows in the low-passed readings.
     """
-    first = np.array([piece.start for piece in found], int)
-    last = np.array([piece.stop for piece in found], int)
     width = 2 * int(round(BELOW / period / 2)) + 1
-    for values in (imu.force_s, imu.rate_s) if found else ():
-        slow = [_low_passed_piece(values, a, b, width) for a, b in zip(first, last)]
-        middles = [
-            slice(*(np.linspace(a, b, 5).astype(int)[1:4:2] - a)) for a, b in zip(first, last)
-        ]
-        centres = [piece[middle].mean(axis=0) for piece, middle in zip(slow, middles)]
-        spread = [
-            np.mean((piece[middle] - centre) ** 2)
-            for piece, middle, centre in zip(slow, middles, centres)
-        ]
-        spread = np.maximum(
-            np.maximum(spread, np.median(spread)), least_variance(values) / 3 / width
-        )
-        for k, (piece, middle, centre) in enumerate(zip(slow, middles, centres)):
-            off = np.sum((piece - centre) ** 2, axis=1) > 3 * _LEAVES**2 * spread[k]
-            before = off[: middle.start]
-            after = off[middle.stop :]
-            start = first[k]
-            last[k] = start + middle.stop + int(np.argmax(after)) if after.any() else last[k]
-            first[k] = (
-                start + middle.start - int(np.argmax(before[::-1])) if before.any() else start
-            )
-    return [slice(int(a), int(b)) for a, b in zip(first, last) if (b - a) * period >= shortest]
+    if rests:
+        for values in (imu.force_s, imu.rate_s):
+            rests = _without_turns(values, rests, width)
+    return [rest for rest in rests if (rest.stop - rest.start) * period >= shortest]
 
 
-def _not_turning(rate, found):
+def _without_turns(values: np.ndarray, rests: list[slice], width: int) -> list[slice]:
     """
-    Exclude intervals whose mean rate differs significantly from their neighbours.
+    Return intervals up to the low-passed readings that differ from the middle half significantly.
 
-    Slow and steady turns.
+    The limit is `_LEAVES` sds of the low-passed readings, over `width` samples, in the middle half
+    of the interval or of the median interval.
     """
-    if len(found) < 2:
-        return found
-    means = np.array([rate[piece].mean(axis=0) for piece in found])
-    noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
-    usual = np.median(means, axis=0)
-    limit = np.maximum(_TURNING_SD * noise, 0.01 * _farthest(rate, usual))
-    keep = np.all(np.abs(means - usual) <= limit, axis=1)
+    low_passed_rests = []
+    middles = []
+    centres = []
+    variances = []
+    for rest in rests:
+        readings = _low_passed_piece(values, rest.start, rest.stop, width)
+        quarters = np.linspace(rest.start, rest.stop, 5).astype(int) - rest.start
+        middle = slice(quarters[1], quarters[3])
+        centre = readings[middle].mean(axis=0)
+        low_passed_rests.append(readings)
+        middles.append(middle)
+        centres.append(centre)
+        variances.append(np.mean((readings[middle] - centre) ** 2))
+    variance = np.maximum(
+        np.maximum(variances, np.median(variances)), least_variance(values) / 3 / width
+    )
+
+    trimmed = []
+    for k, rest in enumerate(rests):
+        middle = middles[k]
+        distance_squared = np.sum((low_passed_rests[k] - centres[k]) ** 2, axis=1)
+        is_turn = distance_squared > 3 * _LEAVES**2 * variance[k]
+        turn_before = is_turn[: middle.start]
+        turn_after = is_turn[middle.stop :]
+        start, stop = rest.start, rest.stop
+        if turn_before.any():
+            start = rest.start + middle.start - int(np.argmax(turn_before[::-1]))
+        if turn_after.any():
+            stop = rest.start + middle.stop + int(np.argmax(turn_after))
+        trimmed.append(slice(int(start), int(stop)))
+    return trimmed
+
+
+def _not_turning(rate: np.ndarray, rests: list[slice]) -> list[slice]:
+    """Return the intervals without slow steady turns, whose mean rate differs significantly."""
+    if len(rests) < 2:
+        return rests
+    means = np.array([rate[rest].mean(axis=0) for rest in rests])
+    noise = np.median([rate[rest].std(axis=0) for rest in rests], axis=0)
+    median = np.median(means, axis=0)
+    limit = np.maximum(_TURNING_SD * noise, 0.01 * _farthest(rate, median))
+    keep = np.all(np.abs(means - median) <= limit, axis=1)
     # An isolated deviation from both neighbours; the drift of warming biases is smooth.
-    if len(found) >= _ENOUGH:
+    if len(rests) >= _ENOUGH:
         step = np.diff(means, axis=0)
-        alone = np.minimum(
-            np.minimum(np.abs(step[:-1]), np.abs(step[1:])), 0.5 * np.abs(step[1:] - step[:-1])
-        )
+        smaller_step = np.minimum(np.abs(step[:-1]), np.abs(step[1:]))
+        isolated = np.minimum(smaller_step, 0.5 * np.abs(step[1:] - step[:-1]))
+        # Sd of one mean from the median of the absolute differences of two.
         scatter = np.median(np.abs(step), axis=0) / (0.6745 * np.sqrt(2))
-        keep[1:-1] &= np.all(alone <= np.maximum(_SCATTERS * scatter, noise), axis=1)
-    return [piece for piece, kept in zip(found, keep, strict=True) if kept]
+        keep[1:-1] &= np.all(isolated <= np.maximum(_SCATTERS * scatter, noise), axis=1)
+    return [rest for rest, kept in zip(rests, keep, strict=True) if kept]

@@ -64,13 +64,22 @@ class ChunkSeries:
 
     def __init__(self, chunk_time: float = CHUNK_SECONDS, capacity: int = MAX_SCAN_CHUNKS):
         self.size: int | None = None
-        self._chunk_time, self._capacity = chunk_time, capacity
+        """Samples of a chunk; None until the period is known."""
         self.n_samples = 0
+        """Samples that were processed."""
         self.n_changed = np.zeros(6, np.int64)
+        """Readings of each column that differ from the one before."""
         self.n_repeated = 0
-        self._rest: tuple[np.ndarray, np.ndarray] | None = None
-        self._first_ns, self._last = None, None
-        self._parts, self._n_chunks = [], 0
+        """Samples in which no column differs."""
+        self._chunk_time = chunk_time
+        self._capacity = capacity
+        # Stamps and columns that do not fill a chunk yet.
+        self._incomplete: tuple[np.ndarray, np.ndarray] | None = None
+        self._first_ns: int | None = None
+        # Columns of the last sample, shape (6, 1).
+        self._last: np.ndarray | None = None
+        self._parts: list[Chunks] = []
+        self._n_chunks = 0
 
     def push(self, stamp_ns: np.ndarray, columns: np.ndarray) -> None:
         """
@@ -79,10 +88,10 @@ class ChunkSeries:
         Stamps, shape (n,), and force and rate, shape (6, n).
         """
         self._count_changes(columns)
-        if self._rest is not None:
-            stamp_ns = np.concatenate([self._rest[0], stamp_ns])
-            columns = np.concatenate([self._rest[1], columns], axis=1)
-        self._rest = (stamp_ns, columns)
+        if self._incomplete is not None:
+            stamp_ns = np.concatenate([self._incomplete[0], stamp_ns])
+            columns = np.concatenate([self._incomplete[1], columns], axis=1)
+        self._incomplete = (stamp_ns, columns)
         if self.size is None and len(stamp_ns) >= FIRST:
             self.size = _size(stamp_ns, self._chunk_time)
         if self.size is not None:
@@ -90,27 +99,18 @@ class ChunkSeries:
 
     def chunks(self) -> Chunks:
         """Return the Chunks until now."""
-        if self.size is None and self._rest is not None and len(self._rest[0]) > MIN_CHUNK_SAMPLES:
-            self.size = _size(self._rest[0], self._chunk_time)
+        incomplete = self._incomplete
+        if self.size is None and incomplete is not None and len(incomplete[0]) > MIN_CHUNK_SAMPLES:
+            self.size = _size(incomplete[0], self._chunk_time)
             self._cut()
-        parts = self._parts or [
-            (np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)), np.zeros(0))
-        ]
-        time, duration, mean, sd, extent, step = (
-            np.concatenate(column) for column in zip(*parts, strict=True)
-        )
-        return Chunks(
-            time,
-            duration,
-            mean,
-            sd,
-            extent,
-            step,
-            self.size or MIN_CHUNK_SAMPLES,
-            int(self._first_ns or 0),
-        )
+        if self._parts:
+            return Chunks.concatenate(self._parts)
+        none, no_columns = np.zeros(0), np.zeros((0, 6))
+        size = self.size or MIN_CHUNK_SAMPLES
+        return Chunks(none, none, no_columns, no_columns, no_columns, none, size)
 
-    def _count_changes(self, columns):
+    def _count_changes(self, columns: np.ndarray) -> None:
+        """Count the readings that differ from the ones before, and the samples without any."""
         joined = columns if self._last is None else np.concatenate([self._last, columns], axis=1)
         changed = joined[:, 1:] != joined[:, :-1]
         self.n_changed += np.count_nonzero(changed, axis=1)
@@ -118,47 +118,48 @@ class ChunkSeries:
         self.n_samples += columns.shape[1]
         self._last = columns[:, -1:].copy()
 
-    def _cut(self):
+    def _cut(self) -> None:
+        """Describe the complete chunks and buffer the incomplete one."""
         # Called with samples, after the size of a chunk is chosen.
-        assert self._rest is not None and self.size is not None
-        stamp_ns, columns = self._rest
+        assert self._incomplete is not None and self.size is not None
+        stamp_ns, columns = self._incomplete
         n = len(stamp_ns) // self.size
         used = n * self.size
-        self._rest = stamp_ns[used:].copy(), columns[:, used:].copy()
+        self._incomplete = stamp_ns[used:].copy(), columns[:, used:].copy()
         if not n or self._n_chunks >= self._capacity:
             return
         if self._first_ns is None:
-            self._first_ns = stamp_ns[0]
-        self._parts.append(
-            _describe(
-                ((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size),
-                columns[:, :used].reshape(6, n, self.size),
-            )
-        )
+            self._first_ns = int(stamp_ns[0])
+        time = ((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size)
+        values = columns[:, :used].reshape(6, n, self.size)
+        self._parts.append(_describe(time, values, self._first_ns))
         self._n_chunks += n
 
 
-def _size(stamps, chunk_time):
+def _size(stamps: np.ndarray, chunk_time: float) -> int:
+    """Return the number of samples in `chunk_time` s, from the period of the first stamps, ns."""
     period = float(np.median(np.diff(stamps[:FIRST]))) * 1e-9
     return int(np.clip(round(chunk_time / max(period, 1e-6)), MIN_CHUNK_SAMPLES, MAX_CHUNK_SAMPLES))
 
 
-def _describe(time, values):
-    start = values[:, :, :1].copy()
-    values = values - start  # avoids cancellation with large offsets
+def _describe(time: np.ndarray, values: np.ndarray, first_ns: int) -> Chunks:
+    """Return chunks of samples at times, s, shape (n, size), with columns, shape (6, n, size)."""
+    origin = values[:, :, :1].copy()
+    values = values - origin  # avoids cancellation with large offsets
     mean = values.mean(axis=2)
-    sd = np.sqrt(
-        np.maximum(np.einsum('ijk,ijk->ij', values, values) / values.shape[2] - mean**2, 0.0)
-    )
+    mean_square = np.einsum('ijk,ijk->ij', values, values) / values.shape[2]
+    sd = np.sqrt(np.maximum(mean_square - mean**2, 0.0))
+    extent = values.max(axis=2) - values.min(axis=2)
     size = time.shape[1]
-    spread = values.max(axis=2) - values.min(axis=2)
-    return (
-        time.mean(axis=1),
-        (time[:, -1] - time[:, 0]) * size / (size - 1),
-        (mean + start[:, :, 0]).T,
-        sd.T,
-        spread.T,
-        np.median(np.diff(time, axis=1), axis=1),
+    return Chunks(
+        time=time.mean(axis=1),
+        duration=(time[:, -1] - time[:, 0]) * size / (size - 1),
+        mean=(mean + origin[:, :, 0]).T,
+        sd=sd.T,
+        range=extent.T,
+        step=np.median(np.diff(time, axis=1), axis=1),
+        size=size,
+        first_ns=first_ns,
     )
 
 
@@ -211,15 +212,16 @@ class Rest:
 
         Or None.
         """
-        found = self._sphere() if len(self.force) >= LEAST_FACES else None
-        return None if found is None else found.centre
+        sphere = self._sphere() if len(self.force) >= LEAST_FACES else None
+        return None if sphere is None else sphere.centre
 
-    def _sphere(self):
+    def _sphere(self) -> Sphere | None:
+        """Return the sphere fitted to the readings, or None where they do not determine it."""
         if not np.median(self.norm) > 0.0:  # an accelerometer that reads zero has no sphere
             return None
-        found = fit_sphere(self.force)
-        far = np.linalg.norm(found.centre) > FARTHEST * np.median(self.norm)
-        return None if far or found.spread < LEAST_EIGENVALUE else found
+        sphere = fit_sphere(self.force)
+        is_far = np.linalg.norm(sphere.centre) > FARTHEST * np.median(self.norm)
+        return None if is_far or sphere.spread < LEAST_EIGENVALUE else sphere
 
     @property
     def length(self) -> float:
@@ -258,23 +260,20 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
         scatter = np.linalg.norm(chunks.sd[:, part], axis=1)
         quiet &= scatter <= 3.0 * np.quantile(scatter, 0.1) + 1e-3 * np.median(scatter)
     turn = np.linalg.norm(np.diff(unit_rows(chunks.mean[:, :3]), axis=0), axis=1)
-    still = (
-        quiet & (np.append(turn, 0.0) < MAX_CHUNK_TURN) & (np.append(0.0, turn) < MAX_CHUNK_TURN)
-    )
+    keeps_before = np.append(0.0, turn) < MAX_CHUNK_TURN
+    keeps_after = np.append(turn, 0.0) < MAX_CHUNK_TURN
+    still = quiet & keeps_before & keeps_after
     if still.sum() < LEAST_CHUNKS:
         return still
-    rate = np.median(chunks.mean[still, 3:], axis=0)
-    away = np.linalg.norm(chunks.mean[:, 3:] - rate, axis=1)
     # A spin at constant rate about the vertical is as quiet as rest, but has rates.
-    return still & (
-        away
-        <= np.maximum(
-            0.05 * away.max(), 3.0 * np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1))
-        )
-    )
+    rate_at_rest = np.median(chunks.mean[still, 3:], axis=0)
+    rate = np.linalg.norm(chunks.mean[:, 3:] - rate_at_rest, axis=1)
+    noise = np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1))
+    return still & (rate <= np.maximum(0.05 * rate.max(), 3.0 * noise))
 
 
-def _stretches(still):
+def _stretches(still: np.ndarray) -> np.ndarray:
+    """Return (start, stop) of the runs of chunks at rest; of at least two chunks if there are."""
     runs = runs_of(still)
     long = runs[np.ptp(runs, axis=1) >= 2]
     return long if len(long) else runs
@@ -336,27 +335,27 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
         Smallest step between readings of each column.
 
     """
-    flat = {}
+    constant = {}
     for sensor, part in SENSOR_COLUMNS.items():
         flags = (chunks.range[:, part] == 0).all(axis=1)
         if flags.all():  # an absent sensor, or one without any reading: no part of it is frozen
             flags = np.zeros(len(chunks), bool)
-        flat[sensor] = flags
-    found = {sensor: in_long_runs(flags) for sensor, flags in flat.items()}
-    rest = (
-        find_rest(chunks.select(~np.logical_or(*flat.values())))
-        if np.logical_or(*found.values()).any()
-        else None
-    )
+        constant[sensor] = flags
+    frozen = {sensor: in_long_runs(flags) for sensor, flags in constant.items()}
+    rest = None
+    if np.logical_or(*frozen.values()).any():
+        rest = find_rest(chunks.select(~np.logical_or(*constant.values())))
     for sensor, part in SENSOR_COLUMNS.items():
         if (
+            # The noise at rest is not known, or is zero, or is below the steps of the converter.
             rest is None
             or not rest.range[part].all()
             or (rest.range[part] < MIN_NOISE_STEPS * resolution[part]).any()
-            or len(runs_of(found[sensor])) > len(rest.force)
+            # Most rests are constant.
+            or len(runs_of(frozen[sensor])) > len(rest.force)
         ):
-            found[sensor] = np.zeros(len(chunks), bool)
-    return found
+            frozen[sensor] = np.zeros(len(chunks), bool)
+    return frozen
 
 
 def frozen_parts(chunks: Chunks, frozen: dict[str, np.ndarray]) -> list[FrozenPart]:
@@ -373,6 +372,7 @@ class ResolutionSearch:
 
     def __init__(self) -> None:
         self._n_samples = 0
+        # Smallest step so far, infinite where no reading has changed.
         self._step = np.full(6, np.inf)
 
     def push(self, readings: np.ndarray) -> None:
@@ -426,25 +426,24 @@ def frozen_joints(
         that explains more (spins about the vertical are as steady as rests).
 
     """
-    inside = np.zeros(len(chunks), bool)
+    chunk_start = chunks.time - chunks.duration / 2
+    chunk_stop = chunks.time + chunks.duration / 2
+    joints_rest = np.zeros(len(chunks), bool)
     for start, stop in (still_ns - chunks.first_ns) * 1e-9:
-        inside |= (chunks.time - chunks.duration / 2 >= start) & (
-            chunks.time + chunks.duration / 2 <= stop
-        )
-    if not inside.any():
+        joints_rest |= (chunk_start >= start) & (chunk_stop <= stop)
+    if not joints_rest.any():
         return []
     rates = chunks.mean[:, 3:]
-    turning = min(
-        (
-            np.linalg.norm(rates - rate, axis=1) > MIN_TURN_RATE
-            for rate in (rate_at_rest, np.median(rates[inside], axis=0))
-        ),
-        key=lambda flags: np.count_nonzero(flags & inside),
-    )
-    return [_part(chunks, 'joints', start, stop) for start, stop in long_runs(turning & inside)]
+    usual_rate = np.median(rates[joints_rest], axis=0)
+    contradicts = joints_rest & (np.linalg.norm(rates - rate_at_rest, axis=1) > MIN_TURN_RATE)
+    contradicts_usual = joints_rest & (np.linalg.norm(rates - usual_rate, axis=1) > MIN_TURN_RATE)
+    if np.count_nonzero(contradicts_usual) < np.count_nonzero(contradicts):
+        contradicts = contradicts_usual
+    return [_part(chunks, 'joints', start, stop) for start, stop in long_runs(contradicts)]
 
 
-def _part(chunks, who, start, stop):
+def _part(chunks: Chunks, who: str, start: int, stop: int) -> FrozenPart:
+    """Return the stretch from chunk `start` to before chunk `stop`."""
     return FrozenPart(
         who,
         max(float(chunks.time[start] - chunks.duration[start] / 2), 0.0),
@@ -455,17 +454,19 @@ def _part(chunks, who, start, stop):
 
 class StandingJoints:
     """
-    Notes, in bounded memory, of stretches without change of a joint position.
+    Records, in bounded memory, the stretches of at least half a second with constant joints.
 
-    The stretches are of more than half a second and no joint position changes in them.
+    No joint position changes in them.
     """
 
     LEAST_NS = 500_000_000
     CAPACITY = 10_000
 
     def __init__(self) -> None:
-        self._found = np.zeros((0, 2), np.int64)
+        # First and last stamp of the complete long stretches, (n, 2), and of the newest stretch.
+        self._complete = np.zeros((0, 2), np.int64)
         self._open = np.zeros((1, 2), np.int64)
+        # Positions of the last sample.
         self._last = np.zeros(0)
 
     def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
@@ -474,17 +475,22 @@ class StandingJoints:
         """
         if len(self._last) != position.shape[1]:
             self._last = np.full(position.shape[1], np.nan)  # differs from any position
-        starts = np.flatnonzero(
-            np.any(position != np.concatenate([self._last[None], position[:-1]]), axis=1)
-        )
-        ends = np.append(self._open[0, 1], stamp_ns)[np.append(starts, len(stamp_ns))]
-        found = np.column_stack([np.append(self._open[0, 0], stamp_ns[starts]), ends])
-        self._found = np.concatenate([self._found, self._long(found[:-1])])[: self.CAPACITY]
-        self._open, self._last = found[-1:], position[-1].copy()
+        before = np.concatenate([self._last[None], position[:-1]])
+        starts = np.flatnonzero(np.any(position != before, axis=1))
+        # A stretch ends with the stamp before the next start; `stamp_before[k]` is that of k - 1.
+        stamp_before = np.append(self._open[0, 1], stamp_ns)
+        first_ns = np.append(self._open[0, 0], stamp_ns[starts])
+        last_ns = stamp_before[np.append(starts, len(stamp_ns))]
+        stretches = np.column_stack([first_ns, last_ns])
+        complete = np.concatenate([self._complete, self._long(stretches[:-1])])
+        self._complete = complete[: self.CAPACITY]
+        self._open = stretches[-1:]
+        self._last = position[-1].copy()
 
     def stretches(self) -> np.ndarray:
         """Return first and last stamp of each stretch until now, shape (n, 2)."""
-        return np.concatenate([self._found, self._long(self._open)])
+        return np.concatenate([self._complete, self._long(self._open)])
 
-    def _long(self, found):
-        return found[np.ptp(found, axis=1) >= self.LEAST_NS]
+    def _long(self, stretches: np.ndarray) -> np.ndarray:
+        """Return the stretches of at least `LEAST_NS`."""
+        return stretches[np.ptp(stretches, axis=1) >= self.LEAST_NS]

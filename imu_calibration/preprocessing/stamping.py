@@ -69,11 +69,11 @@ class StampLine:
     word: Stamping
     """Use of the stamps."""
     period_ns: float
-    """Sampling period."""
+    """Sampling period, ns."""
     low_ns: float = 0.0
-    """Smallest distance of a stamp from the line of the sampling times."""
+    """Smallest distance of a stamp from the line of the sampling times, ns (2 % quantile)."""
     high_ns: float = 0.0
-    """Largest distance."""
+    """Largest distance, ns (98 % quantile)."""
     at_once: float = 1.0
     """Samples received together, on average."""
 
@@ -116,36 +116,52 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
     step = step[np.abs(step) <= PAUSE_NS]
     if len(step) < MIN_PERIOD_STEPS:
         return None
-    in_order = np.diff(np.sort(stamp_ns))  # exchanged neighbours are no error of the stamps
-    in_order = in_order[in_order <= PAUSE_NS]
-    line = _regular(in_order, float(np.median(in_order)))
+    # Regular steps. Exchanged neighbours are no error of the stamps.
+    sorted_step = np.diff(np.sort(stamp_ns))
+    sorted_step = sorted_step[sorted_step <= PAUSE_NS]
+    line = _regular_line(sorted_step, float(np.median(sorted_step)))
     if line is not None or len(stamp_ns) < 4 * LAG:
         return line
+
+    # Steps that scatter about a line: their sums over many steps do not diverge.
     period = float(step.mean())
-    apart = (stamp_ns[LAG:] - stamp_ns[:-LAG]).astype(float)
-    apart = apart[np.abs(apart - LAG * period) <= PAUSE_NS]
-    apart = _without_losses(apart, float(np.min(in_order[in_order > 0], initial=PAUSE_NS)))
-    if period > 0 and len(apart) and apart.var() <= DRIFTING * step.var():
-        line = _line(stamp_ns, step, float(apart.mean()) / LAG)
+    lagged = (stamp_ns[LAG:] - stamp_ns[:-LAG]).astype(float)
+    lagged = lagged[np.abs(lagged - LAG * period) <= PAUSE_NS]
+    resolution = float(np.min(sorted_step[sorted_step > 0], initial=PAUSE_NS))
+    lagged = _without_losses(lagged, resolution)
+    if period > 0 and len(lagged) and lagged.var() <= DRIFTING * step.var():
+        line = _counted_line(stamp_ns, step, float(lagged.mean()) / LAG)
         if line.period_ns >= 1.0:
             return line
-    # Where more than half of the samples are lost the usual step is two periods.
-    return _regular(in_order, float(np.quantile(in_order, 0.1))) or StampLine(
-        IRREGULAR, max(period, 1.0)
-    )
+
+    # Where more than half of the samples are lost the median step is two periods.
+    line = _regular_line(sorted_step, float(np.quantile(sorted_step, 0.1)))
+    return line or StampLine(IRREGULAR, max(period, 1.0))
 
 
-def _regular(step: np.ndarray, usual: float) -> StampLine | None:
+def _regular_line(step: np.ndarray, usual: float) -> StampLine | None:
+    """
+    Return the line of regular stamps, or None if too many steps are no multiples of a period.
+
+    The period is the mean step, divided by the number of periods in each.
+
+    Parameters
+    ----------
+    step : array, shape (n,)
+        ns.
+    usual : float
+        First estimate of the period, ns.
+
+    """
     if usual <= 0 or regular_share(step, usual) < 1 - MAX_IRREGULAR_SHARE:
         return None
-    number = np.rint(step / usual)
-    # the sample is late, and the next one earlier
-    number[
-        (step <= MAX_REGULAR_STEP * usual)
-        | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE_STEP_SHARE))
-    ] = 1.0
-    used = (step > 0) & (number <= MOST_LOST)
-    return StampLine(REGULAR, float(step[used].sum() / number[used].sum()))
+    n_periods = np.rint(step / usual)
+    # A step that is no multiple is one period: the sample is late, and the next step is shorter.
+    is_multiple = np.abs(step / usual - n_periods) <= WHOLE_STEP_SHARE
+    is_late = (n_periods < MOST_LOST) & ~is_multiple
+    n_periods[(step <= MAX_REGULAR_STEP * usual) | is_late] = 1.0
+    used = (step > 0) & (n_periods <= MOST_LOST)
+    return StampLine(REGULAR, float(step[used].sum() / n_periods[used].sum()))
 
 
 def is_regular(step: np.ndarray, period: float) -> np.ndarray:
@@ -159,30 +175,29 @@ def regular_share(step: np.ndarray, period: float) -> float:
 
     0 when more than `MOST_LOST` would be lost.
     """
-    number = np.rint(step / period)
-    whole = np.abs(step / period - number)
-    good = is_regular(step, period) | ((number >= 2) & (whole <= WHOLE_STEP_SHARE))
-    lost = float(np.sum(number[good] - 1, where=number[good] > 1))
-    return 0.0 if lost > MOST_LOST * len(step) else float(good.mean())
+    n_periods = np.rint(step / period)
+    is_multiple = np.abs(step / period - n_periods) <= WHOLE_STEP_SHARE
+    good = is_regular(step, period) | ((n_periods >= 2) & is_multiple)
+    n_lost = float(np.sum(n_periods[good] - 1, where=n_periods[good] > 1))
+    return 0.0 if n_lost > MOST_LOST * len(step) else float(good.mean())
 
 
-def _without_losses(apart: np.ndarray, resolution: float) -> np.ndarray:
+def _without_losses(lagged: np.ndarray, resolution: float) -> np.ndarray:
     """
-    Return the differences across `LAG` steps.
+    Return the stamp differences across `LAG` steps that contain neither lost samples nor a pause.
 
-    Without the ones that contain lost samples or a pause.
+    These are near their median: within three median deviations, half a period and `resolution`, ns.
     """
-    off = np.abs(apart - np.median(apart)) if len(apart) else apart
-    return (
-        apart[off <= 3 * np.median(off) + 0.5 * np.median(apart) / LAG + resolution]
-        if len(apart)
-        else apart
-    )
+    if not len(lagged):
+        return lagged
+    median = np.median(lagged)
+    deviation = np.abs(lagged - median)
+    return lagged[deviation <= 3 * np.median(deviation) + 0.5 * median / LAG + resolution]
 
 
-def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
+def _counted_line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     """
-    Return the line of stamps near it.
+    Return the line of stamps that scatter about it.
 
     Through the earliest ones of times of arrival, otherwise through their median.
 
@@ -194,11 +209,15 @@ def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     residual = (stamp_ns - stamp_ns[0]) - period * number
     residual = residual - np.polynomial.Polynomial.fit(number, residual, 1)(number)
     low, middle, high = np.quantile(residual, (0.02, 0.5, 0.98))
-    at_once = len(step) / max(int(np.count_nonzero(step > MIN_REGULAR_STEP * period)), 1)
-    skewed = middle - low < SKEWED * (high - low)
-    arrivals = high - low > period and np.all(step >= 0) and (at_once >= PACKET or skewed)
-    origin = low if arrivals else middle
-    return StampLine(COUNTED, period, low - origin, high - origin, at_once if arrivals else 1.0)
+    n_packets = max(int(np.count_nonzero(step > MIN_REGULAR_STEP * period)), 1)
+    packet_size = len(step) / n_packets
+    is_skewed = middle - low < SKEWED * (high - low)
+    are_arrivals = (
+        high - low > period and np.all(step >= 0) and (packet_size >= PACKET or is_skewed)
+    )
+    origin = low if are_arrivals else middle
+    at_once = packet_size if are_arrivals else 1.0
+    return StampLine(COUNTED, period, low - origin, high - origin, at_once)
 
 
 LOST_SCATTER = 0.6
@@ -230,17 +249,17 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
     if len(stamp) < MIN_PART:
         return [slice(0, len(stamp))]
     parts = _parts_between_gaps(stamp, period)
-    own_period = _period_within(parts, stamp, period)
+    period_of_parts = _period_within(parts, stamp, period)
     number = np.arange(len(stamp), dtype=float)
-    found = []
+    misfitting = []
     for part in parts:
-        late = stamp[part] - own_period * number[part]
-        clock = own_period * number[part] + (late.min() if arrivals else late.mean())
+        offset = stamp[part] - period_of_parts * number[part]
+        clock = period_of_parts * number[part] + (offset.min() if arrivals else offset.mean())
         computed_error = np.linalg.norm(times[part] - clock)
         recorded_error = np.linalg.norm(stamp[part] - clock)
         if len(clock) < MIN_PART or computed_error > recorded_error:
-            found.append(part)
-    return found
+            misfitting.append(part)
+    return misfitting
 
 
 def _parts_between_gaps(stamp: np.ndarray, period: float) -> list[slice]:
@@ -273,8 +292,8 @@ def _period_within(parts: list[slice], stamp: np.ndarray, period: float) -> floa
     number = np.arange(len(stamp), dtype=float)
     numbers_apart = np.concatenate([number[part] - number[part].mean() for part in parts])
     stamps_apart = np.concatenate([stamp[part] - stamp[part].mean() for part in parts])
-    own_period = float(numbers_apart @ stamps_apart / max(numbers_apart @ numbers_apart, 1.0))
-    return own_period if own_period >= _least_period(period) else period
+    slope = float(numbers_apart @ stamps_apart / max(numbers_apart @ numbers_apart, 1.0))
+    return slope if slope >= _least_period(period) else period
 
 
 def _least_period(period: float) -> float:
@@ -322,11 +341,12 @@ class TimesInOrder:
         times = np.concatenate([self._latest[1:], times_ns])
         earlier_stamp = np.maximum.accumulate(stamp)[:-1]
         earlier_time = np.maximum.accumulate(times)[:-1]
-        back = np.flatnonzero((stamp_ns > earlier_stamp) & (times_ns <= earlier_time)) + 1
-        if len(back):
-            for run in np.split(back, np.flatnonzero(np.diff(back) > 1) + 1):
+        # Indices into `stamp` and `times` of the samples that are moved.
+        moved = np.flatnonzero((stamp_ns > earlier_stamp) & (times_ns <= earlier_time)) + 1
+        if len(moved):
+            for run in np.split(moved, np.flatnonzero(np.diff(moved) > 1) + 1):
                 before = times[: run[0]].max()
-                # as far apart as recorded, and before the next time
+                # At the recorded distances, but before the next time.
                 step = (stamp[run[-1]] - stamp[run[0] - 1]) / len(run)
                 if run[-1] + 1 < len(times):
                     step = min(step, (times[run[-1] + 1] - before) / (len(run) + 1))
@@ -372,22 +392,31 @@ class CountedClock:
     """
 
     def __init__(self, line: StampLine):
-        self._period, self._arrivals = line.period_ns, line.arrivals
-        self._margin = LOST_PERIOD_SHARE * line.period_ns + (
-            0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns)
-        )
+        self._period = line.period_ns
+        self._arrivals = line.arrivals
+        # Samples were lost if the clock is ahead by more than this after a long step, ns.
+        self._loss_margin = LOST_PERIOD_SHARE * line.period_ns
+        self._loss_margin += 0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns)
+        # Stamps that are in no block yet, and times that are not returned yet, ns.
         self._raw = np.zeros(0, np.int64)
         self._times = [np.zeros(0, np.int64)]
         self._begin()
 
     def _begin(self) -> None:
         """Reset everything except the period."""
+        # First stamp, ns; the stamps, times and points below are relative to it.
         self._origin_ns: int | None = None
-        self._stamp = self._told = np.zeros(0)
-        self._next = 0.0
+        # Number of the next sample, and numbers and stamps of the newest samples, (2, n), at most
+        # `LOSS_REACH`.
+        self._next_number = 0.0
         self._before = np.zeros((2, 0))
+        # Numbers and stamps of the newest block, whose times need the point of the next one.
         self._block: np.ndarray | None = None
+        self._block_stamp = np.zeros(0)
+        # Points of the clock: (number of a sample, its time), of the newest blocks.
         self._points: list[tuple[float, float]] = []
+        # Last computed time; empty before the first.
+        self._last_time = np.zeros(0)
 
     def push(self, stamp_ns: np.ndarray) -> None:
         """Add stamps in the order of arrival."""
@@ -400,103 +429,113 @@ class CountedClock:
         They are in the order of the stamps.
         """
         while len(self._raw) >= CLOCK_BLOCK + LOSS_REACH or (final and len(self._raw)):
-            pause = np.flatnonzero(np.diff(self._raw[: CLOCK_BLOCK + LOSS_REACH]) > PAUSE_NS)
-            end = len(self._raw) if not len(pause) else int(pause[0]) + 1
-            self._work(
-                self._raw[: min(CLOCK_BLOCK, end)],
-                self._raw[min(CLOCK_BLOCK, end) : min(CLOCK_BLOCK + LOSS_REACH, end)],
-            )
-            self._raw = self._raw[min(CLOCK_BLOCK, end) :]
-            if len(pause) and end <= CLOCK_BLOCK:
+            # A block and the stamps ahead of it end at a pause.
+            pauses = np.flatnonzero(np.diff(self._raw[: CLOCK_BLOCK + LOSS_REACH]) > PAUSE_NS)
+            end = int(pauses[0]) + 1 if len(pauses) else len(self._raw)
+            block_end = min(CLOCK_BLOCK, end)
+            ahead_end = min(CLOCK_BLOCK + LOSS_REACH, end)
+            self._add_block(self._raw[:block_end], self._raw[block_end:ahead_end])
+            self._raw = self._raw[block_end:]
+            if len(pauses) and end <= CLOCK_BLOCK:
                 self._finish()
         if final:
             self._finish()
-        times, self._times = np.concatenate(self._times), [np.zeros(0, np.int64)]
+        times = np.concatenate(self._times)
+        self._times = [np.zeros(0, np.int64)]
         return times
 
-    def _work(self, stamp_ns: np.ndarray, ahead_ns: np.ndarray) -> None:
-        """Number a block, compute its point, and compute the times of the block before it."""
+    def _add_block(self, stamp_ns: np.ndarray, ahead_ns: np.ndarray) -> None:
+        """
+        Number a block, compute its point, and compute the times of the block before it.
+
+        `ahead_ns`: the next stamps, which decide whether samples were lost at a long step.
+        """
         if self._origin_ns is None:
             self._origin_ns = int(stamp_ns[0])
         stamp = (np.concatenate([stamp_ns, ahead_ns]) - self._origin_ns).astype(float)
-        number = self._numbered(stamp, len(stamp_ns))
+        number = self._numbers(stamp, len(stamp_ns))
         stamp = stamp[: len(stamp_ns)]
-        self._before = np.stack(
-            [np.concatenate([self._before[0], number]), np.concatenate([self._before[1], stamp])]
-        )[:, -LOSS_REACH:]
-        self._next = number[-1] + 1
-        # The few samples of a shorter one may all be late.
+        self._before = np.hstack([self._before, [number, stamp]])[:, -LOSS_REACH:]
+        self._next_number = number[-1] + 1
+        # A shorter block has no point, because its few samples may all be late.
         if len(number) >= CLOCK_BLOCK // 2 or not self._points:
-            late = stamp - self._period * number
-            usual = late.min() if self._arrivals else late.mean()
-            self._points.append((float(number.mean()), float(usual + self._period * number.mean())))
+            offsets = stamp - self._period * number
+            offset = offsets.min() if self._arrivals else offsets.mean()
+            mean_number = float(number.mean())
+            self._points.append((mean_number, float(offset + self._period * mean_number)))
         if self._block is not None:
-            self._tell(self._block)
-            self._follow()
-        self._block, self._stamp = number, stamp
+            self._add_times(self._block)
+            self._update_period()
+        self._block = number
+        self._block_stamp = stamp
 
-    def _numbered(self, stamp: np.ndarray, count: int) -> np.ndarray:
+    def _numbers(self, stamp: np.ndarray, count: int) -> np.ndarray:
         """
-        Return the numbers of the first `count` samples.
+        Return the numbers of the first `count` samples, shape (count,).
 
-        Increments of one, plus the number of samples lost at a long step.
+        They increase by one, and by the number of lost samples at a long step. That is the change
+        of ``stamp - period * number`` from the samples before to those from the step on, in
+        periods: the earliest of times of arrival, otherwise the median, of `LOSS_REACH` samples.
         """
-        middle = np.min if self._arrivals else np.median
-        number = self._next + np.arange(len(stamp))
-        step = np.diff(stamp, prepend=self._before[1, -1] if self._before.shape[1] else stamp[0])
+        central = np.min if self._arrivals else np.median
+        number = self._next_number + np.arange(len(stamp))
+        stamp_before = self._before[1, -1] if self._before.shape[1] else stamp[0]
+        step = np.diff(stamp, prepend=stamp_before)
         for k in np.flatnonzero(step[:count] > MAX_REGULAR_STEP * self._period):
-            past = np.concatenate(
+            offset_before = np.concatenate(
                 [
                     self._before[1] - self._period * self._before[0],
                     stamp[:k] - self._period * number[:k],
                 ]
             )[-LOSS_REACH:]
-            if len(past):
-                jump = middle(
-                    stamp[k : k + LOSS_REACH] - self._period * number[k : k + LOSS_REACH]
-                ) - middle(past)
-                number[k:] += np.round(jump / self._period) if jump > self._margin else 0.0
+            if not len(offset_before):
+                continue
+            after = slice(k, k + LOSS_REACH)
+            jump = central(stamp[after] - self._period * number[after]) - central(offset_before)
+            if jump > self._loss_margin:
+                number[k:] += np.round(jump / self._period)
         return number[:count]
 
-    def _tell(self, number: np.ndarray) -> None:
-        """Compute the times of a block, from its point and the points of its neighbours."""
+    def _add_times(self, number: np.ndarray) -> None:
+        """
+        Compute the times of the samples with these numbers, those of the newest block.
+
+        They are on the lines through its point and the points of its neighbours, continued with the
+        period. In parts where the stamps fit a clock better, these are used.
+        """
         points = np.array(self._points)
-        ends = (
-            points[0] - (CLOCK_BLOCK, CLOCK_BLOCK * self._period),
-            points[-1] + (CLOCK_BLOCK, CLOCK_BLOCK * self._period),
-        )
-        points = np.vstack([ends[0], points, ends[1]])
-        times = np.interp(number, points[:, 0], points[:, 1])
-        recorded = np.zeros(len(times), bool)
-        for part in misfits(self._stamp, times, self._period, arrivals=self._arrivals):
-            recorded[part] = True
-        mixed = np.where(recorded, self._stamp, times)
-        if np.any(np.diff(np.append(self._told, mixed)) <= 0):
-            # a computed part beside a recorded one, or this block and the one before, overlap
-            mixed = self._stamp
-        if recorded.any() or mixed is self._stamp:
-            times = mixed
+        block_length = (CLOCK_BLOCK, CLOCK_BLOCK * self._period)
+        points = np.vstack([points[0] - block_length, points, points[-1] + block_length])
+        computed = np.interp(number, points[:, 0], points[:, 1])
+        is_recorded = np.zeros(len(computed), bool)
+        for part in misfits(self._block_stamp, computed, self._period, arrivals=self._arrivals):
+            is_recorded[part] = True
+        times = np.where(is_recorded, self._block_stamp, computed)
+        # A computed part may overlap a recorded one, or this block the one before.
+        overlaps = bool(np.any(np.diff(np.append(self._last_time, times)) <= 0))
+        if overlaps:
+            times = self._block_stamp
+        if is_recorded.any() or overlaps:
             self._points = self._points[-1:]
-        self._told = times[-1:]
+        self._last_time = times[-1:]
         self._times.append((self._origin_ns or 0) + np.rint(times).astype(np.int64))
 
-    def _follow(self) -> None:
-        """Update the period; keep the last two points."""
+    def _update_period(self) -> None:
+        """Update the period from the last two points, and keep only these."""
         if len(self._points) < 2:
             return
         (n0, t0), (n1, t1) = self._points[-2:]
         period = (t1 - t0) / (n1 - n0)
-        self._period = (
-            period
-            if abs(period - self._period) > FOLLOW * self._period
-            else self._period + NEW_WEIGHT * (period - self._period)
-        )
+        if abs(period - self._period) > FOLLOW * self._period:
+            self._period = period
+        else:
+            self._period = self._period + NEW_WEIGHT * (period - self._period)
         self._points = self._points[-2:]
 
     def _finish(self) -> None:
         """Compute the remaining times, and reset."""
         if self._block is not None:
-            self._tell(self._block)
+            self._add_times(self._block)
         self._begin()
 
 
@@ -518,120 +557,146 @@ class SampleTimes:
 
     def __init__(self) -> None:
         self.line: StampLine | None = None
-        """Relation of the stamps to the sampling, as far as known."""
-        self.n_rebuilt = self.n_irregular = self.n_repeated = 0
-        """Samples with a computed time; samples whose stamps follow no clock; repeated messages."""
-        self._odd_lines: dict[Stamping, StampLine] = {}
+        """Relation of the stamps to the sampling; None before it is known."""
+        self.n_rebuilt = 0
+        """Samples with a computed time."""
+        self.n_irregular = 0
+        """Samples whose stamps follow no clock."""
+        self.n_repeated = 0
+        """Repeated messages."""
+        # Newest line of each use of the stamps.
+        self._line_of_use: dict[Stamping, StampLine] = {}
+        # The sample before the next ones, in an array of one.
         self._last: Any = None
         self._begin()
 
     def _begin(self) -> None:
+        """Begin a stretch of the stream; the line and the counts remain."""
+        # Whether the stamps of this stretch are not classified yet; its samples are buffered.
         self._learning = True
+        # Not None while times are computed.
         self._clock: Any = None
-        self._held: Any = None
-        self._history, self._unseen, self._reviewed = np.zeros(0, np.int64), 0, 0
+        # Samples without a time.
+        self._buffered: Any = None
+        # Newest stamps, the number of them since the last full block, and of blocks since a review
+        # of counted stamps.
+        self._history = np.zeros(0, np.int64)
+        self._n_in_block = 0
+        self._n_blocks = 0
         self._order = TimesInOrder()
 
     def push(self, samples: ImuSamples) -> ImuSamples | None:
         """
         Return the samples whose times are determined now, in the order of arrival; None for none.
         """
-        if self._pass(samples):
+        if self._pass_if_regular(samples):
             return samples
         samples = self._without_repeated(samples)
         ready = []
         while len(samples):
-            part = samples.select(slice(0, CLOCK_BLOCK - self._unseen))
-            samples = samples.select(slice(CLOCK_BLOCK - self._unseen, None))
-            self._unseen = (self._unseen + len(part)) % CLOCK_BLOCK
+            part = samples.select(slice(0, CLOCK_BLOCK - self._n_in_block))
+            samples = samples.select(slice(CLOCK_BLOCK - self._n_in_block, None))
+            self._n_in_block = (self._n_in_block + len(part)) % CLOCK_BLOCK
             self._history = np.concatenate([self._history, part.stamp_ns])[-STAMP_HISTORY:]
             ready += self._take(part)
         return _joined(ready)
 
     def finish(self) -> ImuSamples | None:
         """Return the buffered samples, and reset."""
-        if self._learning and self._held is not None:
-            self._judge(describe_stamps(self._held.stamp_ns))
-        ready = (
-            self._counted(final=True) if self._clock is not None else [self._ordered(self._held)]
-        )
+        if self._learning and self._buffered is not None:
+            self._set_line(describe_stamps(self._buffered.stamp_ns))
+        if self._clock is not None:
+            ready = self._counted(final=True)
+        else:
+            ready = [self._ordered(self._buffered)]
         self._begin()
         return _joined(ready)
 
-    def _pass(self, samples: ImuSamples) -> bool:
+    def _pass_if_regular(self, samples: ImuSamples) -> bool:
         """
-        Return whether all steps agree with the known clock: the usual case, without further tests.
+        Return whether all steps agree with the known clock; then record the samples as passed.
+
+        This is the usual case, in which the samples need no further tests.
         """
         if self._learning or self._clock is not None or self.line is None or not len(samples):
             return False
         # The complete block of the next review.
-        step = np.diff(np.concatenate([self._history[-self._unseen - 1 :], samples.stamp_ns]))
+        step = np.diff(np.concatenate([self._history[-self._n_in_block - 1 :], samples.stamp_ns]))
         if not np.all(is_regular(step, self.line.period_ns)):
             return False
         if not self._order.passes(samples.stamp_ns):
             return False
-        self._unseen = (self._unseen + len(samples)) % CLOCK_BLOCK
-        self._history = np.concatenate([self._history, samples.stamp_ns[-STAMP_HISTORY:]])[
-            -STAMP_HISTORY:
-        ]
+        self._n_in_block = (self._n_in_block + len(samples)) % CLOCK_BLOCK
+        history = np.concatenate([self._history, samples.stamp_ns[-STAMP_HISTORY:]])
+        self._history = history[-STAMP_HISTORY:]
         self._last = samples.select(slice(len(samples) - 1, None))
         return True
 
     def _without_repeated(self, samples: ImuSamples) -> ImuSamples:
+        """Return samples without those that repeat the stamp and the readings of the one before."""
         joined = samples if self._last is None else ImuSamples.concatenate([self._last, samples])
-        at = np.flatnonzero(joined.stamp_ns[1:] == joined.stamp_ns[:-1])
-        same = at[
-            np.all(joined.force_s[at] == joined.force_s[at + 1], axis=1)
-            & np.all(joined.rate_s[at] == joined.rate_s[at + 1], axis=1)
-        ]
+        n_before = len(joined) - len(samples)
         self._last = joined.select(slice(len(joined) - 1, None))
-        if not len(same):
+        # Sample k + 1 has the stamp of sample k.
+        k = np.flatnonzero(joined.stamp_ns[1:] == joined.stamp_ns[:-1])
+        has_same_force = np.all(joined.force_s[k] == joined.force_s[k + 1], axis=1)
+        has_same_rate = np.all(joined.rate_s[k] == joined.rate_s[k + 1], axis=1)
+        repeated = k[has_same_force & has_same_rate] + 1
+        if not len(repeated):
             return samples
-        self.n_repeated += len(same)
-        new = np.arange(len(joined)) >= len(joined) - len(samples)
-        new[same + 1] = False
-        return joined.select(new)
+        self.n_repeated += len(repeated)
+        kept = np.arange(len(joined)) >= n_before
+        kept[repeated] = False
+        return joined.select(kept)
 
     def _take(self, part: ImuSamples) -> list:
         """Add a block or a part of one; return the samples that are ready."""
         if self._learning:
-            self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
-            stamp_ns = self._held.stamp_ns
-            some = stamp_ns[: MIN_PERIOD_STEPS + 1] if len(stamp_ns) < STAMP_HISTORY else stamp_ns
-            line = describe_stamps(some) if len(stamp_ns) > MIN_PERIOD_STEPS else None
-            if line is None and len(stamp_ns) < STAMP_HISTORY:
+            self._add_to_buffer(part)
+            stamp_ns = self._buffered.stamp_ns
+            is_full = len(stamp_ns) >= STAMP_HISTORY
+            line = None
+            if len(stamp_ns) > MIN_PERIOD_STEPS:
+                # Before it is full, regular stamps only are recognised, by the first ones.
+                line = describe_stamps(stamp_ns if is_full else stamp_ns[: MIN_PERIOD_STEPS + 1])
+            if line is None and not is_full:
                 return []
             self._learning = False
-            return self._judge(line) + self._on(None)
-        ready = self._on(part)
-        if not self._unseen:
-            self._reviewed = (self._reviewed + 1) % RARE
-            if self._odd() if self._clock is None else not self._reviewed:
-                ready += self._judge(describe_stamps(self._history))
+            return self._set_line(line) + self._with_times(None)
+
+        ready = self._with_times(part)
+        if not self._n_in_block:
+            self._n_blocks = (self._n_blocks + 1) % RARE
+            is_due = self._block_differs() if self._clock is None else not self._n_blocks
+            if is_due:
+                ready += self._set_line(describe_stamps(self._history))
         return ready
 
-    def _on(self, part: ImuSamples | None) -> list:
-        """Return the held samples and a further part, unchanged or with times from the clock."""
+    def _add_to_buffer(self, part: ImuSamples) -> None:
+        if self._buffered is not None:
+            part = ImuSamples.concatenate([self._buffered, part])
+        self._buffered = part
+
+    def _with_times(self, part: ImuSamples | None) -> list:
+        """Return the buffered samples and `part`, unchanged or with times from the clock."""
         if self._clock is None:
-            held, self._held = self._held, None
-            self.n_irregular += (
-                len(part or ()) if self.line is not None and self.line.word == IRREGULAR else 0
-            )
-            return [self._ordered(held), self._ordered(part)]
+            buffered = self._buffered
+            self._buffered = None
+            if part is not None and self.line is not None and self.line.word == IRREGULAR:
+                self.n_irregular += len(part)
+            return [self._ordered(buffered), self._ordered(part)]
         if part is not None:
             self._clock.push(part.stamp_ns)
-            self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
+            self._add_to_buffer(part)
         return self._counted()
 
     def _counted(self, final: bool = False) -> list:
-        """Return the samples at the front whose times are determined."""
+        """Return the first buffered samples whose times are determined, all with `final`."""
         times = self._clock.take(final)
         if not len(times):
             return []
-        timed, self._held = (
-            self._held.select(slice(0, len(times))),
-            self._held.select(slice(len(times), None)),
-        )
+        timed = self._buffered.select(slice(0, len(times)))
+        self._buffered = self._buffered.select(slice(len(times), None))
         self.n_rebuilt += len(times)
         return [replace(timed, stamp_ns=self._order.push(timed.stamp_ns, times))]
 
@@ -648,45 +713,49 @@ class SampleTimes:
 
         It is returned when it concerns more than a few of `count` samples.
         """
-        number, word = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
-        return self._odd_lines.get(word) if number > MAX_IRREGULAR_SHARE * count else None
+        number, use = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
+        return self._line_of_use.get(use) if number > MAX_IRREGULAR_SHARE * count else None
 
-    def _odd(self) -> bool:
+    def _block_differs(self) -> bool:
         """Return whether the steps of the last block differ from the known clock."""
         if self.line is None:
             return True
         step = np.diff(self._history[-CLOCK_BLOCK - 1 :])
-        return bool(
-            np.count_nonzero(~is_regular(step, self.line.period_ns))
-            > MAX_IRREGULAR_SHARE * len(step)
-        )
+        n_irregular = np.count_nonzero(~is_regular(step, self.line.period_ns))
+        return bool(n_irregular > MAX_IRREGULAR_SHARE * len(step))
 
-    def _judge(self, line: StampLine | None) -> list:
-        """Start or stop counting according to the stamps; return the samples that become ready."""
+    def _set_line(self, line: StampLine | None) -> list:
+        """
+        Begin or end to compute times according to a line; return the samples that become ready.
+        """
         if line is None:
             return []
-        before, self.line = self.line, line
-        self._odd_lines[line.word] = line
-        changed = (
-            before is not None
-            and abs(line.period_ns - before.period_ns) > FOLLOW * before.period_ns
-        )
-        if (line.word == COUNTED) == (self._clock is not None) and not (
-            changed and self._clock is not None
-        ):
-            return []
+        before = self.line
+        self.line = line
+        self._line_of_use[line.word] = line
         ready = []
-        if self._clock is not None:
-            ready, self._clock = self._counted(final=True), None
+        if self._clock is None:
+            if line.word != COUNTED:
+                return []
+        else:
+            has_same_period = (
+                before is None
+                or abs(line.period_ns - before.period_ns) <= FOLLOW * before.period_ns
+            )
+            if line.word == COUNTED and has_same_period:
+                return []
+            ready = self._counted(final=True)
+            self._clock = None
             if line.word != COUNTED:
                 return ready
         self._clock = CountedClock(line)
-        if self._held is not None:
-            self._clock.push(self._held.stamp_ns)
+        if self._buffered is not None:
+            self._clock.push(self._buffered.stamp_ns)
         return ready
 
 
 def _joined(parts: list) -> ImuSamples | None:
+    """Return samples joined in order, without empty parts and None; None for none."""
     parts = [part for part in parts if part is not None and len(part)]
     if not parts:
         return None

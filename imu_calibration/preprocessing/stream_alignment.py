@@ -293,7 +293,7 @@ class MotionChunks:
         self._joints.forget_before(oldest_ns)
         self._temperature.forget_before(oldest_ns, keep_one=True)
 
-    def _count(self, reason: str, number: int) -> None:
+    def _count(self, reason: str, number: int | np.integer) -> None:
         self.counts += Counter({reason: int(number)})  # without zeros
 
     def _process_chunk(self, start_ns: int, final: bool) -> PhasedSamples | None:
@@ -331,9 +331,13 @@ class MotionChunks:
         )
         temperature = self._temperature_at(stamp_ns, last_ns)
         vibration = self._vibration.of(period, imu.force_s[core])
+        position, joint_rate, acceleration, jerk = derivatives
         motion = JointMotion(
             time[core] + self.time_origin,
-            *derivatives,
+            position,
+            joint_rate,
+            acceleration,
+            jerk,
             temperature.branch,
             vibration,
             temperature.rate,
