@@ -1,6 +1,6 @@
 """Checks of the joints, and of joints that stand still while the IMU turns."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -21,6 +21,8 @@ from imu_calibration.preprocessing.joint_geometry import (
 )
 from imu_calibration.preprocessing.on_table import (
     TESTED_RATE,
+    AxisMatch,
+    ProductSums,
     a_period_late,
     exchanged,
     find_exchange,
@@ -78,26 +80,9 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     if not windows:
         return None
     expected = _expected_rates(windows, table)
-    turning = [np.linalg.norm(rate, axis=1) > MIN_TURN_RATE for rate in expected]
-    repeats = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
-    same = [np.append(each.all(axis=1), False) for each in repeats]
-    bias = np.median(
-        np.concatenate([window.rate_s - rate for window, rate in zip(windows, expected)]), axis=0
-    )
-    coarse = np.concatenate(repeats).mean() > OFTEN
-    step = np.min([smallest_step(window.rate_s) for window in windows], axis=0)
-    known = np.isfinite(step)  # an axis without motion has the steps of the other axes
-    step = np.where(known, step, step[known].max(initial=0.0)) if coarse else np.zeros(3)
-    repeated = []
-    for window, flags, turns, rate in zip(windows, same, turning, expected):
-        for start, stop in runs_of(flags):
-            first = float(window.time[start])
-            last = float(window.time[stop - 1])
-            if last - first < LASTING or turns[start:stop].mean() <= 0.5:
-                continue
-            if not _rounded(window.rate_s[start], rate[start:stop], bias, step):
-                repeated.append((first, last))
-    spans = _joined(repeated)
+    differences = [window.rate_s - rate for window, rate in zip(windows, expected)]
+    bias = np.median(np.concatenate(differences), axis=0)
+    spans = _repeating_spans(windows, expected, bias)
     if spans:
         return CheckFinding(
             'frozen',
@@ -133,16 +118,44 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     return description_error(windows, table) if is_unexplained(windows, expected) else None
 
 
+def _repeating_spans(
+    windows: Sequence[Window], expected: Sequence[np.ndarray], bias: np.ndarray
+) -> list[tuple[float, float]]:
+    """
+    Return (start, stop) in which the gyroscope repeats one reading while the joints turn, s.
+
+    Not where the reading is the expected rate of the joints, rad/s, plus the bias, rounded to the
+    steps of a coarse gyroscope.
+    """
+    is_repeated = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
+    step = np.zeros(3)
+    if np.concatenate(is_repeated).mean() > OFTEN:
+        step = np.min([smallest_step(window.rate_s) for window in windows], axis=0)
+        known = np.isfinite(step)  # an axis without motion has the steps of the other axes
+        step = np.where(known, step, step[known].max(initial=0.0))
+    spans = []
+    for window, repeated, rate in zip(windows, is_repeated, expected):
+        turns = np.linalg.norm(rate, axis=1) > MIN_TURN_RATE
+        for start, stop in runs_of(np.append(repeated.all(axis=1), False)):
+            first = float(window.time[start])
+            last = float(window.time[stop - 1])
+            if last - first < LASTING or turns[start:stop].mean() <= 0.5:
+                continue
+            if not _is_rounded(window.rate_s[start], rate[start:stop], bias, step):
+                spans.append((first, last))
+    return _joined(spans)
+
+
 def _expected_rates(windows: Sequence[Window], table: Table) -> list[np.ndarray]:
     """Return the rates of the sensor by the joints in each window, rad/s, shape (n, 3)."""
     return [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
 
 
-def _unsaturated(windows):
+def _unsaturated(windows: Sequence[Window]) -> list[Window]:
     """
     Return the windows in which no rate is at an end of its range.
 
-    What a saturated axis lacks may lie along the axis of a joint that rests.
+    The missing part of a saturated rate may lie along the axis of a joint that rests.
     """
     rates = np.concatenate([window.rate_s for window in windows])
     ends = np.stack([rates.min(axis=0), rates.max(axis=0)])
@@ -154,7 +167,9 @@ def _unsaturated(windows):
     return [window for window, part in zip(windows, parts) if not part.any()]
 
 
-def _frozen_spans(windows, table, expected, *, joint):
+def _frozen_spans(
+    windows: Sequence[Window], table: Table, expected: Sequence[np.ndarray], *, joint: int
+) -> list[tuple[float, float]]:
     """Return the joined spans of all windows in which a joint is frozen."""
     spans = []
     for window, rate in zip(windows, expected):
@@ -162,53 +177,58 @@ def _frozen_spans(windows, table, expected, *, joint):
     return _joined(spans)
 
 
-def _frozen(window, table, expected, *, joint):
+def _frozen(
+    window: Window, table: Table, expected: np.ndarray, *, joint: int
+) -> Iterator[tuple[float, float]]:
     """
-    Yield (start, stop) in which a joint's state is constant despite rotation.
+    Yield (start, stop) in which a joint's state is constant while the IMU turns about its axis, s.
 
-    The residual rate is along the joint's axis in that time.
+    The residual, measured minus expected rates, (n, 3), rad/s, is along the axis in that time.
     """
     for start, stop in runs_of(np.abs(window.motion.rate[:, joint]) < MAX_REPEATED_RATE):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
+        # The axis of the joint in the sensor frame: change of the rates for 1 rad/s more.
         motion = window.motion.select(slice(start, stop))
-        rest = (window.rate_s - expected)[start:stop]
-        faster = motion.rate.copy()
-        faster[:, joint] += 1.0
-        plain, changed = (
-            reference_motion(table, each, attitude=False).rate_s
-            for each in (motion, replace(motion, rate=faster))
+        joint_rates = motion.rate.copy()
+        joint_rates[:, joint] += 1.0
+        faster = replace(motion, rate=joint_rates)
+        axis = (
+            reference_motion(table, faster, attitude=False).rate_s
+            - reference_motion(table, motion, attitude=False).rate_s
         )
-        axis = changed - plain
+        # A late clock turns the rates of the other joints about this axis too: without the lag.
+        residual = (window.rate_s - expected)[start:stop]
         slope = np.gradient(expected[start:stop], window.time[start:stop], axis=0)
-        # A late clock turns the rates of the other joints about this axis too.
-        lag = (rest * slope).sum() / max((slope**2).sum(), 1e-300)
-        rest = rest - lag * slope
-        along = (rest * axis).sum(axis=1)
-        measured = (window.rate_s[start:stop] * axis).sum(axis=1)
-        square = float(along @ along)
+        lag = (residual * slope).sum() / max((slope**2).sum(), 1e-300)
+        residual = residual - lag * slope
+
+        residual_along = (residual * axis).sum(axis=1)
+        measured_along = (window.rate_s[start:stop] * axis).sum(axis=1)
+        square_along = float(residual_along @ residual_along)
         if (
-            square > len(along) * MIN_TURN_RATE**2
-            and square > FROZEN_SHARE * (rest**2).sum()
-            and square > OWN**2 * (measured @ measured)
+            square_along > len(residual_along) * MIN_TURN_RATE**2
+            and square_along > FROZEN_SHARE * (residual**2).sum()
+            and square_along > OWN**2 * (measured_along @ measured_along)
         ):
             yield float(window.time[start]), float(window.time[stop - 1])
 
 
-def _rounded(reading, expected, bias, step):
+def _is_rounded(
+    reading: np.ndarray, expected: np.ndarray, bias: np.ndarray, step: np.ndarray
+) -> bool:
     """
-    Return whether one reading represents the reference rates.
+    Return whether one reading, (3,), is that of all expected rates, (n, 3), with a coarse step.
 
-    Shape (n, 3), up to one step per axis and wrong gains and axes.
+    The rates vary by at most one step per axis, (3,). The reading differs from rate plus bias by at
+    most one step, and by the share of the rates that wrong gains and axes cause.
     """
     error = np.linalg.norm(reading - expected - bias, axis=1)
-    return bool(
-        (np.ptp(expected, axis=0) <= step).all()
-        and (error <= np.linalg.norm(step) + OWN * np.linalg.norm(expected, axis=1)).all()
-    )
+    allowed = np.linalg.norm(step) + OWN * np.linalg.norm(expected, axis=1)
+    return bool((np.ptp(expected, axis=0) <= step).all() and (error <= allowed).all())
 
 
-def _joined(spans):
+def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """Return spans in order, merged where the gap is below a second."""
     joined: list[tuple[float, float]] = []
     for start, stop in sorted(spans):
@@ -264,67 +284,78 @@ def against_joints(gathered: Reduced, model: SensorModel, table: Table) -> tuple
         Gives the mount that would fit.
 
     """
-    found = []
+    findings: list[CheckFinding] = []
     for sensor in ('gyroscope', 'accelerometer'):
         if sensor in gathered.absent:
             continue
-        moments = _moments(gathered.accumulator, model, sensor)
-        if moments is not None:
-            found += _rates(moments, gathered.moving, table) if sensor == 'gyroscope' else []
-            found += _axes(sensor, moments, table, gathered.moving)
-    return tuple(found)
+        sums = _product_sums(gathered.accumulator, model, sensor)
+        if sums is not None:
+            if sensor == 'gyroscope':
+                findings += _rate_findings(sums, gathered.moving, table)
+            findings += _axis_findings(sensor, sums, table, gathered.moving)
+    return tuple(findings)
 
 
-def _moments(accumulator, model, sensor):
+def _product_sums(accumulator: Any, model: SensorModel, sensor: str) -> ProductSums | None:
     """
-    Return sums of products (measured with reference, reference with itself, measured with itself).
+    Return the sums of products of rates, or of specific forces at rest; None without motion.
 
-    Or None.
+    The rates are without their mean in windows, weighted by samples; those of the samples within
+    windows are added.
     """
     part = model.columns_of(sensor, Role.LINEAR)
-    rows = [row for row in accumulator.rows if sensor == 'gyroscope' or row.kind == 'static']
+    is_gyroscope = sensor == 'gyroscope'
+    rows = [row for row in accumulator.rows if is_gyroscope or row.kind == 'static']
     if not rows:
         return None
-    weight = np.array([row.count if sensor == 'gyroscope' else 1.0 for row in rows])
+    weight = np.array([row.count if is_gyroscope else 1.0 for row in rows])
     means = np.array([row.sensors[sensor].mean for row in rows])
-    if sensor == 'gyroscope':
+    if is_gyroscope:
         means = means - weight @ means / weight.sum()  # the bias
     total = (means * weight[:, None]).T @ means
-    for (name, _), factor in accumulator.within.items():
-        if name == sensor == 'gyroscope':
-            total = total + factor.T @ factor
-    if sensor == 'gyroscope':
+    if is_gyroscope:
+        for (name, _), factor in accumulator.within.items():
+            if name == 'gyroscope':
+                total = total + factor.T @ factor
         samples = sum(accumulator.samples.values())
         if np.trace(total[part, part]) < TESTED_RATE**2 * max(samples, 1):
             return None
-    return total[-3:, part], total[part, part], total[-3:, -3:]
+    # The last three columns are the measured readings.
+    return ProductSums(
+        cross=total[-3:, part], reference=total[part, part], measured=total[-3:, -3:]
+    )
 
 
-def _seen(sensor, moment):
+def _seen_directions(sensor: str, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (projector on the directions that the reference shows, inverse of its moment there).
+    Return the projector on the directions with enough reference power, and the inverse there.
+
+    `reference`: sums of products of the reference with itself; all of shape (3, 3).
     """
-    values, vectors = np.linalg.eigh(moment)
-    shown = values > LEAST_POWER_SHARE[sensor] * values.max()
-    vectors = vectors[:, shown]
-    return vectors @ vectors.T, vectors @ np.diag(1.0 / values[shown]) @ vectors.T
+    values, vectors = np.linalg.eigh(reference)
+    is_seen = values > LEAST_POWER_SHARE[sensor] * values.max()
+    vectors = vectors[:, is_seen]
+    return vectors @ vectors.T, vectors @ np.diag(1.0 / values[is_seen]) @ vectors.T
 
 
-def _rates(moments, windows, table):
-    found = list(_rate_units(moments))
-    if found:
-        return found
+def _rate_findings(sums: ProductSums, windows: list[Window], table: Table) -> list[CheckFinding]:
+    """Return the finding of rates that are not those of the joints, apart from the IMU axes."""
+    unit_findings = list(_rate_units(sums))
+    if unit_findings:
+        return unit_findings
     exchange = find_exchange(windows, table)
     if exchange and not exchange.joints and exchange.span is None:
-        return []  # `_axes` reports turned or exchanged IMU axes, with the mount that fits
+        return []  # `_axis_findings` reports turned or exchanged axes, with the mount that fits
     finding = exchanged(exchange, windows, table) if exchange else None
-    finding = finding or standing_still(windows, table) or same_motion(moments, windows, table)
+    finding = finding or standing_still(windows, table) or same_motion(sums, windows, table)
     return [] if finding is None else [finding]
 
 
-def _rate_units(moments):
-    cross, reference, measured = moments
-    ratio = np.sqrt(np.trace(measured) / np.trace(reference))
+def _rate_units(sums: ProductSums) -> Iterator[CheckFinding]:
+    """Yield the finding of rates or joint positions in another unit, by the ratio of their rms."""
+    measured_power = np.trace(sums.measured)
+    reference_power = np.trace(sums.reference)
+    ratio = np.sqrt(measured_power / reference_power)
     if not ratio > 0:
         return
     if 40 < ratio < 80:
@@ -342,7 +373,7 @@ def _rate_units(moments):
         )
     elif (
         scale_range(ratio) is IMPOSSIBLE
-        and np.linalg.norm(cross) ** 2 > RELATED * np.trace(measured) * np.trace(reference) / 3
+        and np.linalg.norm(sums.cross) ** 2 > RELATED * measured_power * reference_power / 3
     ):
         yield wrong_rate_unit(
             f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints:'
@@ -350,33 +381,35 @@ def _rate_units(moments):
         )
 
 
-def _axes(sensor, moments, table, windows):
-    cross, reference, measured = moments
-    seen, inverse = _seen(sensor, reference)
-    matrix = cross @ inverse
-    if np.trace(matrix @ reference @ matrix.T) < RELATED * np.trace(measured):
+def _axis_findings(
+    sensor: str, sums: ProductSums, table: Table, windows: list[Window]
+) -> Iterator[CheckFinding]:
+    """Yield the finding of a sensor with other axes than the table, from a fit by least squares."""
+    seen, inverse = _seen_directions(sensor, sums.reference)
+    matrix = sums.cross @ inverse
+    if np.trace(matrix @ sums.reference @ matrix.T) < RELATED * np.trace(sums.measured):
         return  # a different fault dominates the readings and is reported by other checks
     match = match_axes(matrix, seen)
     if not match.wrong:
         return
-    delay = (
-        signs_or_delay(windows, table)
-        if sensor == 'gyroscope' and match.turned and match.mirrored
-        else None
-    )
+    # Rates of the opposite sign may be half a period late.
+    delay = None
+    if sensor == 'gyroscope' and match.turned and match.mirrored:
+        delay = signs_or_delay(windows, table)
     if delay and delay.sure:
         yield CheckFinding('on_table', REFUSE, f'both streams must share one clock: {delay.words}')
         return
-    what, whose = WORDS[sensor]
+    readings, reference_readings = WORDS[sensor]
     yield CheckFinding(
         'handedness',
         REFUSE,
-        f'{what} must be {whose}, {match.words(seen) or NO_EXCHANGE}:'
+        f'{readings} must be {reference_readings}, {match.words(seen) or NO_EXCHANGE}:'
         f' {_cause(match, matrix, seen, table)}' + (f'; or {delay.words}' if delay else ''),
     )
 
 
-def _cause(match, matrix, seen, table):
+def _cause(match: AxisMatch, matrix: np.ndarray, seen: np.ndarray, table: Table) -> str:
+    """Return the cause of wrong axes and the remedy; `matrix`: measured per reference."""
     if match.turned and match.mirrored:
         return (
             'this recording does not separate a rotated sensor from a wrong sign; correct'
@@ -412,10 +445,8 @@ def check_units(gathered: Reduced, model: SensorModel, table: Table) -> None:
     rows = gathered.accumulator.rows
     static = [row for row in rows if row.kind == 'static']
     if static and 'accelerometer' not in gathered.absent:
-        length = float(
-            np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static])
-        )
-        check_force(length)
+        lengths = [np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]
+        check_force(float(np.median(lengths)))
     refuse(against_joints(gathered, model, table))
 
 

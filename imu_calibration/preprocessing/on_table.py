@@ -30,12 +30,12 @@ def signed_permutations() -> np.ndarray:
 
     The identity is first. The rest is ordered by number of changes.
     """
-    every_sign = product((1.0, -1.0), repeat=3)
-    found = [
-        np.eye(3)[list(order)] * np.array(signs)[:, None]
-        for order, signs in product(permutations(range(3)), every_sign)
-    ]
-    return np.array(sorted(found, key=lambda matrix: (matrix != np.eye(3)).any(axis=1).sum()))
+    all_signs = list(product((1.0, -1.0), repeat=3))
+    matrices = []
+    for order in permutations(range(3)):
+        for signs in all_signs:
+            matrices.append(np.eye(3)[list(order)] * np.array(signs)[:, None])
+    return np.array(sorted(matrices, key=lambda matrix: (matrix != np.eye(3)).any(axis=1).sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +45,9 @@ class AxisMatch:
     matrix: np.ndarray
     """Closest signed permutation in ``measured = scale * matrix @ reference``, shape (3, 3)."""
     agreement: float
-    """1: exactly as `matrix`."""
+    """Correlation of the measured matrix with `matrix`; 1: equal up to the scale."""
     as_they_are: float
-    """1: every axis is that of the reference; -1: all turned round."""
+    """The same with the identity; 1: every axis is that of the reference; -1: all are reversed."""
     turned: bool
     """Whether a rotation explains it."""
     mirrored: bool
@@ -71,15 +71,15 @@ class AxisMatch:
         return ', '.join(_axis_phrases(self.matrix, seen)) if self.agreement > MIN_MATCH else ''
 
 
-def _wrong_axes(matrix):
+def _wrong_axes(matrix: np.ndarray) -> list[tuple[int, int, float]]:
     """
     Return (row, column, sign) of the entries of a signed permutation that differ from the identity.
     """
-    found = []
+    entries = []
     for i, j in np.argwhere(matrix):
         if i != j or matrix[i, j] < 0:
-            found.append((int(i), int(j), float(matrix[i, j])))
-    return found
+            entries.append((int(i), int(j), float(matrix[i, j])))
+    return entries
 
 
 def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
@@ -94,19 +94,19 @@ def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
         Projector on the directions in which the reference moved.
 
     """
-    inside = matrix @ seen
-    scale = np.sqrt((inside**2).sum() / np.trace(seen))
+    projected = matrix @ seen
+    scale = np.sqrt((projected**2).sum() / np.trace(seen))
     candidates = signed_permutations()
-    scores = np.einsum('kij,ij->k', candidates, inside) / (scale * np.trace(seen))
-    best = scores.max()
-    near = scores >= best - AGREEMENT_TIE
-    proper = np.linalg.det(candidates) > 0
+    agreements = np.einsum('kij,ij->k', candidates, projected) / (scale * np.trace(seen))
+    best = agreements.max()
+    is_near_best = agreements >= best - AGREEMENT_TIE
+    is_rotation = np.linalg.det(candidates) > 0
     return AxisMatch(
-        candidates[np.argmax(near)],
-        float(best),
-        float(scores[0]),
-        bool((near & proper).any()),
-        bool((near & ~proper).any()),
+        matrix=candidates[np.argmax(is_near_best)],
+        agreement=float(best),
+        as_they_are=float(agreements[0]),
+        turned=bool((is_near_best & is_rotation).any()),
+        mirrored=bool((is_near_best & ~is_rotation).any()),
     )
 
 
@@ -175,80 +175,109 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
     if not windows:
         return None
     time = np.concatenate([window.time for window in windows])
-    every = slice(None, None, max(1, len(time) // MAX_TESTED_SAMPLES))
-    time = time[every]
-    motion = JointMotion.concatenate(window.motion for window in windows).select(every)
-    measured = np.concatenate([np.hstack([window.rate_s, window.force_s]) for window in windows])[
-        every
-    ]
-    rate = measured[:, :3] = measured[:, :3] - np.median(measured[:, :3], axis=0)
-    squares = np.stack(
-        [
-            ((rate - reference_motion(table, motion).rate_s) ** 2).sum(axis=1),
-            (rate**2).sum(axis=1),
-            np.ones(len(time)),
-        ]
-    )
+    thinned = slice(None, None, max(1, len(time) // MAX_TESTED_SAMPLES))
+    time = time[thinned]
+    motion = JointMotion.concatenate(window.motion for window in windows).select(thinned)
+    rate = np.concatenate([window.rate_s for window in windows])[thinned]
+    rate = rate - np.median(rate, axis=0)
+    force = np.concatenate([window.force_s for window in windows])[thinned]
+
+    # Pieces of the recording with motion, and those of them that the table does not explain.
     piece = ((time - time.min()) / TESTED_PIECE_SECONDS).astype(int)
-    residual, power, count = np.array([np.bincount(piece, weights=each) for each in squares])
-    tested = power > TESTED_RATE**2 * count
-    part = (tested & (residual > (1.0 - SAME) * power))[piece]
-    if part.sum() < MIN_TESTED_SAMPLES:
+    error = rate - reference_motion(table, motion).rate_s
+    residual = np.bincount(piece, weights=(error**2).sum(axis=1))
+    power = np.bincount(piece, weights=(rate**2).sum(axis=1))
+    count = np.bincount(piece, weights=np.ones(len(time)))
+    moves = power > TESTED_RATE**2 * count
+    in_moving = moves[piece]
+    in_unexplained = (moves & (residual > (1.0 - SAME) * power))[piece]
+    if in_unexplained.sum() < MIN_TESTED_SAMPLES:
         return None
-    for chosen, span in (
-        (tested[piece], None),
-        (part, (float(time[part].min()), float(time[part].max()))),
-    ):
-        (order, signs), axes, instead, share = _best(measured[chosen], motion.select(chosen), table)
-        joints = _joint_phrases(table.joint_names, order, signs)
-        if share >= LEAST_SHARE_EXPLAINED and (joints or _axis_phrases(axes)):
-            return Exchange(
-                joints, _axis_phrases(axes), _axis_phrases(instead) if joints else (), share, span
-            )
+
+    # An exchange in the complete recording, then one in the unexplained pieces only.
+    unexplained_time = time[in_unexplained]
+    unexplained_span = (float(unexplained_time.min()), float(unexplained_time.max()))
+    for used, span in ((in_moving, None), (in_unexplained, unexplained_span)):
+        best = _best_candidate(rate[used], force[used], motion.select(used), table)
+        joints = _joint_phrases(table.joint_names, best.order, best.signs)
+        axes = _axis_phrases(best.axes)
+        if best.share >= LEAST_SHARE_EXPLAINED and (joints or axes):
+            instead = _axis_phrases(best.axes_alone) if joints else ()
+            return Exchange(joints, axes, instead, best.share, span)
     return None
 
 
-def _best(measured, motion, table):
-    """
-    Return the axes and the shares of the best candidate.
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Order and signs of joints, and IMU axes, that explain the readings best."""
 
-    The result is ((order, signs), matrix of the axes, that of the best candidate without joints,
-    share explained) of the best candidate.
+    order: list[int]
+    """Index of the joint with the readings of each joint."""
+    signs: list[float]
+    """Factor of these readings, 1 or -1."""
+    axes: np.ndarray
+    """Signed permutation P of the IMU axes, shape (3, 3)."""
+    axes_alone: np.ndarray
+    """The one that explains the readings best with the joints as described, shape (3, 3)."""
+    share: float
+    """Share of the rates that is explained."""
+
+
+def _best_candidate(
+    rate: np.ndarray, force: np.ndarray, motion: JointMotion, table: Table
+) -> _Candidate:
+    """
+    Return the candidate that explains most of the rates, then of the force, with fewest changes.
+
+    With a signed permutation P the share of the readings m explained by the reference r is::
+
+        1 - sum |P m - r|^2 / sum |m|^2 = (2 sum (P m) . r - sum |r|^2) / sum |m|^2
     """
     candidates = _candidates(motion.position.shape[1])
     axes = signed_permutations()
-    shares = np.empty((2, len(candidates), len(axes)))
+    rate_share = np.empty((len(candidates), len(axes)))
+    force_share = np.empty((len(candidates), len(axes)))
     for k, (order, signs) in enumerate(candidates):
-        parts = (
-            getattr(motion, name)[:, order] * signs
-            for name in ('position', 'rate', 'acceleration', 'jerk')
+        changed = JointMotion(
+            motion.time,
+            motion.position[:, order] * signs,
+            motion.rate[:, order] * signs,
+            motion.acceleration[:, order] * signs,
+            motion.jerk[:, order] * signs,
         )
-        reference = reference_motion(table, JointMotion(motion.time, *parts))
-        for row, known, expected in zip(
-            shares, (measured[:, :3], measured[:, 3:]), (reference.rate_s, reference.force_s)
-        ):
-            cross = np.einsum('pij,ij->p', axes, known.T @ expected)
-            row[k] = (2.0 * cross - (expected**2).sum()) / max((known**2).sum(), 1e-300)
-    near = shares[0] >= shares[0].max() - AGREEMENT_TIE
-    near &= shares[1] >= shares[1][near].max() - AGREEMENT_TIE
-    joint_changes = [
-        np.count_nonzero((np.array(order) != range(len(order))) | (np.array(signs) < 0))
-        for order, signs in candidates
-    ]
+        reference = reference_motion(table, changed)
+        rate_share[k] = _shares_of_axes(axes, rate, reference.rate_s)
+        force_share[k] = _shares_of_axes(axes, force, reference.force_s)
+    is_near = rate_share >= rate_share.max() - AGREEMENT_TIE
+    is_near &= force_share >= force_share[is_near].max() - AGREEMENT_TIE
+
+    # Numbers of changed joints and axes; a change of both kinds counts as one more.
+    joint_changes = []
+    for order, signs in candidates:
+        is_changed = (np.array(order) != range(len(order))) | (np.array(signs) < 0)
+        joint_changes.append(np.count_nonzero(is_changed))
     axis_changes = (axes != np.eye(3)).any(axis=2).sum(axis=1)
-    changes = np.add.outer(joint_changes, axis_changes) + np.logical_and.outer(
-        joint_changes, axis_changes
+    has_both = np.logical_and.outer(joint_changes, axis_changes)
+    changes = np.add.outer(joint_changes, axis_changes) + has_both
+    k, p = np.unravel_index(np.argmin(np.where(is_near, changes, np.inf)), changes.shape)
+    order, signs = candidates[k]
+    return _Candidate(
+        order=order,
+        signs=signs,
+        axes=axes[p],
+        axes_alone=axes[np.argmax(is_near[0])],
+        share=float(rate_share[k, p]),
     )
-    k, p = np.unravel_index(np.argmin(np.where(near, changes, np.inf)), changes.shape)
-    return candidates[k], axes[p], axes[np.argmax(near[0])], float(shares[0, k, p])
 
 
-def _candidates(n_joints):
-    """
-    Return (index of the joint with the readings of each joint, signs) of candidates.
+def _shares_of_axes(axes: np.ndarray, measured: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the share of the readings, (n, 3), explained with each permutation of the axes."""
+    cross = np.einsum('pij,ij->p', axes, measured.T @ reference)
+    return (2.0 * cross - (reference**2).sum()) / max((measured**2).sum(), 1e-300)
 
-    The description itself is the first of the candidates.
-    """
+
+def _candidates(n_joints: int) -> list[tuple[list[int], list[float]]]:
+    """Return `order` and `signs` of the candidates; those of the description are the first."""
     identity = list(range(n_joints))
     plus = [1.0] * n_joints
     if n_joints <= MAX_PERMUTED_JOINTS:
@@ -269,7 +298,8 @@ def _candidates(n_joints):
     return candidates
 
 
-def _joint_phrases(names, order, signs):
+def _joint_phrases(names: Sequence[str], order: list[int], signs: list[float]) -> tuple[str, ...]:
+    """Return a phrase for each joint that is exchanged or reversed."""
     phrases = []
     for k, (j, sign) in enumerate(zip(order, signs)):
         if k != j and sign > 0:
@@ -281,12 +311,14 @@ def _joint_phrases(names, order, signs):
     return tuple(phrases)
 
 
-def _axis_phrases(axes, seen=np.eye(3)):
-    return tuple(
-        f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}"
-        for i, j, sign in _wrong_axes(axes)
-        if seen[j, j] > 0.5
-    )
+def _axis_phrases(axes: np.ndarray, seen: np.ndarray = np.eye(3)) -> tuple[str, ...]:
+    """Return a phrase for each wrong axis of a permutation, of reference axes with motion."""
+    phrases = []
+    for i, j, sign in _wrong_axes(axes):
+        if seen[j, j] > 0.5:
+            minus = 'minus ' if sign < 0 else ''
+            phrases.append(f"measured {'xyz'[i]} is {minus}the reference's {'xyz'[j]}")
+    return tuple(phrases)
 
 
 MIN_RATE_GAIN = 0.05
@@ -303,7 +335,19 @@ RESOLVED = 4
 """Shifts that are tested per sampling period: the rates of fast sweeps differ within one period."""
 
 
-def same_motion(moments: tuple, windows: list[Window], table: Table) -> CheckFinding | None:
+@dataclass(frozen=True, eq=False)
+class ProductSums:
+    """Sums of products of measured readings and readings expected by the joints, (3, 3) each."""
+
+    cross: np.ndarray
+    """Measured with reference."""
+    reference: np.ndarray
+    """Reference with itself."""
+    measured: np.ndarray
+    """Measured with itself."""
+
+
+def same_motion(sums: ProductSums, windows: list[Window], table: Table) -> CheckFinding | None:
     """
     Return the cause if the gyroscope does not measure the motion of the joints, otherwise None.
 
@@ -312,25 +356,25 @@ def same_motion(moments: tuple, windows: list[Window], table: Table) -> CheckFin
 
     Parameters
     ----------
-    moments : tuple of three arrays (3, 3)
-        Sums of products of rates: measured with reference, reference with itself, measured with
-        itself.
+    sums : ProductSums
+        Of the rates.
     windows : list of Window
         Stored moving windows with their samples; without them, no delay is found.
     table : Table
 
     """
-    cross, reference, measured = moments
-    matrix = cross @ np.linalg.pinv(reference, rcond=0.01)
-    gain = np.sqrt(np.trace(matrix @ reference @ matrix.T) / np.trace(reference))
-    explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
+    # Least squares ``measured = matrix @ reference``.
+    matrix = sums.cross @ np.linalg.pinv(sums.reference, rcond=0.01)
+    fitted_power = np.trace(matrix @ sums.reference @ matrix.T)
+    gain = np.sqrt(fitted_power / np.trace(sums.reference))
+    explained = fitted_power / max(np.trace(sums.measured), 1e-300)
     # Other checks report units, signs and axes.
     if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:
         return a_period_late(windows, table) if explained < 1.0 - SHARE_TIE else None
     key = 'imu_topic'
     cause = 'this IMU does not turn when the table does; give the topic of the IMU on the table'
-    if np.trace(measured) > MIN_RATE_GAIN * np.trace(reference):
-        cause = _cause(windows, table)
+    if np.trace(sums.measured) > MIN_RATE_GAIN * np.trace(sums.reference):
+        cause = _delay_cause(windows, table)
         key = None
     elif gain > MIN_RATE_GAIN:
         return None
@@ -355,33 +399,33 @@ def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckF
 
     Or None if a delay explains the rates better.
     """
-    shift = _best_shift(windows, table)
-    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > exchange.share - SHARE_TIE
-    if late and shift.share > exchange.share + SHARE_TIE:
+    delay = _estimate_delay(windows, table)
+    is_late = abs(delay.seconds) > LEAST_SHIFT and delay.share > exchange.share - SHARE_TIE
+    if is_late and delay.share > exchange.share + SHARE_TIE:
         return None
-    phrases = ', '.join(exchange.joints + exchange.axes) + (
-        f' (or {", ".join(exchange.instead)})' if exchange.instead else ''
-    )
+    phrases = ', '.join(exchange.joints + exchange.axes)
+    if exchange.instead:
+        phrases += f' (or {", ".join(exchange.instead)})'
     span = '' if exchange.span is None else ' from {:.0f} s to {:.0f} s'.format(*exchange.span)
-    remedy = (
-        'correct names and axes in the table description, or the joint states'
-        if exchange.joints
-        else 'correct the axes in the driver of the IMU'
-    ) + ('' if exchange.span is None else ', or exclude that time')
+    remedy = 'correct the axes in the driver of the IMU'
+    if exchange.joints:
+        remedy = 'correct names and axes in the table description, or the joint states'
+    if exchange.span is not None:
+        remedy += ', or exclude that time'
     return CheckFinding(
         'on_table',
         REFUSE,
         f'the rates of the gyroscope must agree with the joints{span}, '
         f'{100 * exchange.share:.0f} % of them are explained if {phrases}; {remedy}'
-        + (f'; or {_late(shift.seconds)}' if late else ''),
+        + (f'; or {_late(delay.seconds)}' if is_late else ''),
     )
 
 
-def _cause(windows, table):
-    """Return the delay with which the streams agree, or ''."""
-    shift = _best_shift(windows, table)
-    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > max(SAME, shift.unshifted + SHARE_TIE)
-    return _late(shift.seconds) if late else ''
+def _delay_cause(windows: Sequence[Window], table: Table) -> str:
+    """Return the delay with which the streams agree, in words, or ''."""
+    delay = _estimate_delay(windows, table)
+    is_better = delay.share > max(SAME, delay.share_near_zero + SHARE_TIE)
+    return _late(delay.seconds) if abs(delay.seconds) > LEAST_SHIFT and is_better else ''
 
 
 def a_period_late(windows: Sequence[Window], table: Table) -> CheckFinding | None:
@@ -391,46 +435,32 @@ def a_period_late(windows: Sequence[Window], table: Table) -> CheckFinding | Non
     Beyond the range of a lag: clocks that differ, or streams of a repeating motion that are a
     period apart.
     """
-    shift, share, unshifted, ambiguous = _best_shift(windows, table)
-    # opposite rates: a wrong sign, or half a period
-    if (
-        ambiguous
-        or abs(shift) <= LEAST_SHIFT
-        or unshifted < -SAME
-        or share < max(LEAST_SHARE_EXPLAINED, unshifted + SHARE_TIE)
-    ):
+    delay = _estimate_delay(windows, table)
+    # A smaller delay is estimated as a lag, with the other parameters.
+    if delay.ambiguous or abs(delay.seconds) <= LEAST_SHIFT:
+        return None
+    # Opposite rates: a wrong sign, or half a period.
+    if delay.share_near_zero < -SAME:
+        return None
+    if delay.share < max(LEAST_SHARE_EXPLAINED, delay.share_near_zero + SHARE_TIE):
         return None
     return CheckFinding(
         'on_table',
         REFUSE,
         'both streams must share one clock, the joints explain'
-        f' {100 * max(unshifted, 0.0):.0f} % of the rates with a delay up to {LEAST_SHIFT} s and'
-        f' {100 * share:.0f} % with a larger one: {_late(shift)}',
+        f' {100 * max(delay.share_near_zero, 0.0):.0f} % of the rates with a delay up to'
+        f' {LEAST_SHIFT} s and {100 * delay.share:.0f} % with a larger one:'
+        f' {_late(delay.seconds)}',
     )
 
 
-def _late(shift):
-    side = 'behind' if shift > 0 else 'ahead of'
+def _late(seconds: float) -> str:
+    """Return a delay of the IMU's stamps in words, with the remedy."""
+    side = 'behind' if seconds > 0 else 'ahead of'
     return (
-        f'the stamps of the IMU are about {abs(shift):.1f} s {side} those of the joints; '
+        f'the stamps of the IMU are about {abs(seconds):.1f} s {side} those of the joints; '
         'set both clocks by one source, or stamp in the drivers'
     )
-
-
-class _Shift(NamedTuple):
-    """A delay of the IMU's stamps and the shares of the rates that the joints then explain."""
-
-    seconds: float
-    """Positive: the IMU's stamps are late."""
-    share: float
-    """Share explained with this delay."""
-    unshifted: float
-    """Largest one within +-LEAST_SHIFT, the range of a lag; negative if the rates are opposite."""
-    ambiguous: bool
-    """
-    Whether it is one period of a repeating motion from a peak within the range of a lag, and a
-    delay of the other sign is as good.
-    """
 
 
 @dataclass(frozen=True)
@@ -459,92 +489,156 @@ def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
     table : Table
 
     """
-    shift, share, unshifted, _ = _best_shift(windows, table)
-    if abs(shift) <= LEAST_SHIFT or share < SAME or share < -unshifted - SHARE_TIE:
+    delay = _estimate_delay(windows, table)
+    # A smaller delay is estimated as a lag, and the joints must explain the rates at all.
+    if abs(delay.seconds) <= LEAST_SHIFT or delay.share < SAME:
         return None
-    return Delay(_late(shift), share > -unshifted + SHARE_TIE)
+    # Reversed signs of the reference change the sign of the correlation, and thereby of the share.
+    share_with_reversed_sign = -delay.share_near_zero
+    if delay.share < share_with_reversed_sign - SHARE_TIE:
+        return None
+    return Delay(_late(delay.seconds), delay.share > share_with_reversed_sign + SHARE_TIE)
 
 
-def _best_shift(windows: Sequence[Window], table: Table) -> _Shift:
+@dataclass(frozen=True)
+class _DelayEstimate:
+    """A delay of the IMU's stamps and the shares of the rates that the joints explain with it."""
+
+    seconds: float
+    """Delay, s; positive: the IMU's stamps are late."""
+    share: float
+    """Share explained with this delay."""
+    share_near_zero: float
+    """Largest one within +-LEAST_SHIFT, the range of a lag; negative if the rates are opposite."""
+    ambiguous: bool
     """
-    Return the `_Shift` that explains the rates best; of equally good ones, the smallest.
+    Whether it is one period of a repeating motion from a peak within the range of a lag, and a
+    delay of the other sign is as good.
+    """
 
-    Without samples, no shift.
 
-    ``share(s) = c |c| / (e_m e_r)`` with c the sum of measured(t) reference(t - s) and e their sums
-    of squares, all of the same pairs.
+def _estimate_delay(windows: Sequence[Window], table: Table) -> _DelayEstimate:
+    """
+    Return the delay that explains the rates best; of equally good ones, the smallest.
+
+    Without samples, a delay of zero.
     """
     windows = [window for window in windows if len(window) >= MIN_TESTED_SAMPLES]
     if not windows:
-        return _Shift(0.0, 0.0, 0.0, False)
+        return _DelayEstimate(0.0, 0.0, 0.0, False)
+    rates = _resample_rates(windows, table)
+    max_lag = min(int(LARGEST_SHIFT / rates.period), len(rates.measured) // 2)
+    shares = _shares_explained(rates, max_lag)
+
+    # Index of the delay zero, and of the largest share within the range of a lag.
+    zero = RESOLVED * max_lag
+    reach = int(RESOLVED * LEAST_SHIFT / rates.period)
+    shares_near_zero = np.abs(shares[zero - reach : zero + reach + 1])
+    peak_near_zero = int(np.argmax(shares_near_zero)) + zero - reach
+    # The nearest peak to zero delay among those within SHARE_TIE of the highest: periodic motion
+    # has many.
+    inner = shares[1:-1]
+    is_peak = (inner >= shares[:-2]) & (inner >= shares[2:])
+    peaks = 1 + np.flatnonzero(is_peak & (inner >= shares.max() - SHARE_TIE))
+    best = int(np.argmax(shares))
+    if len(peaks):
+        best = int(peaks[np.argmin(np.abs(peaks - zero))])
+    shares_of_other_sign = shares[: max(zero - reach, 0)]
+    if best < zero:
+        shares_of_other_sign = shares[zero + reach + 1 :]
+    ambiguous = (
+        # A peak, not the slope of one beyond the range of a lag.
+        0 < peak_near_zero - zero + reach < 2 * reach
+        and shares[best] < 1.0 - SHARE_TIE
+        and shares_of_other_sign.max(initial=-1.0) > shares[best] - SHARE_TIE
+    )
+    return _DelayEstimate(
+        seconds=(best - zero) * rates.period / RESOLVED,
+        share=float(shares[best]),
+        share_near_zero=float(shares[peak_near_zero]),
+        ambiguous=bool(ambiguous),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _ResampledRates:
+    """Rates of the IMU and of the joints at n equidistant times, zero without samples."""
+
+    measured: np.ndarray
+    """Measured rates minus their mean, rad/s, shape (n, 3)."""
+    reference: np.ndarray
+    """Rates of the joints minus their mean, rad/s, shape (n, 3)."""
+    has_samples: np.ndarray
+    """1 where there are samples, else 0, shape (n, 1)."""
+    period: float
+    """Distance of the times, s."""
+
+
+def _resample_rates(windows: Sequence[Window], table: Table) -> _ResampledRates:
+    """Return the rates of windows, interpolated linearly at multiples of the median period."""
     period = float(np.median([window.period for window in windows]))
     start = windows[0].time[0]
     end = windows[-1].time[-1]
-    measured, reference = np.zeros((2, int((end - start) / period) + 2, 3))
-    inside = np.zeros((len(measured), 1))
+    n_times = int((end - start) / period) + 2
+    measured = np.zeros((n_times, 3))
+    reference = np.zeros((n_times, 3))
+    has_samples = np.zeros((n_times, 1))
     bias = np.median(np.concatenate([window.rate_s for window in windows]), axis=0)
     for window in windows:
         first = int(np.ceil((window.time[0] - start) / period))
         grid = start + period * np.arange(first, int((window.time[-1] - start) / period) + 1)
         part = slice(first, first + len(grid))
-        inside[part] = 1.0
-        for line, rate in (
-            (measured, window.rate_s - bias),
-            (reference, reference_motion(table, window.motion).rate_s),
-        ):
-            line[part] = np.stack(
-                [np.interp(grid, window.time, column) for column in rate.T], axis=1
-            )
-    measured, reference = (
-        inside * (line - line.sum(axis=0) / inside.sum()) for line in (measured, reference)
-    )
-    most = min(int(LARGEST_SHIFT / period), len(measured) // 2)
-    power = [(line**2).sum(axis=1, keepdims=True) for line in (measured, reference)]
-    products = _correlations(measured, reference, most)
-    energies = [
-        _correlations(power[0], inside, most),
-        _correlations(inside, power[1], most),
-    ]
-    paired = np.logical_and(*(energy > 0.5 * whole.sum() for energy, whole in zip(energies, power)))
-    shares = np.where(
-        paired, products * np.abs(products) / np.maximum(np.prod(energies, axis=0), 1e-300), 0.0
-    )
-    middle = RESOLVED * most
-    lag = int(RESOLVED * LEAST_SHIFT / period)
-    near = np.abs(shares[middle - lag : middle + lag + 1])
-    place = int(np.argmax(near)) + middle - lag
-    # The nearest peak to zero delay among those within SHARE_TIE of the highest: periodic motion
-    # has many.
-    inner = shares[1:-1]
-    peaks = 1 + np.flatnonzero(
-        (inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - SHARE_TIE)
-    )
-    best = int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(shares))
-    other = shares[middle + lag + 1 :] if best < middle else shares[: max(middle - lag, 0)]
-    twin = (
-        0 < place - middle + lag < 2 * lag
-        and shares[best] < 1.0 - SHARE_TIE
-        and other.max(initial=-1.0) > shares[best] - SHARE_TIE
-    )
-    return _Shift(
-        (best - middle) * period / RESOLVED, float(shares[best]), float(shares[place]), bool(twin)
+        has_samples[part] = 1.0
+        measured_rate = window.rate_s - bias
+        reference_rate = reference_motion(table, window.motion).rate_s
+        for axis in range(3):
+            measured[part, axis] = np.interp(grid, window.time, measured_rate[:, axis])
+            reference[part, axis] = np.interp(grid, window.time, reference_rate[:, axis])
+    n_samples = has_samples.sum()
+    return _ResampledRates(
+        measured=has_samples * (measured - measured.sum(axis=0) / n_samples),
+        reference=has_samples * (reference - reference.sum(axis=0) / n_samples),
+        has_samples=has_samples,
+        period=period,
     )
 
 
-def _correlations(first, second, most):
+def _shares_explained(rates: _ResampledRates, max_lag: int) -> np.ndarray:
     """
-    Return the sums of first(t) second(t - s) for s up to +-most samples.
+    Return the share of the measured rates that the joints explain with each delay.
 
-    s is in steps of 1 / RESOLVED of a sample.
+    With w(t) = 1 where there are samples, else 0::
+
+        c(s)   = sum measured(t) . reference(t - s)
+        e_m(s) = sum |measured(t)|^2 w(t - s)
+        e_r(s) = sum w(t) |reference(t - s)|^2
+        share  = c |c| / (e_m e_r)
+
+    Delays up to +-`max_lag` samples in steps of 1 / RESOLVED.
     """
-    size = 1 << int(np.ceil(np.log2(2 * len(first))))
-    sums = np.fft.irfft(
-        (np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))).sum(axis=1),
-        size,
-    )
-    shifts = np.arange(-most, most + 1)
+    measured_power = (rates.measured**2).sum(axis=1, keepdims=True)
+    reference_power = (rates.reference**2).sum(axis=1, keepdims=True)
+    cross = _correlations(rates.measured, rates.reference, max_lag)
+    measured_energy = _correlations(measured_power, rates.has_samples, max_lag)
+    reference_energy = _correlations(rates.has_samples, reference_power, max_lag)
+    # Not from a small common part: at least half of both motions must remain in the pairs.
+    is_common = measured_energy > 0.5 * measured_power.sum()
+    is_common &= reference_energy > 0.5 * reference_power.sum()
+    energy = np.maximum(measured_energy * reference_energy, 1e-300)
+    return np.where(is_common, cross * np.abs(cross) / energy, 0.0)
+
+
+def _correlations(first: np.ndarray, second: np.ndarray, max_lag: int) -> np.ndarray:
+    """
+    Return the sums of first(t) second(t - s) for s up to +-`max_lag` samples, columns added.
+
+    s is in steps of 1 / RESOLVED of a sample, interpolated by a cubic spline.
+    """
     from scipy.interpolate import CubicSpline  # here, because its import is slow
 
-    return CubicSpline(shifts, sums[shifts])(
-        np.arange(-most * RESOLVED, most * RESOLVED + 1) / RESOLVED
-    )
+    size = 1 << int(np.ceil(np.log2(2 * len(first))))
+    spectrum = np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))
+    sums = np.fft.irfft(spectrum.sum(axis=1), size)
+    lags = np.arange(-max_lag, max_lag + 1)
+    fine_lags = np.arange(-max_lag * RESOLVED, max_lag * RESOLVED + 1) / RESOLVED
+    return CubicSpline(lags, sums[lags])(fine_lags)

@@ -13,8 +13,9 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.joint_checks import _rates, standing_still
+from imu_calibration.preprocessing.joint_checks import _rate_findings, standing_still
 from imu_calibration.preprocessing.on_table import (
+    ProductSums,
     _candidates,
     a_period_late,
     same_motion,
@@ -265,8 +266,10 @@ def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
     )
     assert standing_still([window], table).check == 'frozen', 'a standstill of inner explains it'
     told = reference_motion(table, reversed_outer).rate_s
-    (finding,) = _rates(
-        (reference.rate_s.T @ told, told.T @ told, reference.rate_s.T @ reference.rate_s),
+    (finding,) = _rate_findings(
+        ProductSums(
+            reference.rate_s.T @ told, told.T @ told, reference.rate_s.T @ reference.rate_s
+        ),
         [window],
         table,
     )
@@ -395,7 +398,7 @@ def test_gain_and_coherence_decide(gain, noise, fails):
     rng = np.random.default_rng(1)
     told = rng.normal(size=(5000, 3))
     felt = gain * told + noise * rng.normal(size=(5000, 3))
-    found = same_motion((felt.T @ told, told.T @ told, felt.T @ felt), [], None)
+    found = same_motion(ProductSums(felt.T @ told, told.T @ told, felt.T @ felt), [], None)
     assert (found is not None) == fails
 
 
