@@ -23,6 +23,7 @@ class DeadBandSearch:
     """Counts zeros and magnitudes of the rates, in bounded memory."""
 
     def __init__(self) -> None:
+        # Samples, readings of exactly zero of each axis, and readings by their magnitude.
         self._n_samples = 0
         self._n_zero = np.zeros(3, np.int64)
         self._counts = np.zeros((3, N_OCTAVE_BINS), np.int64)
@@ -45,18 +46,18 @@ class DeadBandSearch:
 
         `resolution` is the smallest step between readings of each axis, shape (3,).
         """
-        found = np.zeros(3)
+        thresholds = np.zeros(3)
         for axis, counts in enumerate(self._counts):
-            below = np.concatenate([[0], np.cumsum(counts)])
-            # first bin that does not lie within the band
-            first = int(np.searchsorted(below, MOST_STRAYS, side='right')) - 1
+            # The first bin below which there are more readings than transients is not in the band.
+            n_below = np.concatenate([[0], np.cumsum(counts)])
+            first = int(np.searchsorted(n_below, MOST_STRAYS, side='right')) - 1
             threshold = SMALLEST * 2.0 ** (first / BINS_PER_OCTAVE)
             n_above = counts[first : first + BINS_PER_OCTAVE].sum()
             often_zero = self._n_zero[axis] >= LEAST_ZERO_SHARE * max(self._n_samples, 1)
             is_wide = threshold >= LEAST_BAND_STEPS * resolution[axis]
             if often_zero and is_wide and n_above >= LEAST_ABOVE:
-                found[axis] = threshold
-        return found
+                thresholds[axis] = threshold
+        return thresholds
 
 
 def dead_bands(rate: np.ndarray, resolution: np.ndarray) -> np.ndarray:

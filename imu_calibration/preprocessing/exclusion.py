@@ -111,13 +111,13 @@ def exclusions_of_units(
                 key='exclude',
                 code='exclude_recording',
             )
-    found: dict[str, list[list[Exclusion]]] = {}
+    of_units: dict[str, list[list[Exclusion]]] = {}
     for unit, recordings in recordings_of.items():
-        found[unit] = []
+        of_units[unit] = []
         for recording in recordings:
             names = ('', unit, recording)
-            found[unit].append([each for each in exclusions if each.recording in names])
-    return found
+            of_units[unit].append([each for each in exclusions if each.recording in names])
+    return of_units
 
 
 class ExclusionMask:
@@ -126,6 +126,7 @@ class ExclusionMask:
     def __init__(self, exclusions: Sequence[Exclusion]):
         self._exclusions = exclusions
         self._first_ns: int | None = None
+        # Whether each exclusion contains a sample, and the time of the last sample, s.
         self._is_used = np.zeros(len(exclusions), bool)
         self._last = 0.0
 
@@ -146,8 +147,8 @@ class ExclusionMask:
 
     def require_used(self) -> None:
         """Raise where an excluded time has no sample."""
-        for exclusion, found in zip(self._exclusions, self._is_used, strict=True):
-            if not found:
+        for exclusion, is_used in zip(self._exclusions, self._is_used, strict=True):
+            if not is_used:
                 raise InputError(
                     f'an excluded time must lie in the recording, which has {self._last:.1f} s, got'
                     f" '{exclusion}'; correct it",

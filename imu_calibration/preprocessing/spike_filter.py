@@ -40,7 +40,9 @@ indicates a knock.
 NOISE_ROUNDING = 1e-7
 """Share of the readings below which differences are due to rounding."""
 _CANDIDATE = 6.0
-_NORMAL = 1.4826 / np.sqrt(1.5)  # sd of white noise over the median of |x_k - (x_k-1 + x_k+1) / 2|
+"""Second differences above this many noise sds are tested further."""
+_NORMAL = 1.4826 / np.sqrt(1.5)
+"""Sd of white noise over the median of ``|x_k - (x_k-1 + x_k+1) / 2|``."""
 
 
 class SpikeFilter:
@@ -60,126 +62,138 @@ class SpikeFilter:
 
     def __init__(self) -> None:
         self.dropped = 0
+        """Samples with a spike so far."""
         self._begin()
 
     def _begin(self):
-        self._held: Any = None
-        self._values, self._first = np.zeros((0, 6)), 0
-        self._noise, self._n_noise, self._step = np.zeros((1, 6)), 0, np.full(6, np.inf)
+        """Begin a stream."""
+        # Samples without a decision.
+        self._buffered: Any = None
+        # Readings, (n, 6), of these and of decided samples before them, which are needed as
+        # neighbours; and the number of the first of these rows in the stream.
+        self._values = np.zeros((0, 6))
+        self._first_row = 0
+        # Noise sd of the newest chunks of `NOISE_SAMPLES`, (n, 6), the number of chunks until now,
+        # and the smallest step of each column until now.
+        self._noise = np.zeros((1, 6))
+        self._n_chunks = 0
+        self._step = np.full(6, np.inf)
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return a list of the ImuSamples with a decision; the last `SPIKE_REACH` are buffered."""
         passed = []
         for start, stop in runs_of(np.ones(len(samples)), np.diff(samples.stamp_ns) > BREAK_NS):
             part = samples.select(slice(start, stop))
-            if self._held is not None and part.stamp_ns[0] - self._held.stamp_ns[-1] > BREAK_NS:
+            if (
+                self._buffered is not None
+                and part.stamp_ns[0] - self._buffered.stamp_ns[-1] > BREAK_NS
+            ):
                 passed += self.finish()
-            self._held = part if self._held is None else type(part).concatenate([self._held, part])
+            if self._buffered is not None:
+                self._buffered = type(part).concatenate([self._buffered, part])
+            else:
+                self._buffered = part
             self._values = np.vstack([self._values, np.hstack([part.force_s, part.rate_s])])
-            passed += self._decide(
-                max(len(self._held) - SPIKE_REACH, 0)
-                if self._first + len(self._values) > NOISE_SAMPLES
-                else 0
-            )
+            # Not before the first chunk has a noise.
+            if self._first_row + len(self._values) > NOISE_SAMPLES:
+                passed += self._decide(max(len(self._buffered) - SPIKE_REACH, 0))
         return passed
 
     def finish(self) -> list[ImuSamples]:
         """Return the buffered samples, and reset."""
-        rest = [] if self._held is None else self._decide(len(self._held))
+        passed = [] if self._buffered is None else self._decide(len(self._buffered))
         self._begin()
-        return rest
+        return passed
 
     def _decide(self, count):
         """Return the first `count` of the buffered samples, without spikes, in a list."""
         if not count:
             return []
-        samples = self._held.select(slice(0, count))
-        held = self._held.select(slice(count, None))
-        at = len(self._values) - len(self._held) + np.arange(count)
-        spiky = self._spikes(at)
-        self.dropped, self._held = self.dropped + int(np.count_nonzero(spiky)), held
-        # The first kept row has no second difference.
-        kept = max((at[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0) * NOISE_SAMPLES
-        self._values, self._first = self._values[kept:], self._first + kept
+        samples = self._buffered.select(slice(0, count))
+        rows = len(self._values) - len(self._buffered) + np.arange(count)
+        is_spike = self._spikes(rows)
+        self.dropped += int(np.count_nonzero(is_spike))
+        self._buffered = self._buffered.select(slice(count, None))
+        # Drop the rows that no later test needs. The first kept row has no second difference.
+        n_old_chunks = max((rows[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0)
+        self._values = self._values[n_old_chunks * NOISE_SAMPLES :]
+        self._first_row += n_old_chunks * NOISE_SAMPLES
         self._noise = self._noise[-2 - (len(self._values) + SPIKE_REACH) // NOISE_SAMPLES :]
-        return [samples.select(~spiky) if spiky.any() else samples]
+        return [samples.select(~is_spike) if is_spike.any() else samples]
 
-    def _spikes(self, at):
-        """Return which of the rows `at` of the values are spikes."""
+    def _spikes(self, rows):
+        """Return which of some rows of the values, shape (n,), have a spike."""
         values = self._values
         if len(values) < 2 * SPIKE_REACH + 1:
-            return np.zeros(len(at), bool)
+            return np.zeros(len(rows), bool)
         second = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
         second = np.vstack([second[:1], second, second[-1:]])
         self._add_noise(second)
-        chunk = np.maximum((self._first + at) // NOISE_SAMPLES - 1, 0)
-        limit = (
-            LARGE
-            * self._noise[
-                np.clip(chunk - self._n_noise + len(self._noise), 0, len(self._noise) - 1)
-            ]
-        )
-        spiky = np.zeros(len(at), bool)
-        row, column = np.nonzero(second[at] > _CANDIDATE / LARGE * limit)
-        if len(row):
-            first = np.clip(at[row] - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
-            window = first[:, None] + np.arange(2 * SPIKE_REACH + 1)
-            column = column[:, None]
-            inner = np.clip(at[row], 2, len(values) - 3)
-            knock = _knocked(values[inner[:, None] + [-2, -1, 1, 2]], limit[row]) & (
-                inner == at[row]
-            )
-            # during vibration, as at the first touch of a hand, the previous noise does not apply;
-            # a spike affects three second differences, two in six
-            shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
-            limit = np.maximum(limit[row, column[:, 0]], shaking)
-            first = np.clip(at[row] - SPIKE_NEIGHBOURS, 0, len(values) - 2 * SPIKE_NEIGHBOURS - 1)
-            around = values[first[:, None] + np.arange(2 * SPIKE_NEIGHBOURS + 1), column]
-            place = at[row] - first
-            spiky[
-                row[
-                    ~knock
-                    & (_contradicted(around, place, limit) | _off_the_median(around, place, limit))
-                ]
-            ] = True
-        return spiky
+
+        # Candidates exceed the noise of the chunk before; the last row of `_noise` is the newest.
+        chunk = np.maximum((self._first_row + rows) // NOISE_SAMPLES - 1, 0)
+        n_noise = len(self._noise)
+        limit = LARGE * self._noise[np.clip(chunk - self._n_chunks + n_noise, 0, n_noise - 1)]
+        candidate, column = np.nonzero(second[rows] > _CANDIDATE / LARGE * limit)
+        is_spike = np.zeros(len(rows), bool)
+        if not len(candidate):
+            return is_spike
+        row = rows[candidate]
+
+        # A knock affects two neighbours on either side, and several columns.
+        inner = np.clip(row, 2, len(values) - 3)
+        is_knock = _is_knock(values[inner[:, None] + [-2, -1, 1, 2]], limit[candidate])
+        is_knock &= inner == row
+
+        # During vibration, as at the first touch of a hand, the previous noise does not apply; a
+        # spike affects three second differences, two in six.
+        first = np.clip(row - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
+        window = first[:, None] + np.arange(2 * SPIKE_REACH + 1)
+        shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column[:, None]], axis=1)
+        limit = np.maximum(limit[candidate, column], shaking)
+
+        # The nine readings around each candidate, and its place among them.
+        first = np.clip(row - SPIKE_NEIGHBOURS, 0, len(values) - 2 * SPIKE_NEIGHBOURS - 1)
+        around = values[first[:, None] + np.arange(2 * SPIKE_NEIGHBOURS + 1), column[:, None]]
+        place = row - first
+        is_outlier = _contradicted(around, place, limit) | _off_the_median(around, place, limit)
+        is_spike[candidate[~is_knock & is_outlier]] = True
+        return is_spike
 
     def _add_noise(self, second):
         """
-        Estimate the noise sd of each complete chunk, at least the converter's step.
+        Estimate the noise sd of each complete chunk, at least the step of the converter.
 
-        Shape (n_chunks, 6).
+        `second`: second differences of the rows, shape (n, 6).
         """
-        start = self._n_noise * NOISE_SAMPLES - self._first
+        start = self._n_chunks * NOISE_SAMPLES - self._first_row
         count = (len(second) - 1 - start) // NOISE_SAMPLES if len(second) > NOISE_SAMPLES else 0
-        if self._n_noise == 0 and count == 0:  # a stream that ended before
-            parts = second[None]
+        if self._n_chunks == 0 and count == 0:  # a stream that ended before
+            chunks = second[None]
             values = self._values[None]
         else:
-            parts, values = (
-                rows[start : start + count * NOISE_SAMPLES].reshape(count, NOISE_SAMPLES, 6)
-                for rows in (second, self._values)
-            )
-        if not len(parts):
+            rows = slice(start, start + count * NOISE_SAMPLES)
+            chunks = second[rows].reshape(count, NOISE_SAMPLES, 6)
+            values = self._values[rows].reshape(count, NOISE_SAMPLES, 6)
+        if not len(chunks):
             return
+        # Smallest step until each chunk, (n_chunks, 6), infinite before the first change.
         change = np.abs(np.diff(values, axis=1))
         steps = np.where(change > 0, change, np.inf).min(axis=1)
         steps = np.minimum.accumulate(np.vstack([self._step, steps]))[1:]
-        usual = _NORMAL * _median(parts)
-        # a constant output (clipped, frozen, coarse) has no noise estimate: the previous one is
-        # kept
-        known = np.vstack([self._noise[-1:], usual])
-        last = np.maximum.accumulate(np.where(known > 0, np.arange(len(known))[:, None], 0))
-        usual = np.take_along_axis(known, last, axis=0)[1:]
+        # A constant output (clipped, frozen, coarse) has no noise estimate: the previous one is
+        # kept.
+        estimates = np.vstack([self._noise[-1:], _NORMAL * _median(chunks)])
+        number = np.arange(len(estimates))[:, None]
+        last_known = np.maximum.accumulate(np.where(estimates > 0, number, 0))
+        estimates = np.take_along_axis(estimates, last_known, axis=0)[1:]
         noise = np.maximum(
-            np.maximum(usual, np.where(np.isfinite(steps), steps, 0.0)),
+            np.maximum(estimates, np.where(np.isfinite(steps), steps, 0.0)),
             NOISE_ROUNDING * np.abs(_median(values)),
         )
-        self._noise, self._n_noise, self._step = (
-            np.vstack([self._noise, noise]),
-            self._n_noise + len(noise),
-            steps[-1],
-        )
+        self._noise = np.vstack([self._noise, noise])
+        self._n_chunks += len(noise)
+        self._step = steps[-1]
 
 
 def _median(values):
@@ -193,53 +207,67 @@ def _median(values):
     return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
 
 
-def _knocked(beside, limit):
+def _is_knock(neighbours, limit):
     """
-    Return where two or more of the six readings deviate in the neighbours as well.
+    Return where two or more of the six columns deviate in the neighbours as well, shape (m,).
 
-    The neighbours are `beside` (m, 4, 6). Such a deviation indicates motion, which affects several
-    axes.
+    Such a deviation indicates motion, which affects several axes. It is ``2 (b - c) - (a - d)`` of
+    the two neighbours before, a and b, and after, c and d.
+
+    Parameters
+    ----------
+    neighbours : array, shape (m, 4, 6)
+        Readings a, b, c, d.
+    limit : array, shape (m, 6)
+        `LARGE` noise sds.
+
     """
-    return (
-        np.count_nonzero(
-            np.abs(np.einsum('mkc,k->mc', beside, [-1.0, 2.0, -2.0, 1.0])) > SHARED * limit, axis=1
-        )
-        >= 2
-    )
+    deviation = np.abs(np.einsum('mkc,k->mc', neighbours, [-1.0, 2.0, -2.0, 1.0]))
+    return np.count_nonzero(deviation > SHARED * limit, axis=1) >= 2
 
 
 def _contradicted(around, place, limit):
     """
-    Compare with the cubic and the straight lines through the neighbours.
-
-    The cubic is through two neighbours on either side, and the lines are through the two on each
-    side.
+    Return where readings deviate from the cubic through two neighbours on either side, (m,).
 
     A motion with such a deviation at one reading also affects its neighbours: the impulse response
-    of 0.9 of the Nyquist bandwidth has a tenth there. Both lines must therefore agree with the
-    cubic; `place` of the reading in `around` is the middle except at the ends.
+    of 0.9 of the Nyquist bandwidth has a tenth there. The straight lines through the two neighbours
+    of each side must therefore agree with the cubic.
+
+    Parameters
+    ----------
+    around : array, shape (m, 9)
+        Nine successive readings.
+    place : array of int, shape (m,)
+        Index of the reading among them: the middle except at the ends of the stream.
+    limit : array, shape (m,)
+        `LARGE` noise sds.
+
     """
     a, b, x, c, d = around[:, SPIKE_NEIGHBOURS - 2 : SPIKE_NEIGHBOURS + 3].T
     predicted = (4 * (b + c) - (a + d)) / 6
-    off = np.abs(x - predicted)
+    deviation = np.abs(x - predicted)
     apart = np.maximum(np.abs(2 * b - a - predicted), np.abs(2 * c - d - predicted))
     # The prediction is as noisy as the reading.
-    return (
-        (place == SPIKE_NEIGHBOURS)
-        & (off > 1.4 * limit)
-        & (apart < PREDICTION_SHARE * off + PREDICTION_MARGIN * limit)
-    )
+    is_deviating = (place == SPIKE_NEIGHBOURS) & (deviation > 1.4 * limit)
+    return is_deviating & (apart < PREDICTION_SHARE * deviation + PREDICTION_MARGIN * limit)
 
 
 def _off_the_median(around, place, limit):
-    """Compare with the median, which is robust to two further outliers."""
+    """
+    Return where readings deviate from the median of nine, which two further outliers do not move.
+
+    By far more than their spread, and without a smaller deviation of a neighbour, which
+    indicates a knock. Arguments as for `_contradicted`.
+    """
     ordered = np.sort(around, axis=1)
+    deviations = np.abs(around - ordered[:, [SPIKE_NEIGHBOURS]])
     rows = np.arange(len(around))
-    off = np.abs(around - ordered[:, [SPIKE_NEIGHBOURS]])
-    own = off[rows, place]
-    beside = off[rows[:, None], np.clip(place[:, None] + [-2, -1, 1, 2], 0, 2 * SPIKE_NEIGHBOURS)]
-    knock = (
-        (beside > np.maximum(BETWEEN[0] * own, 0.5 * limit)[:, None])
-        & (beside < BETWEEN[1] * own[:, None])
-    ).any(axis=1)
-    return (own > np.maximum(limit, SPIKE_SPREADS * (ordered[:, -3] - ordered[:, 2]))) & ~knock
+    deviation = deviations[rows, place]
+    neighbours = np.clip(place[:, None] + [-2, -1, 1, 2], 0, 2 * SPIKE_NEIGHBOURS)
+    of_neighbours = deviations[rows[:, None], neighbours]
+    is_visible = of_neighbours > np.maximum(BETWEEN[0] * deviation, 0.5 * limit)[:, None]
+    is_smaller = of_neighbours < BETWEEN[1] * deviation[:, None]
+    is_knock = (is_visible & is_smaller).any(axis=1)
+    spread = ordered[:, -3] - ordered[:, 2]
+    return (deviation > np.maximum(limit, SPIKE_SPREADS * spread)) & ~is_knock

@@ -61,17 +61,24 @@ class StreamWatch:
     """
 
     def __init__(self, joints: bool = True, temperature: bool = False):
-        wanted = {'imu': True, 'joints': joints, 'temperature': temperature}
-        after = {'imu': SILENT_AFTER, 'joints': SILENT_AFTER, 'temperature': COLD_AFTER}
-        self._needed = {name: after[name] for name, asked in wanted.items() if asked}
+        # Needed stream -> seconds without a message after which it is silent.
+        self._needed = {'imu': SILENT_AFTER}
+        if joints:
+            self._needed['joints'] = SILENT_AFTER
+        if temperature:
+            self._needed['temperature'] = COLD_AFTER
+        # Stream -> samples, newest stamp in ns, time of the newest message in s, period in s.
         self._count = dict.fromkeys(STREAMS, 0)
         self._newest = {}
         self._arrived = {}
         self._period = {}
+        # Reason -> dropped samples: of the session, and of the newest loss; and the time of it, s.
         self._lost = Counter()
         self._recent = Counter()
         self._lost_at: float | None = None
+        # Since when the stamps of the streams differ, s; None while they agree.
         self._apart_since: float | None = None
+        # Messages that were used with a modification: the last time, s, and reason -> count.
         self._unstamped_at: float | None = None
         self._notes: Counter[str] = Counter()
 
@@ -96,36 +103,43 @@ class StreamWatch:
             if len(samples) > 1 and last > first:
                 self._period[name] = (last - first) * 1e-9 / (len(samples) - 1)
             self._count[name] += len(samples)
-            self._newest[name], self._arrived[name] = last, now
+            self._newest[name] = last
+            self._arrived[name] = now
 
     def note_counts(self, counts: dict[str, int], now: float) -> None:
         """Record the counts of samples by their use."""
         lost = Counter(dropped(counts))
-        grown = lost - self._lost
-        if grown:
-            self._recent, self._lost_at = grown, now
+        new = lost - self._lost
+        if new:
+            self._recent = new
+            self._lost_at = now
         self._lost = lost
 
     def _apart_for(self, lead, now):
         """
         Return the time for which the stamps of the streams have differed, s.
 
-        In a fast replay they differ briefly.
+        `lead`: stamp of the IMU minus stamp of the joints, s. In a fast replay they differ briefly.
         """
         if abs(lead) <= SILENT_AFTER:
             self._apart_since = None
             return 0.0
-        self._apart_since = now if self._apart_since is None else self._apart_since
+        if self._apart_since is None:
+            self._apart_since = now
         return now - self._apart_since
 
     def state(self, now: float, stamping: StampLine | None = None) -> StreamState:
         """Return the StreamState at `now`; `stamping` as its field."""
-        values: dict[str, Any] = {f'{name} messages': count for name, count in self._count.items()}
-        values |= {
-            f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()
-        }
-        values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
-        values |= self._notes | ({'imu stamps': str(stamping)} if stamping else {})
+        values: dict[str, Any] = {}
+        for name, count in self._count.items():
+            values[f'{name} messages'] = count
+        for name, period in self._period.items():
+            values[f'{name} rate [Hz]'] = f'{1 / period:.1f}'
+        for reason, count in self._lost.items():
+            values[f'dropped: {reason}'] = count
+        values.update(self._notes)
+        if stamping:
+            values['imu stamps'] = str(stamping)
         silent = tuple(
             name
             for name, patience in self._needed.items()
@@ -136,20 +150,16 @@ class StreamWatch:
             for name in self._arrived
             if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER)
         )
-        unusable = {name: self._recently(now, MESSAGES[name]) for name in silent}
-        word, text = self._word(silent, now, stamping)
-        return StreamState(
-            word,
-            text,
-            values,
-            silent,
-            coming,
-            {name: what for name, what in unusable.items() if what},
-            stamping,
-        )
+        unusable = {}
+        for name in silent:
+            reasons = self._recent_losses(now, MESSAGES[name])
+            if reasons:
+                unusable[name] = reasons
+        word, text = self._health(silent, now, stamping)
+        return StreamState(word, text, values, silent, coming, unusable, stamping)
 
-    def _recently(self, now, beginning=''):
-        """Return the recently dropped samples for reasons with that beginning; '' if none."""
+    def _recent_losses(self, now, beginning=''):
+        """Return the recently dropped samples, of reasons with a beginning, in words; or ''."""
         if self._lost_at is None or now - self._lost_at >= RECENT_SECONDS:
             return ''
         return ', '.join(
@@ -158,20 +168,17 @@ class StreamWatch:
             if reason.startswith(beginning)
         )
 
-    def _word(self, silent, now, stamping):
-        """Return the state of the streams and the line that describes it."""
+    def _health(self, silent, now, stamping):
+        """Return the `StreamHealth` and the line that describes it; `silent`: silent streams."""
         if silent:
-            none = len(silent) == len(self._needed)
-            return (
-                SILENT if none else TROUBLE,
-                f'no {" and no ".join(MESSAGES[name] for name in silent)} messages received'
-                + ('' if none else ', no data can be used until then'),
-            )
-        lead = (
-            (self._newest['imu'] - self._newest['joints']) * 1e-9
-            if 'joints' in self._needed
-            else 0.0
-        )
+            missing = ' and no '.join(MESSAGES[name] for name in silent)
+            text = f'no {missing} messages received'
+            if len(silent) == len(self._needed):
+                return SILENT, text
+            return TROUBLE, f'{text}, no data can be used until then'
+        lead = 0.0
+        if 'joints' in self._needed:
+            lead = (self._newest['imu'] - self._newest['joints']) * 1e-9
         if self._apart_for(lead, now) > SILENT_AFTER:
             return (
                 TROUBLE,
@@ -191,7 +198,7 @@ class StreamWatch:
         if self._unstamped_at is not None and now - self._unstamped_at < RECENT_SECONDS:
             notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
             return TROUBLE, f'{notes}: the driver sets none, the time of arrival is used'
-        recently = self._recently(now)
-        if recently:
-            return TROUBLE, f'dropped lately: {recently}'
+        losses = self._recent_losses(now)
+        if losses:
+            return TROUBLE, f'dropped lately: {losses}'
         return GOOD, f'{" and ".join(MESSAGES[name] for name in self._needed)} messages come'

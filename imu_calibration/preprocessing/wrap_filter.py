@@ -57,13 +57,15 @@ class WrapFilter:
 
     def __init__(self) -> None:
         self.dropped = 0
-        self._held: ImuSamples | None = None
+        """Samples removed so far."""
         self._begin()
 
     def _begin(self):
         """Begin a stream."""
-        self._held = None
-        self._n_before = 0
+        # The newest samples: decided ones, which are neighbours, and then those without a decision.
+        self._newest: ImuSamples | None = None
+        self._n_decided = 0
+        # End of the newest wrapped part, with its margin.
         self._until_ns = EARLIEST_NS
         # Of each column, the last step that ended a wrapped part.
         self._returned_ns = np.full(6, EARLIEST_NS)
@@ -72,30 +74,30 @@ class WrapFilter:
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return the samples with a decision; those after a step are buffered until it returns."""
-        held = samples if self._held is None else type(samples).concatenate([self._held, samples])
-        self._held = held
-        stamps = held.stamp_ns
-        spans, open_ns = self._spans(held)
-        n_decided = max(len(held) - WRAP_REACH, 0)
+        if self._newest is not None:
+            samples = type(samples).concatenate([self._newest, samples])
+        self._newest = samples
+        spans, open_ns = self._spans(samples)
+        stop = max(len(samples) - WRAP_REACH, 0)
         if open_ns is not None:
-            n_decided = min(n_decided, int(np.searchsorted(stamps, open_ns)))
-        return self._pass_on(n_decided, spans)
+            stop = min(stop, int(np.searchsorted(samples.stamp_ns, open_ns)))
+        return self._pass_on(stop, spans)
 
     def finish(self) -> list[ImuSamples]:
         """Return the buffered samples, and begin a new stream."""
         passed = []
-        if self._held is not None:
-            spans, _ = self._spans(self._held)
-            passed = self._pass_on(len(self._held), spans)
+        if self._newest is not None:
+            spans, _ = self._spans(self._newest)
+            passed = self._pass_on(len(self._newest), spans)
         self._begin()
         return passed
 
     def _pass_on(self, stop, spans):
         """Return the undecided samples before row `stop` that are outside of all spans."""
-        if stop <= self._n_before:
+        if stop <= self._n_decided:
             return []
-        assert self._held is not None
-        part = self._held.select(slice(self._n_before, stop))
+        assert self._newest is not None
+        part = self._newest.select(slice(self._n_decided, stop))
         wrapped = part.stamp_ns <= self._until_ns
         for span in spans:
             # A span that begins in the undecided samples is found again with the next piece.
@@ -106,18 +108,21 @@ class WrapFilter:
             self._until_ns = max(self._until_ns, until_ns)
             self._returned_ns[span.column] = span.return_ns
         self.dropped += int(np.count_nonzero(wrapped))
+        # Drop decided samples that are no neighbours of later ones.
         first = max(stop - KEPT_NEIGHBOURS, 0)
         if first:
-            forgotten = self._held.select(slice(0, first))
-            self._largest = largest_so_far(forgotten, self._largest)[-1]
-        self._held = self._held.select(slice(first, None))
-        self._n_before = stop - first
+            dropped = self._newest.select(slice(0, first))
+            self._largest = largest_so_far(dropped, self._largest)[-1]
+        self._newest = self._newest.select(slice(first, None))
+        self._n_decided = stop - first
         if wrapped.all():
             return []
         return [part.select(~wrapped) if wrapped.any() else part]
 
     def _spans(self, samples):
-        """Return the list of `WrappedSpan`, and the stamp of the first step without return, ns."""
+        """
+        Return the list of `WrappedSpan`, and the stamp of the first step that may still return, ns.
+        """
         row, column, up = wrap_steps(samples, self._largest)
         new = samples.stamp_ns[row] > self._returned_ns[column]
         row = row[new]
@@ -138,7 +143,17 @@ class WrapFilter:
 
 
 def _returns(stamp_ns, up):
-    """Return the stamps (step, opposite step) of one column, ns; and that of a last single step."""
+    """
+    Return the stamps (step, opposite step) of one column, ns; and that of a last single step.
+
+    Parameters
+    ----------
+    stamp_ns : array, shape (n,)
+        Stamps of the steps, increasing.
+    up : array of bool, shape (n,)
+        Whether the reading increases.
+
+    """
     pairs = []
     k = 0
     while k + 1 < len(stamp_ns):
