@@ -3,8 +3,8 @@ Checks of a recording before the estimate.
 
 Their registry, and the checks of frozen outputs and of stamps.
 
-`CHECKS` is the registry: a check is a function of the `Evidence` that yields `Finding` objects;
-adding one is adding an entry.
+`CHECKS` is the registry: a check is a function of the `RecordingEvidence` that yields
+`CheckFinding` objects; adding one is adding an entry.
 """
 
 from collections.abc import Iterator, Sequence
@@ -82,7 +82,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     for sensor, part in SENSOR_COLUMNS.items():
         if sensor in evidence.absent:
             continue
-        noisy = evidence.quiet_range[part] > 0
+        has_noise = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
             zero = not chunks.mean[:, part].any()
@@ -94,7 +94,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             )
             continue
         for axis in np.flatnonzero(constant):
-            if noisy.any():
+            if has_noise.any():
                 yield CheckFinding(
                     'frozen',
                     REFUSE,
@@ -132,7 +132,7 @@ def without_readings(evidence: RecordingEvidence) -> np.ndarray:
         return NO_RANGES
     runs = runs_of(any_within(flags, 1, 1))
     ranges = runs * chunks.size
-    # samples after the last full chunk belong to no chunk
+    # The samples after the last full chunk are those of the last one.
     ranges[runs[:, 1] == len(chunks), 1] = evidence.n_samples
     return ranges
 
@@ -143,7 +143,7 @@ JOINT_STATES = 'joints'
 
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sensor and every joint measures until the end."""
-    joints = [part for part in evidence.frozen_parts if part.who == 'joints']
+    joint_parts = [part for part in evidence.frozen_parts if part.who == 'joints']
     for part in _sensor_parts(evidence.frozen_parts):
         yield CheckFinding(
             'frozen',
@@ -153,15 +153,15 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             ' sensor and its driver; that time is left out',
             samples=part.samples,
         )
-    if joints:
+    if joint_parts:
         yield CheckFinding(
             'frozen',
             WARNING,
             'joint states must follow the table, they are constant while the IMU turns,'
-            f' {span_words([(part.start, part.stop) for part in joints])}; check the driver of the'
-            ' table, or whether the IMU was carried; that time is left out',
+            f' {span_words([(part.start, part.stop) for part in joint_parts])}; check the driver'
+            ' of the table, or whether the IMU was carried; that time is left out',
             sensor=JOINT_STATES,
-            samples=sum(part.samples for part in joints),
+            samples=sum(part.samples for part in joint_parts),
         )
 
 
@@ -193,6 +193,7 @@ def span_words(spans: Sequence[tuple[float, float]]) -> str:
 
 
 WHOLE_MS = 1_000_000
+"""A millisecond, ns."""
 STAMP_FAULTS = {
     'not finite': 'are not finite: the driver sends them; they are left out',
     'zero': (
@@ -223,7 +224,9 @@ has a cause.
 MOST_REPEATED_STAMPS = 0.9
 """Share of repeated stamps above which a recording has no times."""
 GAP_SHARE = 0.01
+"""Share of the duration above which gaps are a warning."""
 RATE_SHARE = 0.02
+"""Relative difference of the rate from that of the median step above which it is a warning."""
 
 
 def is_one_stamp(n_repeated: int, total: int) -> bool:
@@ -242,44 +245,43 @@ def one_stamp_text(name: str, n_repeated: int, total: int) -> str:
 
 def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sample has a stamp of its own, later than the one before, and finite readings."""
-    clean = []
-    for name, found in evidence.streams.items():
+    faultless = []
+    for name, stream in evidence.streams.items():
         # Spikes and wrapped readings have accepted stamps, and a clock reset drops no sample.
-        total = found.count + sum(
-            count
-            for reason, count in found.dropped.items()
-            if reason not in ('clock reset', 'spike', 'wrapped')
-        )
-        if is_one_stamp(found.dropped.get('repeated stamp', 0), total):
-            n_repeated = found.dropped['repeated stamp']
+        total = stream.count
+        for reason, count in stream.dropped.items():
+            if reason not in ('clock reset', 'spike', 'wrapped'):
+                total += count
+        if is_one_stamp(stream.dropped.get('repeated stamp', 0), total):
+            n_repeated = stream.dropped['repeated stamp']
             text = one_stamp_text(MESSAGES[name], n_repeated, total)
             yield CheckFinding('stamps_equal', REFUSE, text)
             continue
-        if found.count < 0.1 * total:
-            reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
+        if stream.count < 0.1 * total:
+            reasons = ', '.join(f'{count} {reason}' for reason, count in stream.dropped.items())
             yield CheckFinding(
                 'stamps',
                 REFUSE,
                 f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total}'
-                f' only {found.count} do ({reasons}); correct the driver and record again',
+                f' only {stream.count} do ({reasons}); correct the driver and record again',
             )
             continue
-        if found.unstamped:
+        if stream.unstamped:
             yield CheckFinding(
                 'stamps',
                 WARNING,
-                f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of'
+                f'{MESSAGES[name]}: {stream.unstamped} of {total} stamps are zero: the time of'
                 ' arrival is used; the driver should stamp each sample at its measurement',
             )
-        if found.overflows:
+        if stream.overflows:
             yield CheckFinding(
                 'stamps',
                 NOTE,
                 f'{MESSAGES[name]}: the counter of the stamps overflows'
-                f' {"once" if found.overflows == 1 else f"{found.overflows} times"}: undone'
-                f'{longer_gaps(found.counter_size_ns, found.n_gaps)}',
+                f' {"once" if stream.overflows == 1 else f"{stream.overflows} times"}: undone'
+                f'{longer_gaps(stream.counter_size_ns, stream.n_gaps)}',
             )
-        for reason, count in found.dropped.items():
+        for reason, count in stream.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
             if reason == 'clock reset':
                 text = (
@@ -289,38 +291,40 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             else:
                 text = f'{count} of {total} samples {STAMP_FAULTS[reason]}'
             yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {text}')
-        clean += [] if found.dropped else [MESSAGES[name]]
-    if clean:
-        yield CheckFinding('stamps', GOOD, f'{" and ".join(clean)}: all stamps advance')
+        if not stream.dropped:
+            faultless.append(MESSAGES[name])
+    if faultless:
+        yield CheckFinding('stamps', GOOD, f'{" and ".join(faultless)}: all stamps advance')
 
 
 def _fast_streams(evidence):
     """Return (message type, StreamStatistics) of the IMU and the joints."""
-    found = []
+    streams = []
     for name in ('imu', 'joints'):
         if name in evidence.streams:
-            found.append((MESSAGES[name], evidence.streams[name]))
-    return found
+            streams.append((MESSAGES[name], evidence.streams[name]))
+    return streams
 
 
 def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The streams have no gaps."""
-    for name, found in _fast_streams(evidence):
-        if found.n_gaps:
-            severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
+    for name, stream in _fast_streams(evidence):
+        if stream.n_gaps:
+            severity = WARNING if stream.gap_total > GAP_SHARE * stream.duration else NOTE
             yield CheckFinding(
                 'gaps',
                 severity,
-                f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""},'
-                f' {found.gap_total:.2f} s of {found.duration:.0f} s, the longest'
-                f' {found.longest_step:.2f} s; motion within a gap is not used',
+                f'{name}: {stream.n_gaps} gap{"s" if stream.n_gaps > 1 else ""},'
+                f' {stream.gap_total:.2f} s of {stream.duration:.0f} s, the longest'
+                f' {stream.longest_step:.2f} s; motion within a gap is not used',
             )
 
 
 def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The samples per second agree with the step between stamps."""
-    for name, found in _fast_streams(evidence):
-        nominal, real = found.rate, found.real_rate
+    for name, stream in _fast_streams(evidence):
+        nominal = stream.rate
+        real = stream.real_rate
         if nominal and abs(real / nominal - 1) > RATE_SHARE:
             yield CheckFinding(
                 'sampling',
@@ -337,24 +341,24 @@ def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Samples are evenly spaced, and stamps finer than their spacing."""
-    for name, found in _fast_streams(evidence):
+    for name, stream in _fast_streams(evidence):
         faults = []
-        if found.stamping is not None:
+        if stream.stamping is not None:
             yield CheckFinding(
                 'jitter',
-                WARNING if found.stamping.word == IRREGULAR else NOTE,
-                f"{name}: {found.stamping}; stamps by the sensor's own clock would be better",
+                WARNING if stream.stamping.word == IRREGULAR else NOTE,
+                f"{name}: {stream.stamping}; stamps by the sensor's own clock would be better",
             )
         if (
-            found.stamp_step_ns
-            and found.stamp_step_ns % WHOLE_MS == 0
-            and found.stamp_step_ns < 0.5e9 * found.period
+            stream.stamp_step_ns
+            and stream.stamp_step_ns % WHOLE_MS == 0
+            and stream.stamp_step_ns < 0.5e9 * stream.period
         ):
-            faults.append(f'all stamps are multiples of {found.stamp_step_ns // WHOLE_MS} ms')
-        if found.irregular > MAX_IRREGULAR_SHARE:
+            faults.append(f'all stamps are multiples of {stream.stamp_step_ns // WHOLE_MS} ms')
+        if stream.irregular > MAX_IRREGULAR_SHARE:
             faults.append(
-                f'{100 * found.irregular:.0f} % of the steps are off the usual'
-                f' {found.period * 1e3:.4g} ms by more than a tenth'
+                f'{100 * stream.irregular:.0f} % of the steps are off the usual'
+                f' {stream.period * 1e3:.4g} ms by more than a tenth'
             )
         if faults:
             yield CheckFinding(
@@ -372,6 +376,7 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     joints = evidence.streams['joints']
     if any('clock reset' in stream.dropped for stream in (imu, joints)):
         return
+    # All in s.
     overlap = (min(imu.last_ns, joints.last_ns) - max(imu.first_ns, joints.first_ns)) * 1e-9
     shorter = min(imu.duration, joints.duration)
     late = (joints.first_ns - imu.first_ns) * 1e-9
@@ -438,7 +443,8 @@ class Preflight(EvidenceGatherer):
         self, gravity: float | None = None, *, strict: bool = True, one_sensor: bool = False
     ):
         super().__init__(STANDARD_GRAVITY if gravity is None else gravity)
-        self._strict, self._one_sensor = strict, one_sensor
+        self._strict = strict
+        self._one_sensor = one_sensor
         self.unusable: dict[str, str] = {}
         """Sensor that cannot be used, one at most -> why; for `one_sensor`."""
         # Complete after `finish`.
@@ -471,10 +477,12 @@ class Preflight(EvidenceGatherer):
             self.resolution = evidence.resolution
         if self._one_sensor:
             self.unusable = unusable_sensor(self.findings, evidence.absent)
-            self.findings = tuple(
-                replace(finding, severity=WARNING) if finding.sensor in self.unusable else finding
-                for finding in self.findings
-            )
+            findings = []
+            for finding in self.findings:
+                if finding.sensor in self.unusable:
+                    finding = replace(finding, severity=WARNING)
+                findings.append(finding)
+            self.findings = tuple(findings)
         if self._strict:
             refuse(self.findings)
 
@@ -485,11 +493,11 @@ def unusable_sensor(findings: Sequence[CheckFinding], absent: Sequence[str] = ()
 
     Empty where both can be used, or none; `absent` are sensors without readings.
     """
-    found: dict[str, str] = {}
+    reason_of: dict[str, str] = {}
     for finding in findings:
         if finding.severity == REFUSE and finding.sensor:
-            found.setdefault(finding.sensor, finding.text)
-    return found if len({*found, *absent}) == 1 else {}
+            reason_of.setdefault(finding.sensor, finding.text)
+    return reason_of if len({*reason_of, *absent}) == 1 else {}
 
 
 def refuse(findings: tuple[CheckFinding, ...]) -> None:

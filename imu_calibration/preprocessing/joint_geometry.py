@@ -71,19 +71,23 @@ class MovingReadings:
 
 
 def _residual(rate, reference):
-    """Return ``w - b - M r - D r'`` with b, M and D of least squares; D stands for a delay."""
+    """
+    Return ``w - b - M r - D r'`` with b, M and D of least squares, rad/s, shape (n, 3).
+
+    With the measured rates w, and rates r and accelerations r' of a `Reference`; D models a delay.
+    """
     design = np.column_stack([np.ones(len(rate)), reference.rate_s, reference.alpha_s])
     return rate - design @ np.linalg.lstsq(design, rate, rcond=1e-6)[0]
 
 
 def _share(residual, measured):
-    """Return the unexplained share of the squares about the mean."""
+    """Return ``sum |residual|^2 / sum |measured - mean|^2``, the unexplained share."""
     return float((residual**2).sum() / ((measured - measured.mean(axis=0)) ** 2).sum())
 
 
 def is_unexplained(windows: Sequence[Window], expected: Sequence[np.ndarray]) -> bool:
     """
-    Return whether rates of the joints leave more unexplained than a correct description does.
+    Return whether more of the rates is unexplained than with a correct description of the table.
 
     Parameters
     ----------
@@ -140,22 +144,18 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
     if not _spans_three(readings.rate):  # many descriptions have the same rates about one axis
         return None
     as_described = readings.correction('', table, readings.motion)
-    sufficient = min(LARGEST_UNEXPLAINED, as_described.rate_share / LEAST_IMPROVEMENT)
+    largest_share = min(LARGEST_UNEXPLAINED, as_described.rate_share / LEAST_IMPROVEMENT)
     corrections = list(_corrections(readings, table))
     smallest = min(correction.rate_share for correction in corrections)
-    if smallest > sufficient:
-        corrections = [_of_several(readings, table)]
+    if smallest > largest_share:
+        corrections = [_correction_of_several(readings, table)]
         smallest = corrections[0].rate_share
-    if smallest > sufficient:
+    if smallest > largest_share:
         return None
-    best = min(
-        (
-            correction
-            for correction in corrections
-            if correction.rate_share <= TIED_FACTOR * smallest
-        ),
-        key=lambda correction: correction.force_share,
-    )
+    tied = [
+        correction for correction in corrections if correction.rate_share <= TIED_FACTOR * smallest
+    ]
+    best = min(tied, key=lambda correction: correction.force_share)
     return CheckFinding(
         'on_table',
         REFUSE,
@@ -171,7 +171,7 @@ def _corrections(readings: MovingReadings, table: Table) -> Iterator[Correction]
     """Yield the best change of the zeros, then another axis of each joint."""
     zero_names = table.joint_names.zeros
     if zero_names:
-        zeros = _fitted(
+        zeros = _fit_angles(
             lambda zeros: readings.rate_residual(table, _shifted(readings.motion, table, zeros)),
             len(zero_names),
         )
@@ -181,10 +181,8 @@ def _corrections(readings: MovingReadings, table: Table) -> Iterator[Correction]
         )
         yield readings.correction(words, table, _shifted(readings.motion, table, zeros))
     for k, name in enumerate(table.joint_names):
-        for axis in (
-            *_other_axes(np.array(table.joints[k].axis)),
-            _axis_between(readings, table, k),
-        ):
+        axes = [*_other_axes(np.array(table.joints[k].axis)), _fit_axis(readings, table, k)]
+        for axis in axes:
             decimals = 0 if _is_coordinate_axis(axis) else 3
             shown = ', '.join(f'{value + 0.0:.{decimals}f}' for value in axis)
             yield readings.correction(
@@ -192,25 +190,26 @@ def _corrections(readings: MovingReadings, table: Table) -> Iterator[Correction]
             )
 
 
-def _of_several(readings: MovingReadings, table: Table) -> Correction:
+def _correction_of_several(readings: MovingReadings, table: Table) -> Correction:
     """Return the change of all zeros and axes together that explains most of the rates."""
     n_zeros = len(table.joint_names.zeros)
 
-    def changed(values):
-        turned = table
-        for k, angles in enumerate(values[n_zeros:].reshape(-1, 2)):
-            turned = with_axis(turned, k, _turned_axis(table, k, angles))
-        return turned, _shifted(readings.motion, table, values[:n_zeros])
+    def changed(angles):
+        """Return table and motion with changed zeros, then two angles of each axis, rad."""
+        changed_table = table
+        for k, axis_angles in enumerate(angles[n_zeros:].reshape(-1, 2)):
+            changed_table = with_axis(changed_table, k, _turned_axis(table, k, axis_angles))
+        return changed_table, _shifted(readings.motion, table, angles[:n_zeros])
 
-    values = _fitted(
-        lambda values: readings.rate_residual(*changed(values)),
+    angles = _fit_angles(
+        lambda angles: readings.rate_residual(*changed(angles)),
         n_zeros + 2 * len(table.joints),
     )
-    return readings.correction('several of them are changed', *changed(values))
+    return readings.correction('several of them are changed', *changed(angles))
 
 
-def _fitted(residual, n_parameters):
-    """Return the angles with the least squares of a residual, rad, from almost zero."""
+def _fit_angles(residual, n_parameters):
+    """Return the angles x, rad, with the least ``sum |residual(x)|^2``, from almost zero."""
     from scipy.optimize import least_squares  # here, because its import is slow
 
     start = np.full(n_parameters, FIRST_ANGLE)
@@ -218,7 +217,7 @@ def _fitted(residual, n_parameters):
 
 
 def _shifted(motion, table, zeros):
-    """Return the motion with changed zeros of the joints that have one."""
+    """Return the motion with `zeros`, rad, added to the angles of the joints that have one."""
     position = motion.position.copy()
     position[:, [table.joint_names.index(name) for name in table.joint_names.zeros]] += zeros
     return replace(motion, position=position)
@@ -230,19 +229,14 @@ def _turned_axis(table, joint, angles):
     return rotation(angles @ axis_error_directions(axis)) @ axis
 
 
-def _axis_between(readings, table, joint):
+def _fit_axis(readings, table, joint):
     """Return the axis of one joint that explains most of the rates, any unit vector."""
 
-    def turned(angles):
-        return _turned_axis(table, joint, angles)
+    def residual(angles):
+        turned_table = with_axis(table, joint, _turned_axis(table, joint, angles))
+        return readings.rate_residual(turned_table, readings.motion)
 
-    angles = _fitted(
-        lambda angles: readings.rate_residual(
-            with_axis(table, joint, turned(angles)), readings.motion
-        ),
-        2,
-    )
-    axis = turned(angles)
+    axis = _turned_axis(table, joint, _fit_angles(residual, 2))
     return np.round(axis) if _is_coordinate_axis(axis) else axis
 
 
@@ -288,10 +282,10 @@ def turned_rates(
     measured, matrix, _ = _sensor_fit(windows, expected)
     turn = nearest_rotation(matrix)
     bias = np.mean(measured - reference @ turn.T, axis=0)
-    unexplained = _share(measured - reference @ turn.T - bias, measured)
+    share_turned = _share(measured - reference @ turn.T - bias, measured)
     difference = measured - reference
-    as_described = _share(difference - difference.mean(axis=0), measured)
-    if unexplained > min(LARGEST_UNEXPLAINED, as_described / LEAST_IMPROVEMENT):
+    share_as_described = _share(difference - difference.mean(axis=0), measured)
+    if share_turned > min(LARGEST_UNEXPLAINED, share_as_described / LEAST_IMPROVEMENT):
         return None
     return [rates @ turn.T + bias for rates in expected]
 

@@ -31,7 +31,7 @@ MIN_MOVING_STEPS = 50.0
 
 @dataclass(frozen=True, eq=False)
 class RecordingEvidence:
-    """A recording as the checks see it, cleaned and in SI."""
+    """Quantities of a recording, cleaned and in SI, from which its checks decide."""
 
     streams: dict[str, StreamStatistics]
     """'imu', 'joints', 'temperature' -> rates, gaps, drops; only streams with accepted samples."""
@@ -76,7 +76,7 @@ class RecordingEvidence:
 
     @cached_property
     def frozen_parts(self) -> list[scan.FrozenPart]:
-        """Where a sensor is frozen, or the joints are while the IMU turns."""
+        """Stretches in which a sensor is frozen, or the joints are while the IMU turns."""
         rate = np.zeros(3) if self.rest is None else self.rest.rate
         return scan.frozen_parts(self.chunks, self.frozen) + scan.frozen_joints(
             self.awake, self.still_joints_ns, rate
@@ -89,7 +89,7 @@ class RecordingEvidence:
 
     @cached_property
     def turning(self) -> Turning | None:
-        """How gravity turns against the rates, or None."""
+        """Relation of the rates to the rotation of gravity, or None."""
         return relate_turns(self.awake)
 
     @cached_property
@@ -133,14 +133,12 @@ class RecordingEvidence:
 
     @cached_property
     def length(self) -> Any:
-        """Gravity as the accelerometer reads it, or None without samples."""
+        """Length of the specific force at rest, else its median length; None without samples."""
         if self.rest is not None:
             return self.rest.length
-        return (
-            float(np.median(np.linalg.norm(self.chunks.mean[:, :3], axis=1)))
-            if len(self.chunks)
-            else None
-        )
+        if not len(self.chunks):
+            return None
+        return float(np.median(np.linalg.norm(self.chunks.mean[:, :3], axis=1)))
 
 
 class EvidenceGatherer:
@@ -148,10 +146,13 @@ class EvidenceGatherer:
 
     def __init__(self, gravity: float):
         self.gravity = gravity
+        """Local gravity, m/s^2."""
         self._chunks = scan.ChunkSeries()
+        # Of each column: largest readings upwards, and downwards with the other sign.
         self._ends = tuple((Extremes(), Extremes()) for _ in range(6))
         self._resolution = scan.ResolutionSearch()
         self._joints = scan.StandingJoints()
+        # Lowest and highest temperature.
         self._temperature_c: tuple[float, float] | None = None
         self._dead_band = DeadBandSearch()
 
@@ -172,23 +173,20 @@ class EvidenceGatherer:
         self, statistics: dict[str, StreamStatistics], readings: RawReadings
     ) -> RecordingEvidence:
         """Return the RecordingEvidence, with the StreamStatistics of each stream."""
-        streams = {name: found for name, found in statistics.items() if found.count}
-        chunks = self._chunks.chunks()
-        series = self._chunks
         resolution = self._resolution.result()
         return RecordingEvidence(
-            streams,
-            chunks,
-            series.n_samples,
-            series.n_changed,
-            series.n_repeated,
-            resolution,
-            self._ends,
-            self._temperature_c,
-            self.gravity,
-            self._joints.stretches(),
-            readings,
-            self._dead_band.bands(resolution[3:]),
+            streams={name: stream for name, stream in statistics.items() if stream.count},
+            chunks=self._chunks.chunks(),
+            n_samples=self._chunks.n_samples,
+            n_changed=self._chunks.n_changed,
+            n_repeated=self._chunks.n_repeated,
+            resolution=resolution,
+            ends=self._ends,
+            temperature_c=self._temperature_c,
+            gravity=self.gravity,
+            still_joints_ns=self._joints.stretches(),
+            readings=readings,
+            dead_band=self._dead_band.bands(resolution[3:]),
         )
 
     def push_imu(self, imu: ImuSamples) -> None:
@@ -203,14 +201,14 @@ class EvidenceGatherer:
 
 
 class Severity(StrEnum):
-    """How much a finding matters, the worst first."""
+    """Consequence of a finding for the result, the worst first."""
 
     REFUSE = 'refuse'
     """The result would be wrong."""
     WARNING = 'warning'
-    """It may suffer."""
+    """The result may be less accurate."""
     NOTE = 'note'
-    """Worth knowing."""
+    """A property of the recording."""
     GOOD = 'good'
     """Checked and in order."""
 
@@ -225,17 +223,17 @@ class CheckFinding:
     check: str
     """Name of the check."""
     severity: Severity
-    """How much it matters."""
+    """Its consequence."""
     text: str
     """Requirement, received value and remedy; for GOOD, the observation."""
     samples: int = 0
-    """Samples that are unusable because of it and that no other count holds."""
+    """Samples that are unusable because of it and not counted elsewhere."""
     key: str | None = None
     """The missing input, a key of `errors.ERROR_KEYS`."""
     value: str = ''
     """Proposed value of the missing input."""
     sensor: str = ''
-    """The sensor that cannot be used, where the other one is not concerned; or the joints."""
+    """The sensor that cannot be used while the other one can; or `checks.JOINT_STATES`."""
 
     def named(self, name: str) -> 'CheckFinding':
         """Return the finding with the name of its recording before the text."""
@@ -331,12 +329,14 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
                     f'the covariance marks the {name} in these messages as absent (-1)',
                 )
             continue
-        if not np.isfinite(matrix).all() or (np.diag(matrix) < 0).any():
+        variances = np.diag(matrix)
+        atol = LARGEST_ASYMMETRY * np.abs(matrix).max()
+        if not np.isfinite(matrix).all() or (variances < 0).any():
             yield CheckFinding(
                 'covariance',
                 WARNING,
                 f'variances of the {name} must be finite and not negative, they are'
-                f' {_numbers(np.diag(matrix))}; filters that believe them diverge: correct the'
+                f' {_numbers(variances)}; filters that believe them diverge: correct the'
                 ' driver, or fill them with compensator_node',
             )
         elif not matrix.any():
@@ -347,27 +347,25 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
                     f'the covariance of the {name} is unknown (zeros): estimators need it; '
                     'compensator_node fills it',
                 )
-        elif not np.allclose(
-            matrix, matrix.T, rtol=0, atol=LARGEST_ASYMMETRY * np.abs(matrix).max()
-        ):
+        elif not np.allclose(matrix, matrix.T, rtol=0, atol=atol):
             yield CheckFinding(
                 'covariance',
                 WARNING,
                 f'the covariance of the {name} must be symmetric, it is not; correct the driver',
             )
-        elif not np.diag(matrix).all():
+        elif not variances.all():
             yield CheckFinding(
                 'covariance',
                 WARNING,
                 f'variances of the {name} must be greater than zero, they are'
-                f' {_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct'
+                f' {_numbers(variances)}: a filter would treat these axes as exact; correct'
                 ' the driver',
             )
         else:
             yield CheckFinding(
                 'covariance',
                 GOOD,
-                f'standard deviations of the {name}: {_numbers(np.sqrt(np.diag(matrix)))}',
+                f'standard deviations of the {name}: {_numbers(np.sqrt(variances))}',
             )
 
 
@@ -414,4 +412,5 @@ def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
 
 
 def _numbers(values):
+    """Return numbers with three digits, separated by commas."""
     return ', '.join(f'{value:.3g}' for value in values)

@@ -53,13 +53,15 @@ def read_recording(
     if preflight is not None:
         watchers.append(preflight)
     cleaner = BlockCleaner(nominal=nominal, watchers=watchers, one_sensor=True)
-    joined, temperatures = JoinedParts(), []
-    # each epoch of the clock is a part of its own: no turn is used across a reset
-    stamps, shifts = ContinuedStamps(), {}
+    # The epochs of the clock follow one another with a pause: no turn is used across a reset.
+    stamps = ContinuedStamps()
+    shift_of_epoch = {}
+    joined = JoinedParts()
+    temperatures = []
     for cleaned in cleaner.all_of(blocks):
         for epoch, imu in cleaned.imu:
             joined.add(stamps.moved(epoch, imu))
-            shifts[epoch] = stamps.shift_ns
+            shift_of_epoch[epoch] = stamps.shift_ns
         temperatures += cleaned.temperature
     if not len(joined):
         raise InputError(
@@ -77,30 +79,25 @@ def read_recording(
     if preflight is not None:
         findings = (*preflight.findings, *late_gyroscope(delay))
         preflight.findings = findings
-    warm = None
+    temperature_c = None
     if temperatures:
-        moved = [
-            replace(part, stamp_ns=part.stamp_ns + shifts.get(epoch, stamps.shift_ns))
-            for epoch, part in temperatures
-        ]
-        known = TemperatureSamples.concatenate(moved)
+        moved = []
+        for epoch, part in temperatures:
+            shift_ns = shift_of_epoch.get(epoch, stamps.shift_ns)
+            moved.append(replace(part, stamp_ns=part.stamp_ns + shift_ns))
+        readings = TemperatureSamples.concatenate(moved)
         start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
-        warm = np.interp(
+        temperature_c = np.interp(
             (imu.stamp_ns - start).astype(float),
-            (known.stamp_ns - start).astype(float),
-            known.temperature_c,
+            (readings.stamp_ns - start).astype(float),
+            readings.temperature_c,
         )
-    counts = cleaner.lost | {
-        reason: count for reason, count in cleaner.counts.items() if reason.startswith('imu ')
-    }
-    return SampleRecording(
-        imu,
-        warm,
-        {reason: count for reason, count in counts.items() if count},
-        findings,
-        delay,
-        unusable_sensors,
-    )
+    counts = dict(cleaner.lost)
+    for reason, count in cleaner.counts.items():
+        if reason.startswith('imu '):
+            counts[reason] = count
+    counts = {reason: count for reason, count in counts.items() if count}
+    return SampleRecording(imu, temperature_c, counts, findings, delay, unusable_sensors)
 
 
 def late_gyroscope(delay: GyroscopeDelay | None) -> Iterator[CheckFinding]:

@@ -36,7 +36,9 @@ from imu_calibration.preprocessing.recording_evidence import (
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
+"""Sensor, its columns in (force x, y, z, rate x, y, z), and their SI unit."""
 GRAVITY_SHARE = 0.02
+"""Share by which gravity at rest may differ from the local one."""
 LINEAR = 0.8
 """
 m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity.
@@ -109,13 +111,13 @@ def force_error(
         Samples per second, for the search of increments; 0: not known.
 
     """
-    said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
+    requirement = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
     remedy = 'convert it in the driver'
     raw_length = length
     if not stated.is_si:
         # The length of the readings, for the search of their unit.
         raw_length = length * float(np.mean(stated.scale))
-        said = (
+        requirement = (
             f'specific force must be in the stated unit {stated.unit}, the length of the readings'
             f' {where} is {raw_length:.4g}: '
         )
@@ -123,18 +125,18 @@ def force_error(
     unit = unit_of_rest(raw_length)
     if not stated.is_si and scale_range(raw_length / STANDARD_GRAVITY) is not IMPOSSIBLE:
         unit = unit or 'm/s^2'
-    wrong = scale_range(length / STANDARD_GRAVITY) is IMPOSSIBLE
-    if unit and (wrong or stated.is_si):
+    is_wrong = not _is_force(length)
+    if unit and (is_wrong or stated.is_si):
         return InputError(
-            f'{said}it is probably {unit}; {remedy}',
+            f'{requirement}it is probably {unit}; {remedy}',
             key='accelerometer_unit',
             code='force_unit',
             value=unit,
         )
     gravity_ratio = length * per_second / STANDARD_GRAVITY
-    if wrong and stated.is_si and abs(gravity_ratio - 1.0) < INCREMENT_AGREEMENT:
+    if is_wrong and stated.is_si and abs(gravity_ratio - 1.0) < INCREMENT_AGREEMENT:
         return InputError(
-            f'{said}increments per sample? Times {per_second:.4g} Hz it is'
+            f'{requirement}increments per sample? Times {per_second:.4g} Hz it is'
             f' {length * per_second:.4g}; {remedy}',
             key='increments',
             code='increments',
@@ -142,14 +144,14 @@ def force_error(
         )
     if length < LINEAR:
         return InputError(
-            f'{said}it is probably acceleration without gravity, as phones compute it; record the'
-            ' raw accelerometer',
+            f'{requirement}it is probably acceleration without gravity, as phones compute it; record'
+            ' the raw accelerometer',
             key='imu_topic',
             code='without_gravity',
         )
-    if wrong:
+    if is_wrong:
         return InputError(
-            f'{said}counts or volts?; {remedy}',
+            f'{requirement}counts or volts?; {remedy}',
             key='accelerometer_unit',
             code='force_unit',
             value='counts:NUMBER/g',
@@ -197,10 +199,12 @@ def refuse_units(imu: ImuSamples, readings: RawReadings = RawReadings()) -> None
     The median length decides, so that a motion in part of them does not. Readings that are zero or
     not finite are no measurement of gravity. Increments must be over the samples of this stream.
     """
-    stated, force = readings.accelerometer, imu.force_s
+    stated = readings.accelerometer
+    force = imu.force_s
     per_second = samples_per_second(imu.stamp_ns)
-    if per_second and (wrong := increments_error(per_second, readings)) is not None:
-        raise wrong
+    error = increments_error(per_second, readings) if per_second else None
+    if error is not None:
+        raise error
     measured = np.isfinite(force).all(axis=1) & np.any(force != 0.0, axis=1)
     length = np.linalg.norm(stated.convert(force[measured]), axis=1)
     if len(length) == 0:
@@ -226,26 +230,27 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if turning is not None:
         ratio = 1.0 / turning.factor
         raw_ratio = ratio * float(np.mean(stated.scale))
-        wanted, convert = 'in rad/s', 'convert them in the driver'
+        wanted = 'in rad/s'
+        convert = 'convert them in the driver'
         if not stated.is_si:
             wanted = f'in the stated unit {stated.unit}'
             convert = 'give the recording that the unit belongs to'
-        came = (
+        observed = (
             f'angular rates must be {wanted}, they are {significant(ratio)} times the rotation of'
             ' the measured gravity: '
         )
         unit = _unit_of_ratio(raw_ratio)
         if unit and scale_range(ratio) is IMPOSSIBLE:
-            yield wrong_rate_unit(f'{came}probably {unit}; {convert}', unit)
+            yield wrong_rate_unit(f'{observed}probably {unit}; {convert}', unit)
         elif 0.6 < ratio / DEG < 1.6:
             yield wrong_rate_unit(
-                f'{came}probably converted from deg/s twice; convert them once',
+                f'{observed}probably converted from deg/s twice; convert them once',
                 f'counts:{DEG:.7g}/(rad/s)',
             )
         elif _full_scale(evidence) is not None:
             return
         elif scale_range(ratio) is IMPOSSIBLE:
-            yield wrong_rate_unit(f'{came}counts or volts?; {convert}')
+            yield wrong_rate_unit(f'{observed}counts or volts?; {convert}')
         else:
             yield CheckFinding(
                 'rate_unit',
@@ -254,7 +259,8 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 f' rates{_about(turning.axes)}',
             )
     elif largest > MAX_GYRO_RATE:
-        unit, proposed = 'counts or volts', 'counts:NUMBER/(deg/s)'
+        unit = 'counts or volts'
+        proposed = 'counts:NUMBER/(deg/s)'
         if largest < FASTEST_DEG and stated.is_si:
             unit = proposed = 'deg/s'
         yield wrong_rate_unit(
@@ -281,37 +287,39 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     factor = _full_scale(evidence)
     if factor is None:
         return
-    came = f'angular rates are {factor:.3g} times the rotation of gravity from one rest to the next'
+    observed = (
+        f'angular rates are {factor:.3g} times the rotation of gravity from one rest to the next'
+    )
     if scale_range(factor) is not USUAL:
-        came += ': is their unit right? If it is'
+        observed += ': is their unit right? If it is'
     if abs(np.log2(factor)) % 1 == 0:
         yield CheckFinding(
             'full_scale',
             WARNING,
-            f'{came}, the driver converts for {factor:.3g} times the full-scale range that is set;'
-            ' correct its setting (a calibration would include the factor in the matrix, and be'
+            f'{observed}, the driver converts for {factor:.3g} times the full-scale range that is'
+            ' set; correct its setting (a calibration would include the factor in the matrix, and be'
             ' wrong after the correction)',
         )
     else:
         yield CheckFinding(
             'full_scale',
             WARNING,
-            f'{came}, the scale of the driver is wrong; correct it, or check that the IMU was at'
-            ' rest',
+            f'{observed}, the scale of the driver is wrong; correct it, or check that the IMU was'
+            ' at rest',
         )
 
 
 def _full_scale(evidence):
     """Return the factor of the rates if a wrong full-scale range may explain it, else None."""
-    factor, turning = evidence.rate_factor, evidence.turning
-    if factor is None and turning is not None:  # no rests available
-        factor = nearest_power(1.0 / turning.factor)
-        factor = factor if np.log2(factor) % 1 == 0 else None
-    return (
-        factor
-        if factor is not None and factor != 1.0 and FACTORS[0] < factor < FACTORS[-1]
-        else None
-    )
+    factor = evidence.rate_factor
+    if factor is None and evidence.turning is not None:
+        # Without turns between rests: powers of two only.
+        factor = nearest_power(1.0 / evidence.turning.factor)
+        if np.log2(factor) % 1 != 0:
+            return None
+    if factor is None or factor == 1.0 or not FACTORS[0] < factor < FACTORS[-1]:
+        return None
+    return factor
 
 
 def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -326,13 +334,13 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 'handedness', GOOD, 'accelerometer and gyroscope share right-handed axes'
             )
         return
-    what = ', '.join(
+    exchanges = ', '.join(
         f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's"
         f' {"xyz"[i]}'
         for i, j, sign in match.exchanges(turning.seen)
     )
-    if not what or match.agreement < MIN_MATCH:
-        what = 'no exchange of axes makes them fit'
+    if not exchanges or match.agreement < MIN_MATCH:
+        exchanges = 'no exchange of axes makes them fit'
     kinds = {
         (True, False): 'one is turned against the other',
         (False, True): 'one of them is left-handed',
@@ -344,7 +352,7 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         'handedness',
         REFUSE,
         'accelerometer and gyroscope must share right-handed axes, gravity does not rotate'
-        f' according to the rates: {what} ({kind}); correct signs and order of the axes in the'
+        f' according to the rates: {exchanges} ({kind}); correct signs and order of the axes in the'
         ' driver',
     )
 
@@ -352,56 +360,65 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """No output piles up at the end of its range."""
     for sensor, part, unit in CHANNELS:
-        fine = evidence.quiet_range[part] > FINE * evidence.resolution[part]
-        least = CLIP_RATE * evidence.quiet_range[part]
+        # Axes with visible noise, and the least end of a range.
+        has_noise = evidence.quiet_range[part] > FINE * evidence.resolution[part]
+        least_end = CLIP_RATE * evidence.quiet_range[part]
         if sensor == 'accelerometer':
-            least = np.where(fine, least, CLIP_FORCE * (evidence.length or 0.0))
+            least_end = np.where(has_noise, least_end, CLIP_FORCE * (evidence.length or 0.0))
         else:
-            least = np.maximum(least, LEAST_RANGE)
-        held = _held(evidence, sensor)
-        words = []
+            least_end = np.maximum(least_end, LEAST_RANGE)
+        frozen = _frozen_readings(evidence, sensor)
+        counts = []
         total = 0
         level = 0.0
         for axis, ends in enumerate(evidence.ends[part]):
             count = 0
             for sign, end in zip((1, -1), ends):
-                if not (end.level > least[axis] and (fine[axis] or end.jumped)):
+                # Without visible noise the largest reading must have been reached by large steps.
+                if end.level <= least_end[axis] or not (has_noise[axis] or end.jumped):
                     continue
-                clipped = _clipped(end, sign * held[:, axis], evidence.chunks.size)
-                if clipped:
-                    count += clipped
+                n_clipped = _n_clipped(end, sign * frozen[:, axis], evidence.chunks.size)
+                if n_clipped:
+                    count += n_clipped
                     level = max(level, end.level)
             if count:
-                words.append(f'{"xyz"[axis]} {count}')
+                counts.append(f'{"xyz"[axis]} {count}')
                 total = total + count
-        if words:
-            people = (
-                f' ({level / DEG:.0f} deg/s)'
-                if unit == 'rad/s'
-                else f' ({level / STANDARD_GRAVITY:.1f} g)'
-            )
+        if counts:
+            customary = f' ({level / STANDARD_GRAVITY:.1f} g)'
+            if unit == 'rad/s':
+                customary = f' ({level / DEG:.0f} deg/s)'
             yield CheckFinding(
                 'clipping',
                 WARNING,
-                f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at '
-                'the end of the range; larger values are lost, move less or choose a wider range',
+                f'the {sensor} clips at {level:.4g} {unit}{customary}: {", ".join(counts)} readings'
+                ' at the end of the range; larger values are lost, move less or choose a wider range',
                 samples=total,
             )
 
 
-def _held(evidence, sensor):
+def _frozen_readings(evidence, sensor):
     """Return the readings of the chunks in which a sensor is frozen, shape (n, 3)."""
     return evidence.chunks.mean[evidence.frozen[sensor]][:, SENSOR_COLUMNS[sensor]]
 
 
-def _clipped(end, held, size):
+def _n_clipped(end, frozen, size):
     """
-    Return how many readings are at the end of the range.
+    Return how many readings are at an end of the range, without those of frozen stretches.
 
-    A pile that is a frozen stretch with its two ends is none.
+    Parameters
+    ----------
+    end : Extremes
+        Largest readings of an axis.
+    frozen : array, shape (n,)
+        Readings of the frozen chunks, with the sign of the end.
+    size : int
+        Samples of a chunk.
+
     """
-    frozen = size * int(np.isclose(held, end.level, rtol=1e-9).sum())
-    return end.n_clipped if not frozen or end.n_clipped > frozen + 2 * size else 0
+    n_frozen = size * int(np.isclose(frozen, end.level, rtol=1e-9).sum())
+    # A frozen stretch may begin and end within further chunks.
+    return end.n_clipped if not n_frozen or end.n_clipped > n_frozen + 2 * size else 0
 
 
 def _is_force(length):
@@ -415,21 +432,19 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if rest is None or rest.bias is None or not _is_force(evidence.length):
         # With few attitudes, a steady spin about the vertical is not distinguishable from rest
         return
-    found = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
+    biases = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
     for sensor, _, unit in CHANNELS:
-        size = float(np.linalg.norm(found[sensor]))
+        size = float(np.linalg.norm(biases[sensor]))
         if size > MOST_BIAS[sensor]:
-            people = (
-                f'{size / STANDARD_GRAVITY:.2f} g'
-                if sensor == 'accelerometer'
-                else f'{size / DEG:.0f} deg/s'
-            )
-            values = ', '.join(f'{value:+.2f}' for value in found[sensor])
+            customary = f'{size / DEG:.0f} deg/s'
+            if sensor == 'accelerometer':
+                customary = f'{size / STANDARD_GRAVITY:.2f} g'
+            values = ', '.join(f'{value:+.2f}' for value in biases[sensor])
             yield CheckFinding(
                 'bias',
                 WARNING,
-                f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of'
-                ' sensor has; check offsets in the driver, the supply and the soldering of the'
+                f'the bias of the {sensor} is {customary} ([{values}] {unit}), more than any grade'
+                ' of sensor has; check offsets in the driver, the supply and the soldering of the'
                 ' sensor',
             )
 
@@ -439,26 +454,29 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     rest = evidence.rest
     if rest is None or 'accelerometer' in evidence.absent or not _is_force(evidence.length):
         return
-    off = rest.length / evidence.gravity - 1
+    error = rest.length / evidence.gravity - 1
+    source = 'one stretch'
     if rest.sphere is not None:
         bias = np.linalg.norm(rest.sphere.centre)
-        what = f'{len(rest.force)} poses, bias of {bias:.2f} m/s^2 subtracted'
-    else:
-        what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
+        source = f'{len(rest.force)} poses, bias of {bias:.2f} m/s^2 subtracted'
+    elif len(rest.force) > 1:
+        source = f'median of {len(rest.force)} stretches'
     cause = 'scale or bias is wrong'
-    if scale_range(1.0 + off) is not USUAL:
+    if scale_range(1.0 + error) is not USUAL:
         cause = 'is the unit right? If it is, ' + cause
-    if abs(off) > GRAVITY_SHARE:
+    if abs(error) > GRAVITY_SHARE:
         yield CheckFinding(
             'gravity',
             WARNING,
             f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads'
-            f' {rest.length:.3f} ({what}), {100 * off:+.1f} %: {cause} (gravity'
+            f' {rest.length:.3f} ({source}), {100 * error:+.1f} %: {cause} (gravity'
             f' differs by {100 * GRAVITY_PLACE_SHARE} % between sites)',
         )
     else:
         yield CheckFinding(
-            'gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})'
+            'gravity',
+            GOOD,
+            f'gravity reads {rest.length:.3f} m/s^2, {100 * error:+.1f} % ({source})',
         )
 
 
@@ -478,13 +496,13 @@ def dead_band(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every message carries a new measurement."""
-    frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
-    share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
-    noisy = []
+    n_frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
+    share = (evidence.n_repeated - n_frozen) / max(evidence.n_samples, 1)
+    has_noise = True
     for sensor, part in SENSOR_COLUMNS.items():
         if sensor not in evidence.absent:
-            noisy.append(evidence.quiet_range[part].all())
-    if share > REPEATED_SHARE and all(noisy):
+            has_noise &= bool(evidence.quiet_range[part].all())
+    if share > REPEATED_SHARE and has_noise:
         yield CheckFinding(
             'repeated_readings',
             WARNING,
@@ -500,21 +518,19 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         return
     for sensor, part, unit in CHANNELS:
         step = evidence.resolution[part]
-        range_ = evidence.rest.range[part]
+        extent = evidence.rest.range[part]
         # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
-        coarse = (step > MIN_CONVERTER_STEP) & (4 * step > range_)
-        constant = coarse & (range_ == 0)
+        coarse = (step > MIN_CONVERTER_STEP) & (4 * step > extent)
+        constant = coarse & (extent == 0)
         if coarse.any():
             size = step[coarse].max()
-            people = (
-                f'{size / DEG:.2g} deg/s'
-                if unit == 'rad/s'
-                else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
-            )
+            customary = f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
+            if unit == 'rad/s':
+                customary = f'{size / DEG:.2g} deg/s'
             yield CheckFinding(
                 'resolution',
                 NOTE,
-                f'the {sensor} is read in steps of {people}, coarser than its noise on'
+                f'the {sensor} is read in steps of {customary}, coarser than its noise on'
                 f' {_axes(coarse)}'
                 + (f' and constant at rest on {_axes(constant)}' if constant.any() else '')
                 + ': means over short windows are rounded too; the noise is at least step/sqrt(12)',
@@ -541,8 +557,10 @@ def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def _axes(flags):
+    """Return the letters of the axes with a true flag, shape (3,)."""
     return ', '.join(np.array(list('xyz'))[np.asarray(flags, bool)])
 
 
 def _about(flags):
+    """Return ' about x, y' for the axes with a true flag; '' for none."""
     return f' about {_axes(flags)}' if np.any(flags) else ''
