@@ -55,7 +55,9 @@ def norm_sf(x: ArrayLike) -> np.ndarray:
 
 def chance_of_fall(fall: float, added: int, *, rest: float, spare: float) -> float:
     """
-    Return the p-value of the fall of a sum of squares.
+    Return the p-value of the fall of a sum of squares by added parameters (F test).
+
+    ``F = (fall / added) / (rest / spare)`` has `added` and `spare` degrees of freedom.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from errno import EINVAL
 from functools import cache
 from os import PathLike
@@ -63,13 +63,13 @@ def stated(entry: Any) -> dict[str, Any]:
 
     Without fields that are None, False or ''; an unknown number (NaN) becomes null.
     """
-    found = {}
-    for each in fields(entry):
-        value = getattr(entry, each.name)
+    stated_fields = {}
+    for field in fields(entry):
+        value = getattr(entry, field.name)
         if value is None or value is False or (isinstance(value, str) and not value):
             continue
-        found[each.name] = _entry(value)
-    return found
+        stated_fields[field.name] = _entry(value)
+    return stated_fields
 
 
 def _entry(value: Any) -> Any:
@@ -193,18 +193,32 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
         ) from error
 
 
+@dataclass
+class _OpenPart:
+    """A list or mapping whose end was not parsed yet."""
+
+    anchor: str | None
+    """Its name for aliases."""
+    count_before: int
+    """Number of parts of the document before it."""
+    keys: set[Any] | None
+    """Keys so far of a mapping; None for a list."""
+    expects_key: bool = True
+    """Whether the next part of a mapping is a key, not a value."""
+
+
 def _look_through(events, what, aliases):
     """
     Refuse documents that need much time or memory.
 
-    From the events of the parser, which need neither.
+    From the events of the parser, which need neither. Arguments as for `parsed`.
     """
     # Number of parts with aliases expanded.
     count = 0
     # Anchor -> number of its parts.
     sizes = {}
-    # Stack of [anchor, count, keys or None, key is next].
-    open_parts = []
+    # From the outermost to the innermost.
+    open_parts: list[_OpenPart] = []
     for event in events:
         kind = type(event).__name__
         if kind.endswith(
@@ -212,8 +226,8 @@ def _look_through(events, what, aliases):
         ):
             continue
         if kind.endswith('EndEvent'):
-            anchor, start, *_ = open_parts.pop()
-            sizes[anchor] = count - start
+            part = open_parts.pop()
+            sizes[part.anchor] = count - part.count_before
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
             raise DocumentError(
@@ -221,7 +235,7 @@ def _look_through(events, what, aliases):
                 ' write it without',
                 code='yaml_alias',
             )
-        if open_parts and open_parts[-1][2] is not None:
+        if open_parts and open_parts[-1].keys is not None:
             _check_key(event, open_parts[-1], what)
         count += sizes[event.anchor] if kind == 'AliasEvent' else 1
         if kind == 'ScalarEvent':
@@ -233,9 +247,8 @@ def _look_through(events, what, aliases):
                         len(event.value), MAX_NUMBER_CHARACTERS, what, 'characters in a number'
                     )
         elif kind != 'AliasEvent':
-            open_parts.append(
-                [event.anchor, count, set() if kind == 'MappingStartEvent' else None, True]
-            )
+            keys = set() if kind == 'MappingStartEvent' else None
+            open_parts.append(_OpenPart(event.anchor, count, keys))
         _within_limits(len(open_parts), MAX_DOCUMENT_DEPTH, what, 'levels')
         _within_limits(count, MOST_PARTS, what, 'parts')
 
@@ -243,22 +256,27 @@ def _look_through(events, what, aliases):
 def _check_key(event, mapping, what):
     """
     Refuse a key that the open mapping has already, and one that merges another mapping into it.
+
+    Called for the event of each key and value of the `_OpenPart`, in turn.
     """
-    mapping[3] = not mapping[3]
-    if mapping[3]:  # this is a value
+    is_key = mapping.expects_key
+    mapping.expects_key = not is_key
+    if not is_key:
         return
     # The value of a scalar key; keys of other kinds have none.
     key: Any = getattr(event, 'value', None)
-    if key in mapping[2] or (key == '<<' and event.implicit[0]):
+    if key in mapping.keys or (key == '<<' and event.implicit[0]):
         raise DocumentError(
             f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line'
             f' {event.start_mark.line + 1}; remove it',
             code='key_repeated',
         )
-    mapping[2].update([key] if key is not None else [])
+    if key is not None:
+        mapping.keys.add(key)
 
 
 def _within_limits(number, limit, what, unit):
+    """Raise where a document has more than `limit` of a unit, such as characters."""
     if number > limit:
         raise DocumentError(
             f'a {what} must not have more than {limit} {unit}, this one has more; is it the right'

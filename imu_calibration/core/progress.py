@@ -27,7 +27,9 @@ Item = TypeVar('Item')
 Listener = Callable[[str, float, float], None]
 """Receives the name of a phase, the amount done and the total; a total of 0 means unknown."""
 
+# Receivers of reports and of remarks in this context.
 _listener: ContextVar[Listener | None] = ContextVar('listener', default=None)
+_reader: ContextVar[Callable[[str], None] | None] = ContextVar('reader', default=None)
 
 
 @contextmanager
@@ -38,9 +40,6 @@ def listening(listener: Listener | None) -> Iterator[None]:
         yield
     finally:
         _listener.reset(token)
-
-
-_reader: ContextVar[Callable[[str], None] | None] = ContextVar('reader', default=None)
 
 
 @contextmanager

@@ -210,11 +210,13 @@ class RawReadings:
 
     def to_mapping(self) -> dict:
         """Return the part `readings` of a document."""
-        found = {
+        document: dict[str, Any] = {
             'accelerometer': self.accelerometer.to_mapping(),
             'gyroscope': self.gyroscope.to_mapping(),
         }
-        return found | {'axes': self.axes} if self.axes else found
+        if self.axes:
+            document['axes'] = self.axes
+        return document
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], place: str = 'readings') -> 'RawReadings':
@@ -401,6 +403,7 @@ def _axes_matrix(axes):
 
 
 def _axes_error(axes):
+    """Return the error for axes that are no convention and no signed permutation."""
     return InputError(
         'axes must be flu, frd or the axes of the source that point forward, left and up, such as'
         f' x,-y,-z, got {shortened(repr(axes))}; correct them',
@@ -410,6 +413,7 @@ def _axes_error(axes):
 
 
 def _spelled(sensor, text):
+    """Return a unit in its first spelling; another text without spaces at its ends."""
     text = text.strip()
     return READING_SPELLINGS[sensor].get(text.lower(), text)
 
@@ -425,12 +429,12 @@ def _positive(text):
 
 def _of_scale(sensor, scale, offset):
     """Return the unit of readings that a scale describes; SI where it is 1 without an offset."""
-    known = SensorUnit(COUNTS, _number(scale), _number(offset))
-    return replace(known, unit=SI_UNITS[sensor]) if known.is_si else known
+    unit = SensorUnit(COUNTS, _number(scale), _number(offset))
+    return replace(unit, unit=SI_UNITS[sensor]) if unit.is_si else unit
 
 
 def _sensor_unit(sensor, entry, place):
-    """Return the unit in a mapping of unit, scale and offset, each optional."""
+    """Return the unit in a mapping of unit, scale and offset, each optional; `place`: its name."""
     place = f'{place}.{sensor}'
     scale = _number_or_none(entry.get('scale'))
     offset = _number_or_none(entry.get('offset'))
@@ -445,18 +449,18 @@ def _sensor_unit(sensor, entry, place):
                 f' per {SI_UNITS[sensor]}, or write counts:NUMBER/UNIT',
                 code='scale_missing',
             )
-        known = SensorUnit(unit, scale)
+        stated = SensorUnit(unit, scale)
     else:
-        known = unit_of(sensor, unit)
-        if scale is not None and not np.allclose(scale, known.scale, rtol=UNIT_AGREEMENT, atol=0):
+        stated = unit_of(sensor, unit)
+        if scale is not None and not np.allclose(scale, stated.scale, rtol=UNIT_AGREEMENT, atol=0):
             raise InputError(
-                f"'{place}.scale' must be that of its unit {unit}, {known.scale:.6g} per"
+                f"'{place}.scale' must be that of its unit {unit}, {stated.scale:.6g} per"
                 f' {SI_UNITS[sensor]}, got {_plain(scale)}; remove one of them',
                 code='unit_scale',
             )
         if scale is not None:
-            known = replace(known, scale=scale)
-    return known if offset is None else replace(known, offset=offset)
+            stated = replace(stated, scale=scale)
+    return stated if offset is None else replace(stated, offset=offset)
 
 
 def _number_or_none(value):
@@ -464,6 +468,7 @@ def _number_or_none(value):
 
 
 def _number(value):
+    """Return a `Number` of a number, or of a list with one or three."""
     if np.size(value) > 1:
         x, y, z = (float(number) for number in value)
         return (x, y, z)
@@ -471,4 +476,5 @@ def _number(value):
 
 
 def _plain(value):
+    """Return a `Number` as plain data: a float, or a list of three."""
     return list(value) if isinstance(value, tuple) else float(value)

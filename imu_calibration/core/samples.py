@@ -38,10 +38,10 @@ def _times_of(time: ArrayLike) -> np.ndarray:
 
 def _stamps_of_any(time: np.ndarray) -> np.ndarray:
     """Return stamps of times in s, or of integers with the steps of nanoseconds; ns, int64."""
-    whole = np.issubdtype(time.dtype, np.integer)
-    steps = np.diff(time.astype(np.int64) if whole else time)
+    is_integer = np.issubdtype(time.dtype, np.integer)
+    steps = np.diff(time.astype(np.int64) if is_integer else time)
     step = float(np.median(np.abs(steps))) if len(steps) else LEAST_STEP
-    in_ns = whole and step >= LEAST_NS_STEP
+    in_ns = is_integer and step >= LEAST_NS_STEP
     seconds = step * 1e-9 if in_ns else step
     if not LEAST_STEP <= seconds <= LARGEST_STEP:
         raise InputError(
@@ -51,9 +51,9 @@ def _stamps_of_any(time: np.ndarray) -> np.ndarray:
         )
     if not in_ns:
         return stamps_of(time)
-    whole_ns = time.astype(np.int64)
-    start_ns = int(whole_ns[0]) if whole_ns[0] > EPOCH * 10**9 else FIRST_NS
-    return start_ns + (whole_ns - whole_ns[0])
+    time_ns = time.astype(np.int64)
+    start_ns = int(time_ns[0]) if time_ns[0] > EPOCH * 10**9 else FIRST_NS
+    return start_ns + (time_ns - time_ns[0])
 
 
 def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
@@ -95,18 +95,21 @@ class AlignedArrays:
         first part.
         """
         parts = list(parts)
-        return cls(
-            **{name: _joined([getattr(part, name) for part in parts]) for name in vars(parts[0])}
-        )
+        fields = {}
+        for name in vars(parts[0]):
+            fields[name] = _joined([getattr(part, name) for part in parts])
+        return cls(**fields)
 
 
 def _selected(value, index):
+    """Return the rows of an array or of `AlignedArrays`; other values unchanged."""
     if isinstance(value, np.ndarray):
         return value[index]
     return value.select(index) if isinstance(value, AlignedArrays) else value
 
 
 def _joined(values):
+    """Return the values of one field of all parts as that of the joined object."""
     if any(value is None for value in values):
         return None
     if isinstance(values[0], np.ndarray):
@@ -121,7 +124,9 @@ class JoinedParts:
     """The arrays grow by this fraction of their length."""
 
     def __init__(self) -> None:
+        # The first part without its rows, for the fields that are no arrays.
         self._first: Any = None
+        # Name of a field -> its array with spare rows at the end, of which `_count` are in use.
         self._columns: dict[str, np.ndarray] = {}
         self._count = 0
 
@@ -151,7 +156,7 @@ class JoinedParts:
         return replace(self._first, **self._columns)
 
     def _resize(self, name, count):
-        # In place: no view exists.
+        """Change the number of rows of an array in place; no view of it exists."""
         self._columns[name].resize((count, *self._columns[name].shape[1:]), refcheck=False)
 
 

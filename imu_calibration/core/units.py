@@ -1,7 +1,7 @@
 """
-Constants, and customary units with as many digits as a standard deviation supports.
+Constants, and printed values in customary units with as many digits as their sd supports.
 
-For printed values, never for arithmetic.
+The customary units are never used in arithmetic.
 """
 
 import math
@@ -78,18 +78,12 @@ OTHER_UNITS = {'g': 1 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
 
 def unit_of_rest(length: float) -> str:
     """
-    Return the unit other than m/s^2 in which a force at rest has this length.
-
-    The length of the specific force agrees within a fifth. The result is '' for none.
+    Return the unit other than m/s^2 in which gravity has this length within a fifth; '' for none.
     """
-    return next(
-        (
-            unit
-            for unit, scale in OTHER_UNITS.items()
-            if 0.8 < length / (scale * STANDARD_GRAVITY) < 1.25
-        ),
-        '',
-    )
+    for unit, scale in OTHER_UNITS.items():
+        if 0.8 < length / (scale * STANDARD_GRAVITY) < 1.25:
+            return unit
+    return ''
 
 
 def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
@@ -107,8 +101,12 @@ def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
         of an accelerometer and % per g of a gyroscope.
 
     """
-    kinds = (quantity.rpartition('.')[2], quantity.partition('.')[0], '')
-    return next((_SHOWN[kind][unit] for kind in kinds if unit in _SHOWN.get(kind, {})), (1.0, unit))
+    sensor = quantity.partition('.')[0]
+    component = quantity.rpartition('.')[2]
+    for kind in (component, sensor, ''):
+        if unit in _SHOWN.get(kind, {}):
+            return _SHOWN[kind][unit]
+    return 1.0, unit
 
 
 def decimals(sd: float) -> int:
@@ -138,14 +136,13 @@ def significant(value: float, digits: int = 3) -> str:
         return f'{value:g}'
     if not 1e-4 <= abs(value) < 1e6:
         return f'{value:.{digits - 1}e}'
-    return f'{value:.{max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))}f}'
+    exponent = int(np.floor(np.log10(abs(value))))
+    return f'{value:.{max(0, digits - 1 - exponent)}f}'
 
 
 def error_text(value: float, unit: str, digits: int = 3) -> str:
     """
-    Return an error figure as it is printed everywhere.
-
-    In the customary unit of an SI unit, with three significant digits.
+    Return the text of an error in the customary unit of its SI unit, with `digits` digits.
     """
     factor, shown = for_people(unit)
     return f'{significant(value * factor, digits)} {shown}'

@@ -144,8 +144,8 @@ def force_error(
         )
     if length < LINEAR:
         return InputError(
-            f'{requirement}it is probably acceleration without gravity, as phones compute it; record'
-            ' the raw accelerometer',
+            f'{requirement}it is probably acceleration without gravity, as phones compute it;'
+            ' record the raw accelerometer',
             key='imu_topic',
             code='without_gravity',
         )
@@ -297,8 +297,8 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             'full_scale',
             WARNING,
             f'{observed}, the driver converts for {factor:.3g} times the full-scale range that is'
-            ' set; correct its setting (a calibration would include the factor in the matrix, and be'
-            ' wrong after the correction)',
+            ' set; correct its setting (a calibration would include the factor in the matrix, and'
+            ' be wrong after the correction)',
         )
     else:
         yield CheckFinding(
@@ -392,7 +392,8 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 'clipping',
                 WARNING,
                 f'the {sensor} clips at {level:.4g} {unit}{customary}: {", ".join(counts)} readings'
-                ' at the end of the range; larger values are lost, move less or choose a wider range',
+                ' at the end of the range; larger values are lost, move less or choose a wider'
+                ' range',
                 samples=total,
             )
 

@@ -77,15 +77,14 @@ class Window:
 
     def select(self, index: Any) -> 'Window':
         """Return the samples at `index` (slice, mask or integer array)."""
-        rows = {}
+        fields: dict[str, Any] = {}
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray) and name != 'joint_step':
-                rows[name] = value[index]
-        return replace(
-            self,
-            motion=self.motion.select(index) if len(self.motion) == len(self) else self.motion,
-            **rows,
-        )
+                fields[name] = value[index]
+        # At rest the motion is one row.
+        if len(self.motion) == len(self):
+            fields['motion'] = self.motion.select(index)
+        return replace(self, **fields)
 
     @property
     def period(self) -> float:
@@ -95,9 +94,10 @@ class Window:
     @property
     def noise_sd(self) -> np.ndarray:
         """
-        White noise of specific force and angular rate from second differences, shape (2, 3).
+        Sd of white noise of specific force and angular rate, SI, shape (2, 3); NaN if too short.
 
-        Smooth motion cancels.
+        From second differences, in which smooth motion cancels: their variance is 6 times that of
+        white noise.
         """
         second = np.diff(np.stack([self.force_s, self.rate_s]), 2, axis=1)
         return second.std(axis=1) / np.sqrt(6) if second.shape[1] > 1 else np.full((2, 3), np.nan)
@@ -145,11 +145,13 @@ def make_window(
     samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE
 ) -> Window:
     """Return the `Window` of a kind that holds all of `samples`."""
-    motion, temperature = samples.motion, samples.temperature_c
+    motion = samples.motion
+    temperature = samples.temperature_c
     if np.isnan(temperature).any():
         temperature = None
         motion = replace(motion, thermal_branch=None, temperature_rate=None)
-    motion = _mean_motion(motion) if kind == WindowKind.STATIC else motion
+    if kind == WindowKind.STATIC:
+        motion = _mean_motion(motion)
     return Window(
         kind,
         samples.stamp_ns,
@@ -178,6 +180,7 @@ class StoredWindows:
 
     def __init__(self) -> None:
         self._file: Any = SpooledTemporaryFile(max_size=STORED_IN_MEMORY)
+        # Position of each window in the file, bytes.
         self._starts: list[int] = []
 
     def __del__(self) -> None:
@@ -215,7 +218,7 @@ class StoredWindows:
 
 
 def sensors_of(windows: Sequence[Window]) -> tuple[str, ...]:
-    """Return the sensors with readings in windows of one recording."""
+    """Return the sensors with readings in the windows of one recording."""
     return tuple(sensor for sensor in SENSORS if sensor not in windows[0].absent)
 
 
@@ -229,72 +232,77 @@ def chunks(windows: Iterable[Window]) -> Iterator[list[Window]]:
 
     A group has at most `WINDOW_GROUP_SAMPLES` samples, or is a single longer window.
     """
-    part, size = [], 0
+    group: list[Window] = []
+    size = 0
     for window in windows:
-        if part and size + len(window.motion) > WINDOW_GROUP_SAMPLES:
-            yield part
-            part, size = [], 0
-        part.append(window)
+        if group and size + len(window.motion) > WINDOW_GROUP_SAMPLES:
+            yield group
+            group = []
+            size = 0
+        group.append(window)
         size += len(window.motion)
-    if part:
-        yield part
+    if group:
+        yield group
 
 
 def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
     """
-    Return the motion of all windows in one piece, and the temperatures (window means where static).
+    Return the rows of motion of all windows, and the temperature of each row, degrees Celsius.
 
-    Or None.
+    A static window has one row, with its mean temperature. None if one window has no temperature.
     """
-    known = []
-    for w in windows:
-        if w.temperature_c is not None:
-            known.append(
-                [w.temperature_c.mean()] if w.kind == WindowKind.STATIC else w.temperature_c
-            )
-    temperatures = np.concatenate(known) if len(known) == len(windows) else None
+    temperatures = []
+    for window in windows:
+        if window.temperature_c is None:
+            continue
+        if window.kind == WindowKind.STATIC:
+            temperatures.append([window.temperature_c.mean()])
+        else:
+            temperatures.append(window.temperature_c)
+    temperature = None
+    if len(temperatures) == len(windows):
+        temperature = np.concatenate(temperatures)
     if len(windows) == 1:
-        return windows[0].motion, temperatures
-    return JointMotion.concatenate(window.motion for window in windows), temperatures
+        return windows[0].motion, temperature
+    return JointMotion.concatenate(window.motion for window in windows), temperature
 
 
 def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
     """
-    Return the result of `joined_motion`, and the row of motion for each sample.
-
-    The row is that of the motion that belongs to the sample.
+    Return the result of `joined_motion`, and the index of its row for each sample of the windows.
     """
-    lengths = [len(w.motion) for w in windows]
-    starts = np.cumsum([0] + lengths)
-    rows = np.concatenate(
-        [
-            np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
-            for w, s, n in zip(windows, starts, lengths)
-        ]
-    )
-    return *joined_motion(windows), rows
+    rows = []
+    first_row = 0
+    for window in windows:
+        n_rows = len(window.motion)
+        if n_rows == len(window):
+            rows.append(np.arange(first_row, first_row + n_rows))
+        else:
+            rows.append(np.full(len(window), first_row))
+        first_row += n_rows
+    return *joined_motion(windows), np.concatenate(rows)
 
 
-def _mean_motion(motion):
+def _mean_motion(motion: JointMotion) -> JointMotion:
     """
-    Return one row.
+    Return the motion of a rest in one row: mean position, and slope where it is significant.
 
-    The mean position and, when the slope of a straight line is significant, this slope.
+    The slope is that of a straight line through the positions.
     """
     mean = motion.position.mean(axis=0)
-    # The levels are averages over 0.2 s, so these contain the same information.
-    some = slice(None, None, max(1, len(motion) // 500))
-    time = motion.time[some] - motion.time[some].mean()
-    position = motion.position[some] - mean
+    # The levels are averages over 0.2 s, so a part of them contains the same information.
+    thinned = slice(None, None, max(1, len(motion) // 500))
+    time = motion.time[thinned] - motion.time[thinned].mean()
+    position = motion.position[thinned] - mean
     slope = time @ position / max(time @ time, 1e-12)
-    rest = (position - time[:, None] * slope).std(axis=0)
+    scatter = (position - time[:, None] * slope).std(axis=0)
     distance = np.abs(slope) * (time[-1] - time[0])
-    # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no
-    # creep
-    slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
+    # One encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no
+    # creep.
+    slope = np.where((distance > 8 * scatter) & (distance > 1e-6), slope, 0.0)
     zero = np.zeros((1, len(mean)))
     branch = motion.thermal_branch
-    warming = motion.temperature_rate
+    temperature_rate = motion.temperature_rate
     return JointMotion(
         motion.time.mean(keepdims=True),
         mean[None],
@@ -303,7 +311,7 @@ def _mean_motion(motion):
         zero,
         None if branch is None else branch.mean(keepdims=True),
         motion.vibration.mean(axis=0, keepdims=True),
-        None if warming is None else warming.mean(keepdims=True),
+        None if temperature_rate is None else temperature_rate.mean(keepdims=True),
     )
 
 

@@ -74,22 +74,26 @@ class MotionGatherer:
         )
         self._settings = settings
         self._noise_rad = table.joint_noise_rad
+        # Present epoch of the session: number of resets of the clock of IMU or joints. Stream ->
+        # cleaned (epoch, samples) that are not processed, and the epoch of the session minus that
+        # of the cleaner, because a clock may continue while another one is reset.
+        self._epoch = 0
         self._queue = {name: [] for name in STREAMS}
         self._epoch_shift = dict.fromkeys(STREAMS, 0)
+        # Reason -> samples dropped in earlier epochs.
+        self._lost_counts = Counter()
         self._turns = _Unwrapper()
         self._floors = QuietFloor(), QuietFloor()
-        self._lost_counts = Counter()
-        self._epoch = 0
         self._chunks = MotionChunks(settings, self._noise_rad, self._floors)
         self._cutter = WindowCutter(settings, self._chunks.short_rest, keep_unused)
 
     @property
     def n_buffered(self) -> int:
         """Number of buffered samples; bounded for a session of any length."""
-        waiting = 0
+        n_buffered = self.cleaner.n_buffered + self._chunks.n_buffered + self._cutter.n_buffered
         for queue in self._queue.values():
-            waiting += sum(len(part) for _, part in queue)
-        return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_buffered
+            n_buffered += sum(len(part) for _, part in queue)
+        return n_buffered
 
     @property
     def counts(self) -> dict[str | UnusedReason | WindowKind, int]:
@@ -163,7 +167,7 @@ class MotionGatherer:
         return windows + self.finish()
 
     def _enqueue(self, cleaned):
-        """Queue samples by epoch."""
+        """Append cleaned samples to the queues of their streams."""
         for name in STREAMS:
             for epoch, samples in getattr(cleaned, name):
                 if name == 'joints':
@@ -177,15 +181,14 @@ class MotionGatherer:
             for name in STREAMS:
                 for epoch, part in self._queue[name]:
                     if epoch == self._epoch:
-                        # Remaining samples of an earlier epoch arrived after its end: late
-                        # temperatures
                         self._chunks.add(**{name: part})
+                # Samples of an earlier epoch are dropped: temperatures that arrived after its end.
                 self._queue[name] = [
                     (epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch
                 ]
             windows += self._cut(self._chunks.take())
             if not self._epoch_is_over():
-                # Of an epoch that the other streams do not begin.
+                # Temperatures of an epoch that the other streams do not begin are bounded.
                 queue = self._queue['temperature']
                 while len(queue) > 1 and _span(queue) > JOINT_WAIT:
                     del queue[0]
@@ -194,14 +197,15 @@ class MotionGatherer:
 
     def _epoch_is_over(self):
         """
-        Return whether the clocks of IMU and joints were both reset, or only one.
+        Return whether the clocks of IMU and joints were both reset, or one of them for good.
 
-        If only one was reset, the other did not follow in time.
+        One for good: `JOINT_WAIT` after its reset the other one has not been reset.
         """
         queues = [self._queue['imu'], self._queue['joints']]
         return all(queues) or any(queue and _span(queue) > JOINT_WAIT for queue in queues)
 
     def _next_epoch(self):
+        """Return the remaining windows of this epoch, and begin the next one."""
         windows = self._end_epoch()
         old = self._chunks
         self._chunks = MotionChunks(self._settings, self._noise_rad, self._floors)
@@ -209,11 +213,15 @@ class MotionGatherer:
         self._lost_counts.update(old.counts)
         self._epoch += 1
         if not (self._queue['imu'] and self._queue['joints']):
-            self._follow(old)
+            self._continue_streams(old)
         return windows
 
-    def _follow(self, old):
-        """Continue streams without a clock reset in the new epoch: only one clock was reset."""
+    def _continue_streams(self, old):
+        """
+        Move the streams whose clocks were not reset to the new epoch.
+
+        `old`: the `MotionChunks` of the epoch before, whose joints are used further.
+        """
         if not self._queue['joints']:
             self._chunks.add(joints=old.remaining_joints())
         for name in STREAMS:
@@ -221,9 +229,11 @@ class MotionGatherer:
                 self._epoch_shift[name] = self._epoch - self.cleaner.epoch(name)
 
     def _end_epoch(self):
+        """Return the windows of all remaining chunks of this epoch."""
         return self._cut(self._chunks.take(final=True))
 
     def _cut(self, chunks):
+        """Return the windows that are complete with these `PhasedSamples`."""
         windows = []
         for chunk in chunks:
             windows += self._cutter.push(chunk)
@@ -234,6 +244,7 @@ class _Unwrapper:
     """Removes jumps of joint angles by full turns, sample by sample."""
 
     def __init__(self):
+        # Last position, shape (1, n_joints), and the full turns to subtract from it.
         self._last = None
         self._turns = 0
 
@@ -254,6 +265,7 @@ class _Unwrapper:
 
 
 def _span(queue):
+    """Return the time from the first to the last sample in a queue, s."""
     first = queue[0][1].stamp_ns[0]
     last = queue[-1][1].stamp_ns[-1]
     return abs(int(last) - int(first)) / 1e9
