@@ -716,7 +716,7 @@ class BlockCleaner:
         self.lost.update(block.dropped or {})
         self.notes.update(block.notes or {})
         for name in STREAMS:
-            samples = getattr(block, name)
+            samples: Any = getattr(block, name)
             if samples is not None and len(samples):
                 if name == 'imu' and self._nominal is not None:
                     samples = self._nominal.apply(samples)

@@ -251,7 +251,7 @@ def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | 
 
     A static window has one row, with its mean temperature. None if one window has no temperature.
     """
-    temperatures = []
+    temperatures: list[Any] = []
     for window in windows:
         if window.temperature_c is None:
             continue
@@ -283,7 +283,7 @@ def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | No
     return *joined_motion(windows), np.concatenate(rows)
 
 
-def _mean_motion(motion: JointMotion) -> JointMotion:
+def _mean_motion(motion):
     """
     Return the motion of a rest in one row: mean position, and slope where it is significant.
 
