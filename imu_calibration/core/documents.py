@@ -149,25 +149,25 @@ def _with_floats(name: str) -> Any:
     return kind
 
 
-def from_text(text: str, what: str = 'document') -> dict[str, Any]:
+def from_text(text: str, name: str = 'document') -> dict[str, Any]:
     """Return the mapping in a YAML text; raises as `parsed`, also when it is not a mapping."""
-    document = parsed(text, what)
+    document = parsed(text, name)
     if not isinstance(document, dict):
         raise DocumentError(
-            f'a {what} must be a mapping, got {type(document).__name__}; correct the file',
+            f'a {name} must be a mapping, got {type(document).__name__}; correct the file',
             code='not_a_mapping',
         )
     return document
 
 
-def parsed(text: str, what: str, aliases: bool = False) -> Any:
+def parsed(text: str, name: str, aliases: bool = False) -> Any:
     """
     Return the content of a YAML text.
 
     Parameters
     ----------
     text : str
-    what : str
+    name : str
         Name of the document in errors.
     aliases : bool
         Whether a part may refer to an earlier one, as recorders write it.
@@ -182,13 +182,13 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
     import yaml
 
     loader = _with_floats('SafeLoader')
-    _within_limits(len(text), MAX_DOCUMENT_CHARACTERS, what, 'characters')
+    _within_limits(len(text), MAX_DOCUMENT_CHARACTERS, name, 'characters')
     try:
-        _look_through(yaml.parse(text, Loader=loader), what, aliases)
+        _look_through(yaml.parse(text, Loader=loader), name, aliases)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
         raise DocumentError(
-            f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file',
+            f'a {name} must be YAML, this is not: {shortened(str(error), 500)}; correct the file',
             code='not_yaml',
         ) from error
 
@@ -207,7 +207,7 @@ class _OpenPart:
     """Whether the next part of a mapping is a key, not a value."""
 
 
-def _look_through(events, what, aliases):
+def _look_through(events, name, aliases):
     """
     Refuse documents that need much time or memory.
 
@@ -231,29 +231,29 @@ def _look_through(events, what, aliases):
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
             raise DocumentError(
-                f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor});'
+                f'a {name} must not use aliases, this document has YAML aliases (*{event.anchor});'
                 ' write it without',
                 code='yaml_alias',
             )
         if open_parts and open_parts[-1].keys is not None:
-            _check_key(event, open_parts[-1], what)
+            _check_key(event, open_parts[-1], name)
         count += sizes[event.anchor] if kind == 'AliasEvent' else 1
         if kind == 'ScalarEvent':
             sizes[event.anchor] = 1
             if event.implicit[0] or event.tag:  # false for a quoted text
-                _within_limits(len(event.value), MAX_SCALAR_CHARACTERS, what, 'characters in a row')
+                _within_limits(len(event.value), MAX_SCALAR_CHARACTERS, name, 'characters in a row')
                 if NUMBER_START.fullmatch(event.value):
                     _within_limits(
-                        len(event.value), MAX_NUMBER_CHARACTERS, what, 'characters in a number'
+                        len(event.value), MAX_NUMBER_CHARACTERS, name, 'characters in a number'
                     )
         elif kind != 'AliasEvent':
             keys = set() if kind == 'MappingStartEvent' else None
             open_parts.append(_OpenPart(event.anchor, count, keys))
-        _within_limits(len(open_parts), MAX_DOCUMENT_DEPTH, what, 'levels')
-        _within_limits(count, MOST_PARTS, what, 'parts')
+        _within_limits(len(open_parts), MAX_DOCUMENT_DEPTH, name, 'levels')
+        _within_limits(count, MOST_PARTS, name, 'parts')
 
 
-def _check_key(event, mapping, what):
+def _check_key(event, mapping, name):
     """
     Refuse a key that the open mapping has already, and one that merges another mapping into it.
 
@@ -267,7 +267,7 @@ def _check_key(event, mapping, what):
     key: Any = getattr(event, 'value', None)
     if key in mapping.keys or (key == '<<' and event.implicit[0]):
         raise DocumentError(
-            f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line'
+            f'a {name} must not repeat or merge keys, this one has {shortened(key)!r} again in line'
             f' {event.start_mark.line + 1}; remove it',
             code='key_repeated',
         )
@@ -275,11 +275,11 @@ def _check_key(event, mapping, what):
         mapping.keys.add(key)
 
 
-def _within_limits(number, limit, what, unit):
+def _within_limits(number, limit, name, unit):
     """Raise where a document has more than `limit` of a unit, such as characters."""
     if number > limit:
         raise DocumentError(
-            f'a {what} must not have more than {limit} {unit}, this one has more; is it the right'
+            f'a {name} must not have more than {limit} {unit}, this one has more; is it the right'
             ' file?',
             code='document_limit',
         )

@@ -3,6 +3,7 @@
 import numpy as np
 
 BINS_PER_OCTAVE = 16
+"""Bins of the histogram of magnitudes per factor of two."""
 SMALLEST, LARGEST = 2.0**-30, 2.0**10
 """Rates whose magnitudes are counted, rad/s."""
 N_OCTAVE_BINS = int(BINS_PER_OCTAVE * np.log2(LARGEST / SMALLEST))

@@ -23,6 +23,7 @@ range, and intermediate values.
 NEAR_POWER = 0.15
 """A factor within this share of a power of two is one: scales are off by a few per cent."""
 LEAST_TURNS, MOST_TURNS = 3, 16
+"""Turns between rests that are compared."""
 LEAST_ANGLE = 0.3
 """Least turn of gravity for a test of factors, rad."""
 MAX_TURN_SECONDS = 30.0
@@ -121,7 +122,9 @@ COUNTED_OUTPUTS = 24
 NEAR_LARGEST_SHARE = 0.9
 """Outputs above this share of the largest are evaluated."""
 MAX_NEAR_OUTPUTS = 400
+"""Largest number of evaluated outputs of one piece, the largest ones."""
 MIN_CLIPPED_SAMPLES = 4
+"""Samples at the largest value from which on they may be clipped."""
 JUMP = 0.01
 """A step to the largest value by more than this share of it is not noise."""
 PILE = 5.0
@@ -201,6 +204,7 @@ share are excluded as accelerated.
 LEAST_TURN = 1.0
 """Gravity must turn by this much altogether, rad."""
 LEAST_EXPLAINED = 0.5
+"""Share of the rotation of gravity that the rates explain, at least."""
 CHUNK_SD_FACTOR = 4.0
 """Factor on standard deviations for the correlation of errors of neighbouring chunks."""
 DETERMINED_SD_SHARE = 0.15

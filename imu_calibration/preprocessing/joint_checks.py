@@ -247,6 +247,7 @@ WORDS = {
     'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
     'gyroscope': ('angular rates', 'the rates of the joints'),
 }
+"""Sensor -> its readings and their reference in messages."""
 
 
 NO_EXCHANGE = 'no exchange of axes makes them so'

@@ -22,6 +22,7 @@ MIN_MATCH = 0.8
 POOR = 0.6
 """Agreement of the axes as they are below which they are wrong; a turn by 60 degrees has 0.67."""
 AGREEMENT_TIE = 0.05
+"""Agreements and shares that differ by less count as equal."""
 
 
 def signed_permutations() -> np.ndarray:

@@ -254,6 +254,7 @@ OLD = 0.5
 ABSENT_MARK = -1.0
 """First element of a covariance: the message does not have that quantity (sensor_msgs/Imu)."""
 MESSAGE_QUANTITIES = ('specific force', 'angular rate', 'orientation')
+"""Quantities of a message with a covariance."""
 LARGEST_ASYMMETRY = 1e-6
 """Share of the largest variance; rounding errors are much smaller."""
 

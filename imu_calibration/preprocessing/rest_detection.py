@@ -23,9 +23,15 @@ Vibration is steady when it is not above the quiet ratio of its minimum within t
 sides, s; a knock is not steady.
 """
 _MIN_QUIET_SAMPLES = 10
-_GRID = 0.01  # s: spans begin and end on this grid, or at every sample of a slow IMU
+"""Fewest samples of a span."""
+_GRID = 0.01
+"""Spans begin and end on this grid, or at every sample of a slow IMU, s."""
 _GROWTH = 2.0
-_GUARD = 0.05  # s excluded on both sides of a disturbance: its first samples can be in a quiet span
+"""Largest ratio of the floors of a longer and a shorter span."""
+_GUARD = 0.05
+"""
+Time excluded on both sides of a disturbance, s: its first samples can be in a quiet span.
+"""
 
 
 class QuietFloor:

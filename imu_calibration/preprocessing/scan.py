@@ -164,12 +164,15 @@ def _describe(time: np.ndarray, values: np.ndarray, first_ns: int) -> Chunks:
 
 
 LEAST_CHUNKS = 4
+"""Chunks at rest, at least."""
 MAX_CHUNK_TURN = 0.02
 """Largest turn of the measured gravity from one chunk to the next, rad."""
 
 
 LEAST_POSES = 9
+"""Rests from which on the sphere of their readings is used."""
 LEAST_FACES = 6
+"""Rests from which on a bias is estimated roughly."""
 FARTHEST = 0.8
 """Bias in units of gravity from which on readings are no sphere but counts with an offset."""
 LEAST_EIGENVALUE = 0.05
@@ -280,6 +283,7 @@ def _stretches(still: np.ndarray) -> np.ndarray:
 
 
 SENSOR_COLUMNS = {'accelerometer': slice(0, 3), 'gyroscope': slice(3, 6)}
+"""Sensor -> its columns in (force x, y, z, rate x, y, z)."""
 LONG = 4
 """Chunks, one second."""
 MIN_NOISE_STEPS = 2.0

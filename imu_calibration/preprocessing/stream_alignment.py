@@ -90,6 +90,7 @@ TEMPERATURE_WAIT = 5.0
 """Largest delay of the temperature relative to the IMU, s."""
 _LEAST_MARGIN = max(window_cutter.PHASE_REACH, QUIETNESS_REACH) + 0.4
 NEVER = 1 << 62
+"""Later than all stamps, ns; with a minus, earlier."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,11 +32,13 @@ A larger forward step is a reset of the clock as well (a computer that receives 
 start-up).
 """
 NEVER_NS = 1 << 62
+"""Later than all stamps, ns; with a minus, earlier."""
 _NEEDED = {
     ImuSamples: ('force_s', 'rate_s'),
     JointSamples: ('position',),
     TemperatureSamples: ('temperature_c',),
 }
+"""Type of samples -> fields that must be finite."""
 
 
 class StreamCheck:

@@ -66,6 +66,7 @@ LEAST_RANGE = 0.4
 MOST_BIAS = {'accelerometer': 0.25 * STANDARD_GRAVITY, 'gyroscope': 60 * DEG}
 """m/s^2, rad/s: several times the specification of the cheapest grades (0.1 g, 20 deg/s)."""
 REPEATED_SHARE = 0.05
+"""Share of repeated samples above which they are reported."""
 MIN_CONVERTER_STEP = 1e-6
 """m/s^2, rad/s; no converter is that fine."""
 

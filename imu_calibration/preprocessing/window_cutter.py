@@ -344,6 +344,7 @@ PIECE_SECONDS = 0.25
 Duration of the means from which noise at low frequency is estimated, s: longer than sensor filters.
 """
 MIN_NOISE_PIECES = 4
+"""Fewest means for an estimate of the noise."""
 MIN_MOVING_SECONDS = 5.0
 """Least length of moving windows, s."""
 
@@ -365,10 +366,10 @@ class WanderLimit:
 
     def add_rest(self, samples: PhasedSamples) -> None:
         """
-        Estimate the noise density d from a window at rest.
+        Estimate the noise density d from a window at rest: ``d^2 = T v``, median of the axes.
 
-        The variance of a mean over T is ``d^2 / T``, and half that of the differences of
-        neighbouring means, in which drift cancels. The median of the axes is used.
+        The variance v is that of means over T, half the variance of the differences of neighbouring
+        means, in which drift cancels.
         """
         period = _period(samples)
         length = int(round(PIECE_SECONDS / period)) if period > 0 else 0
@@ -407,6 +408,7 @@ _STATIC, _SPIN, _DYNAMIC, _SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO
     len(_USES)
 )
 _MIN_WINDOW_SAMPLES = 5
+"""Fewest samples of a window."""
 _NO_PHASE = -1
 """In place of the phase before a run that begins a recording or follows a gap."""
 
@@ -451,7 +453,8 @@ class WindowCutter:
 
     def change(self, settings: WindowSettings, short_rest: float) -> None:
         """Use other settings from now on."""
-        self._settings, self._short_rest = settings, short_rest
+        self._settings = settings
+        self._short_rest = short_rest
 
     @property
     def n_buffered(self) -> int:
