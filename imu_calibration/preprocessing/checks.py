@@ -4,7 +4,8 @@ Checks of a recording before the estimate.
 Their registry, and the checks of frozen outputs and of stamps.
 
 `CHECKS` is the registry: a check is a function of the `RecordingEvidence` that yields
-`CheckFinding` objects; adding one is adding an entry.
+`CheckFinding` objects; adding one is adding an entry. The docstring of a check is the requirement
+on the recording, and its findings are the violations, or one of severity GOOD.
 """
 
 from collections.abc import Iterator, Sequence
@@ -66,7 +67,7 @@ def both_sensors(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def frozen_text(sensor: str, n_samples: int, *, is_zero: bool) -> str:
-    """Return that the outputs of a sensor never change."""
+    """Return the text of a finding: the outputs of a sensor never change."""
     band = ' (always 0: a dead band, or no sensor)' if is_zero else ''
     return (
         f'the {sensor} must measure something, its outputs never change in {n_samples}'
@@ -187,7 +188,7 @@ def frozen_lines(parts: Sequence[FrozenPart], consequence: str) -> list[str]:
 
 
 def span_words(spans: Sequence[tuple[float, float]]) -> str:
-    """Return the first three of some times in words, each from start to stop in s."""
+    """Return (start, stop), s, of three times in words, and the number of further ones."""
     words = [f'from {start:.1f} s to {stop:.1f} s' for start, stop in spans[:3]]
     return ', '.join(words) + (f' and {len(spans) - 3} times more' if len(spans) > 3 else '')
 
@@ -235,7 +236,7 @@ def is_one_stamp(n_repeated: int, total: int) -> bool:
 
 
 def one_stamp_text(name: str, n_repeated: int, total: int) -> str:
-    """Return that stamps do not advance, with the remedy."""
+    """Return the text of a finding: the stamps of a message type do not advance."""
     return (
         f'{name} must have header stamps that advance, {n_repeated} of {total} repeat the stamp'
         ' before: written with too few digits, or set only once?; stamp each sample at its'
@@ -529,5 +530,5 @@ def visible_findings(findings: Sequence[CheckFinding]) -> list[CheckFinding]:
 
 
 def unusable(findings: Sequence[CheckFinding]) -> int:
-    """Return how many samples are unusable for reasons that no other count holds."""
+    """Return the number of samples that findings make unusable, not counted elsewhere."""
     return sum(finding.samples for finding in findings)

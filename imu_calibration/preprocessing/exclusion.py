@@ -131,7 +131,7 @@ class ExclusionMask:
         self._last = 0.0
 
     def kept(self, stamp_ns: np.ndarray) -> np.ndarray:
-        """Return which of the next samples, shape (n,), lie in no excluded time."""
+        """Return which of the next samples are not in an excluded time, bool, shape (n,)."""
         kept = np.ones(len(stamp_ns), bool)
         if not len(stamp_ns):
             return kept

@@ -32,15 +32,15 @@ MAX_TURN_SECONDS = 30.0
 
 def believed_factor(missed: Callable[[float], float]) -> float:
     """
-    Return the factor between measured and true rates that fits gravity.
+    Return the factor of the measured rates over true ones that the rotation of gravity shows.
 
-    The factor carries gravity from before each turn to after it. It is 1 when the rates fit as they
-    are.
+    It is 1 where the rates explain the rotation without a factor.
 
     Parameters
     ----------
     missed : callable
-        Factor -> typical angle by which gravity misses its direction after a turn, rad.
+        Factor -> typical angle, rad, between gravity after a turn and its prediction from gravity
+        before it, by the integral of the rates divided by the factor.
 
     """
     angle_of_one = missed(1.0)
@@ -79,9 +79,7 @@ class _Turn:
 
 def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     """
-    Return the `believed_factor` of a recording in chunks.
-
-    Or None when too few turns lie between rests.
+    Return the `believed_factor` of a recording; None when there are too few turns between rests.
 
     The mean rates of the chunks are added up from rest to rest; turns within a chunk commute well
     enough for a factor.
@@ -146,7 +144,7 @@ class Extremes:
         self._last = np.inf
 
     def push(self, values: np.ndarray) -> None:
-        """Process values, shape (n,)."""
+        """Process the next values, shape (n,)."""
         before = self._last
         self._last = values[-1]
         largest = values.max()
@@ -248,9 +246,9 @@ class Turning:
 
 def relate_turns(chunks: Chunks) -> Turning | None:
     """
-    Return the `Turning` of Chunks.
+    Return the `Turning` of a recording in chunks.
 
-    Or None when gravity turns too little or is not explained by the rates.
+    None when gravity turns too little or is not explained by the rates.
 
     ``du/dt = u x (matrix @ rate + offset)`` for the direction u of specific force; no assumptions
     on units, axes or bias.

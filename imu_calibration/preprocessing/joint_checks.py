@@ -43,7 +43,7 @@ FROZEN_SHARE = 0.8
 """
 Share of the unexplained rate that lies along the axis of a joint that is frozen, as a mean square.
 """
-OWN = 0.3
+LEAST_GAIN_ERROR = 0.3
 """
 The unexplained rate along that axis is at least this share of the measured rate along it: a wrong
 gain causes less.
@@ -59,7 +59,7 @@ noise.
 
 def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | None:
     """
-    Return the part that is frozen for a second or more while the remaining parts turn, or None.
+    Return the finding of a joint or gyroscope that is frozen for a second in motion, or None.
 
     A joint is frozen when its state is constant while the gyroscope measures a rate about its axis
     that the other joints do not explain; a delay between the clocks or a wrong zero or axis in the
@@ -209,7 +209,7 @@ def _frozen(
         if (
             square_along > len(residual_along) * MIN_TURN_RATE**2
             and square_along > FROZEN_SHARE * (residual**2).sum()
-            and square_along > OWN**2 * (measured_along @ measured_along)
+            and square_along > LEAST_GAIN_ERROR**2 * (measured_along @ measured_along)
         ):
             yield float(window.time[start]), float(window.time[stop - 1])
 
@@ -224,7 +224,7 @@ def _is_rounded(
     most one step, and by the share of the rates that wrong gains and axes cause.
     """
     error = np.linalg.norm(reading - expected - bias, axis=1)
-    allowed = np.linalg.norm(step) + OWN * np.linalg.norm(expected, axis=1)
+    allowed = np.linalg.norm(step) + LEAST_GAIN_ERROR * np.linalg.norm(expected, axis=1)
     return bool((np.ptp(expected, axis=0) <= step).all() and (error <= allowed).all())
 
 
@@ -271,9 +271,7 @@ class Reduced(Protocol):
 
 def against_joints(gathered: Reduced, model: SensorModel, table: Table) -> tuple[CheckFinding, ...]:
     """
-    Return the findings of a comparison of rates and forces with the joints.
-
-    The measured rates and forces are compared with the ones that the joints imply.
+    Return the findings of a comparison of measured rates and forces with those of the joints.
 
     Parameters
     ----------

@@ -396,9 +396,7 @@ def same_motion(sums: ProductSums, windows: list[Window], table: Table) -> Check
 
 def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckFinding | None:
     """
-    Return the finding of joints or IMU axes that are exchanged or reversed.
-
-    Or None if a delay explains the rates better.
+    Return the finding of exchanged or reversed axes; None if a delay explains the rates better.
     """
     delay = _estimate_delay(windows, table)
     is_late = abs(delay.seconds) > LEAST_SHIFT and delay.share > exchange.share - SHARE_TIE
@@ -476,9 +474,7 @@ class Delay:
 
 def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
     """
-    Return the delay that explains rates of the opposite sign.
-
-    Or None if a sign explains them better.
+    Return the delay that explains rates of the opposite sign; None if a sign explains them better.
 
     For sweeps to and fro, half a period of delay and a wrong sign differ only by the differences
     between the sweeps.

@@ -66,7 +66,7 @@ class RecordingEvidence:
 
     @cached_property
     def frozen(self) -> dict[str, np.ndarray]:
-        """Sensor -> in which chunks it gives one reading again and again, bool, shape (n,)."""
+        """Sensor -> whether it repeats one reading in each chunk, bool, shape (n,)."""
         return scan.frozen_chunks(self.chunks, self.resolution)
 
     @cached_property

@@ -51,7 +51,7 @@ class ChunkSeries:
     """
     Cuts clean samples into chunks of equal number.
 
-    How the stream was cut into blocks does not matter.
+    The result does not depend on the division of the stream into blocks.
 
     Parameters
     ----------
@@ -211,9 +211,7 @@ class Rest:
     @property
     def bias(self) -> np.ndarray | None:
         """
-        Bias of the accelerometer, to a tenth of gravity or so, where six faces or more show it.
-
-        Or None.
+        Bias of the accelerometer, to about a tenth of gravity; None with fewer than six rests.
         """
         sphere = self._sphere() if len(self.force) >= LEAST_FACES else None
         return None if sphere is None else sphere.centre
@@ -325,7 +323,7 @@ def in_long_runs(flags: np.ndarray) -> np.ndarray:
 
 def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarray]:
     """
-    Return sensor -> which chunks it is frozen in, bool, shape (n,).
+    Return sensor -> whether it is frozen in each chunk, bool, shape (n,).
 
     A sensor with visible noise at rest never repeats one reading on three axes for a second. A
     sensor with steps coarser than its noise, or without noise, does so at every rest: the constant

@@ -133,7 +133,7 @@ class OtherSensor:
 
 
 def finite_stream(stamp_ns: np.ndarray, values: np.ndarray) -> SensorStream:
-    """Return the finite readings with increasing stamps of one sensor."""
+    """Return the finite readings of one sensor whose stamps exceed all stamps before."""
     known = np.isfinite(values).all(axis=1)
     stamp_ns = stamp_ns[known]
     values = values[known]

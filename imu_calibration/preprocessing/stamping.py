@@ -165,7 +165,7 @@ def _regular_line(step: np.ndarray, usual: float) -> StampLine | None:
 
 
 def is_regular(step: np.ndarray, period: float) -> np.ndarray:
-    """Return whether steps are regular ones."""
+    """Return which steps are about one period, bool, shape of `step`."""
     return (step > MIN_REGULAR_STEP * period) & (step <= MAX_REGULAR_STEP * period)
 
 
@@ -709,9 +709,9 @@ class SampleTimes:
 
     def odd_line(self, count: int) -> StampLine | None:
         """
-        Return the relation of the irregular stamps to the sampling.
+        Return the newest line of the more frequent kind of irregular stamps.
 
-        It is returned when it concerns more than a few of `count` samples.
+        None if they are at most the share `MAX_IRREGULAR_SHARE` of `count` samples.
         """
         number, use = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
         return self._line_of_use.get(use) if number > MAX_IRREGULAR_SHARE * count else None

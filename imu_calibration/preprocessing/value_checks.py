@@ -187,7 +187,7 @@ def increments_error(per_second: float, readings: RawReadings) -> InputError | N
 
 
 def samples_per_second(stamp_ns: np.ndarray) -> float:
-    """Return the rate of the median step between stamps, shape (n,); 0 where none advances."""
+    """Return one over the median step between stamps, (n,), Hz; 0 where none advances."""
     steps = np.diff(stamp_ns)
     steps = steps[steps > 0]
     return 1e9 / float(np.median(steps)) if len(steps) else 0.0

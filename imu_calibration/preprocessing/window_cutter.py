@@ -310,9 +310,9 @@ class JointRun:
 
     def near_motion(self, time: np.ndarray, distance: float) -> np.ndarray:
         """
-        Return a mask of the instants near a reading with moving joints.
+        Return a mask of the instants between the readings and near one with moving joints.
 
-        The instants are between the readings and within `distance` of one with moving joints.
+        Near: at most `distance` s from it.
         """
         if not len(self._moving_time):
             return np.zeros(len(time), bool)
@@ -323,15 +323,20 @@ class JointRun:
         return near & (time >= self.time[0]) & (time <= self.time[-1])
 
     def curve(self, time: np.ndarray, overlap: float, noise_rad: float | None) -> JointMotion:
-        """Return the `JointMotion` of a smooth curve at instants."""
+        """
+        Return the motion at increasing instants by a smooth curve through the readings.
+
+        Through those up to `overlap` s before and after the instants, at least `LEAST_READINGS`.
+        """
         first, stop = np.searchsorted(self.time, [time[0] - overlap, time[-1] + overlap])
         first = max(0, min(first, len(self.time) - LEAST_READINGS))
         stop = min(len(self.time), max(stop, LEAST_READINGS))
         piece = slice(first, stop)
         velocity = None if np.isnan(self.velocity[piece]).all() else self.velocity[piece]
-        return fit_joint_curve(
+        curve = fit_joint_curve(
             self.time[piece], self.position[piece], velocity, noise_sd=noise_rad
-        ).at(time)
+        )
+        return curve.at(time)
 
 
 BEST_BIAS, BEST_TIME = 1e-4, 100.0
