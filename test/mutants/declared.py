@@ -1233,8 +1233,8 @@ LIVE = _of(
     (
         'the model as asked grows live',
         'LiveCalibration.adopt',
-        '... or ... or self.options.as_asked or ...',
-        '... or ... or ...',
+        'self.options.as_asked',
+        'False',
         'test_live_diagnosis.py::test_the_model_as_asked_stays',
     ),
     (

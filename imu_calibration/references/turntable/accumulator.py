@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -36,18 +35,24 @@ class _CentredRows:
     within: dict[tuple[str, str], np.ndarray]
     """(sensor, kind) -> triangular factor of the centred rows."""
     slow: dict[tuple[str, str], np.ndarray]
-    """(sensor, kind) -> triangular factor of the slow parts of the centred rows."""
+    """
+    (sensor, kind) -> triangular factor of the means of short pieces of the centred rows, see
+    `SensorStatistics`.
+    """
 
     def _stack_window(self, window: WindowStatistics) -> None:
+        """Add the centred rows of a window."""
         for sensor, statistics in window.sensors.items():
             stack(self.within, (sensor, window.kind), statistics.within)
             if statistics.slow is not None and statistics.slow_rows:
                 stack(self.slow, (sensor, window.kind), statistics.slow)
 
     def _stack_all_of(self, other: '_CentredRows') -> None:
-        for mine, its in ((self.within, other.within), (self.slow, other.slow)):
-            for key, factor in its.items():
-                stack(mine, key, factor)
+        """Add the centred rows of another object."""
+        for key, factor in other.within.items():
+            stack(self.within, key, factor)
+        for key, factor in other.slow.items():
+            stack(self.slow, key, factor)
 
 
 @dataclass(eq=False)
@@ -104,26 +109,26 @@ class Accumulator(_CentredRows):
     windows: Counter = field(default_factory=Counter)
     """Kind -> number of windows."""
     blocks: list[WindowBlock] = field(default_factory=list)
-    """The centred rows once more, part by part in order of time."""
+    """The same centred rows in blocks of consecutive windows, in order of time."""
     block_length: int = 1
     """Windows per block."""
     in_blocks: bool = True
     """Whether blocks are kept; without them standard deviations include noise only."""
     share: int = 1
     """
-    Among how many accumulators of one recording the memory is shared: each keeps so many times
-    fewer rows.
+    Number of accumulators of one recording; each keeps at most `MAX_MEAN_ROWS` / `share` mean rows.
     """
 
     def add(self, window: WindowStatistics) -> None:
         """Add one window (WindowStatistics)."""
         self._stack_window(window)
-        self.slow_rows[window.kind] += next(iter(window.sensors.values())).slow_rows
+        any_sensor = next(iter(window.sensors.values()))  # both have the same pieces
+        self.slow_rows[window.kind] += any_sensor.slow_rows
         self.samples[window.kind] += window.count
         self.windows[window.kind] += 1
         if self.in_blocks:
             self._add_to_blocks(window)
-        self.rows.append(_without_within(window))
+        self.rows.append(_with_mean_rows_only(window))
         if len(self.rows) > self._capacity:
             self._thin()
 
@@ -134,12 +139,15 @@ class Accumulator(_CentredRows):
 
     def copy(self) -> 'Accumulator':
         """Return an independent copy; rows and factors are never changed in place."""
-        maps: dict[str, Any] = {
-            name: getattr(self, name).copy()
-            for name in ('within', 'slow', 'slow_rows', 'samples', 'windows')
-        }
         return replace(
-            self, rows=list(self.rows), blocks=[block.copy() for block in self.blocks], **maps
+            self,
+            rows=list(self.rows),
+            within=self.within.copy(),
+            slow=self.slow.copy(),
+            slow_rows=self.slow_rows.copy(),
+            samples=self.samples.copy(),
+            windows=self.windows.copy(),
+            blocks=[block.copy() for block in self.blocks],
         )
 
     def merge(self, other: 'Accumulator') -> None:
@@ -149,12 +157,9 @@ class Accumulator(_CentredRows):
         Its recordings follow the ones of this accumulator.
         """
         self._stack_all_of(other)
-        for mine, its in (
-            (self.slow_rows, other.slow_rows),
-            (self.samples, other.samples),
-            (self.windows, other.windows),
-        ):
-            mine.update(its)
+        self.slow_rows.update(other.slow_rows)
+        self.samples.update(other.samples)
+        self.windows.update(other.windows)
         self.rows.extend(other.rows)
         self.blocks.extend(block.copy() for block in other.blocks if self.in_blocks)
         self.block_length = max(self.block_length, other.block_length)
@@ -163,12 +168,20 @@ class Accumulator(_CentredRows):
             self._thin()
 
     def block_of(self, session: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Return the number of the block in which windows of these recordings and middles lie."""
+        """
+        Return the index of the block of each of n windows, shape (n,).
+
+        `session`, `time`: recording and middle of each window, s, shape (n,).
+        """
         starts = np.array([(block.session, block.start) for block in self.blocks])
-        later = (starts[:, :1] > session) | ((starts[:, :1] == session) & (starts[:, 1:] > time))
+        sessions = starts[:, :1]
+        times = starts[:, 1:]
+        # Shape (n_blocks, n): whether the block begins after the window.
+        later = (sessions > session) | ((sessions == session) & (times > time))
         return np.maximum((~later).sum(axis=0) - 1, 0)
 
     def _add_to_blocks(self, window: WindowStatistics) -> None:
+        """Add the centred rows of a window to the last block, or to a new one if it is full."""
         last = self.blocks[-1] if self.blocks else None
         if last is None or last.windows >= self.block_length or last.session != window.session:
             self.blocks.append(WindowBlock(window.session, window.time, 0))
@@ -188,10 +201,10 @@ class Accumulator(_CentredRows):
 
     def _thin(self) -> None:
         """
-        Join neighbours of one kind and recording in the older half of the rows.
+        Join neighbours of one kind and recording in the older half of the mean rows.
 
-        Their difference joins the centred rows of their kind. Without such neighbours the oldest
-        row is lost.
+        The mean row of two windows is their mean, and their difference is added to the centred
+        rows. Without such neighbours the oldest row is removed.
         """
         thinned = []
         index = 0
@@ -212,17 +225,24 @@ class Accumulator(_CentredRows):
 
     def _stack_difference(self, first: WindowStatistics, second: WindowStatistics) -> None:
         """Add the difference of two mean rows to the centred rows, and to those of its block."""
-        parts = [self.within]
+        targets = [self.within]
         if self.blocks:
             (block,) = self.block_of(np.array([first.session]), np.array([first.time]))
-            parts.append(self.blocks[int(block)].within)
+            targets.append(self.blocks[int(block)].within)
         for sensor in first.sensors:
-            for factors in parts:
-                stack(factors, (sensor, first.kind), _difference(first, second, sensor))
+            row = _difference(first, second, sensor)
+            for factors in targets:
+                stack(factors, (sensor, first.kind), row)
 
 
-def stack(factors: dict, key: tuple, factor: np.ndarray) -> None:
-    """Add rows to the triangular factor under `key`."""
+def stack(
+    factors: dict[tuple[str, str], np.ndarray], key: tuple[str, str], factor: np.ndarray
+) -> None:
+    """
+    Replace a factor R by the triangular factor of the rows of R and of `factor`.
+
+    Without a factor under `key`, the rows are stored unchanged.
+    """
     known = factors.get(key)
     if known is None or not len(known):
         factors[key] = factor
@@ -231,18 +251,23 @@ def stack(factors: dict, key: tuple, factor: np.ndarray) -> None:
 
 
 def _difference(first: WindowStatistics, second: WindowStatistics, sensor: str) -> np.ndarray:
-    """Return the row of the difference of two windows, scaled to the noise of one sample."""
+    """
+    Return the difference of the mean rows of two windows, scaled to the noise of one sample.
+
+    With noise of variance s² the means of n and m samples differ by noise of s² (1/n + 1/m).
+    """
     scale = 1 / np.sqrt(1 / first.count + 1 / second.count)
     return scale * (first.sensors[sensor].mean - second.sensors[sensor].mean)[None, :]
 
 
 def _joined(first: WindowStatistics, second: WindowStatistics) -> WindowStatistics:
-    """Return two windows as one, with means by their numbers of samples."""
+    """Return two windows as one, the means weighted by the numbers of samples."""
     total = first.count + second.count
     share_of_first = first.count / total
     share_of_second = second.count / total
 
     def mean(of_first: np.ndarray, of_second: np.ndarray) -> np.ndarray:
+        """Return the mean over the samples of both windows."""
         return share_of_first * of_first + share_of_second * of_second
 
     sensors = {}
@@ -250,25 +275,28 @@ def _joined(first: WindowStatistics, second: WindowStatistics) -> WindowStatisti
         b = second.sensors[sensor]
         sensors[sensor] = SensorStatistics(
             mean(a.mean, b.mean),
-            a.within[:0],
+            within=a.within[:0],
             noise_variance=mean(a.noise_variance, b.noise_variance),
             inflation=mean(a.inflation, b.inflation),
         )
     return WindowStatistics(
-        first.kind,
-        share_of_first * first.time + share_of_second * second.time,
-        first.duration + second.duration,
-        total,
-        sensors,
-        first.session,
-        max(first.encoder_step, second.encoder_step),
+        kind=first.kind,
+        time=share_of_first * first.time + share_of_second * second.time,
+        duration=first.duration + second.duration,
+        count=total,
+        sensors=sensors,
+        session=first.session,
+        encoder_step=max(first.encoder_step, second.encoder_step),
     )
 
 
-def _without_within(window: WindowStatistics) -> WindowStatistics:
-    """Return a window with its mean rows only."""
-    own = window.sensors.values()
-    if not window.pieces and all(len(each.within) == 0 and each.slow is None for each in own):
+def _with_mean_rows_only(window: WindowStatistics) -> WindowStatistics:
+    """Return a window without its centred rows and pieces."""
+    has_centred_rows = False
+    for statistics in window.sensors.values():
+        if len(statistics.within) or statistics.slow is not None:
+            has_centred_rows = True
+    if not window.pieces and not has_centred_rows:
         return window
     sensors = {}
     for name, statistics in window.sensors.items():
@@ -280,28 +308,28 @@ def _without_within(window: WindowStatistics) -> WindowStatistics:
 
 def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.ndarray]:
     """
-    Return sensor -> indices of the columns of `narrow`, and of the outputs.
+    Return the indices by which rows of the model `wide` become rows of the model `narrow`.
 
-    The indices are in rows made with the model `wide`.
+    Sensor -> indices into ``[columns of wide | output]``: the columns of the groups of `narrow`,
+    then the three outputs.
     """
     chosen = {}
     for sensor in SENSORS:
-        place = wide.layout(sensor).rows
-        kept = (np.arange(place[name].start, place[name].stop) for name, _ in narrow.groups(sensor))
-        chosen[sensor] = np.concatenate([*kept, [-3, -2, -1]])
+        slices = wide.layout(sensor).rows
+        indices = []
+        for name, _ in narrow.groups(sensor):
+            indices.append(np.arange(slices[name].start, slices[name].stop))
+        chosen[sensor] = np.concatenate([*indices, [-3, -2, -1]])
     return chosen
 
 
 def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -> Accumulator:
-    """
-    Return the accumulator with only the columns that the model `narrow` needs.
-
-    From one made with the model `wide`.
-    """
+    """Return an accumulator of the model `wide` with the columns of the model `narrow` only."""
     chosen = selected_columns(wide, narrow)
     blocks = []
     for block in accumulator.blocks:
-        within, slow = (chosen_columns(factors, chosen) for factors in (block.within, block.slow))
+        within = chosen_columns(block.within, chosen)
+        slow = chosen_columns(block.slow, chosen)
         blocks.append(replace(block, within=within, slow=slow))
     return replace(
         accumulator.copy(),
@@ -316,21 +344,21 @@ def chosen_columns(
     factors: dict[tuple[str, str], np.ndarray], chosen: dict[str, np.ndarray]
 ) -> dict[tuple[str, str], np.ndarray]:
     """Return (sensor, kind) -> factor with the columns `chosen` of the sensor only."""
-    found = {}
+    restricted = {}
     for (sensor, kind), factor in factors.items():
-        found[sensor, kind] = factor[:, chosen[sensor]]
-    return found
+        restricted[sensor, kind] = factor[:, chosen[sensor]]
+    return restricted
 
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:
     """Return a reduced window with the columns `chosen` (sensor -> indices) only."""
     sensors = {}
-    for name, own in window.sensors.items():
-        at = chosen[name]
+    for name, statistics in window.sensors.items():
+        indices = chosen[name]
         sensors[name] = replace(
-            own,
-            mean=own.mean[at],
-            within=own.within[:, at],
-            slow=None if own.slow is None else own.slow[:, at],
+            statistics,
+            mean=statistics.mean[indices],
+            within=statistics.within[:, indices],
+            slow=None if statistics.slow is None else statistics.slow[:, indices],
         )
     return replace(window, sensors=sensors)

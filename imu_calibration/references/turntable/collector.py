@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import chain, islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,12 +91,15 @@ def to_bytes(
     gathered: SessionData, model: SensorModel, extension: ModelExtension = ModelExtension()
 ) -> bytes:
     """
-    Return a `SessionData` as an npz archive: numbers to the last bit, no pickled objects.
+    Return a `SessionData` as an npz archive, with exact numbers and without pickled objects.
+
+    The archive has two arrays: `numbers`, all arrays of the data in one line, and `header`, JSON
+    text with the plain values and the structure (`_packed`).
 
     Parameters
     ----------
     gathered : SessionData
-        Its least-squares system, the held-out blocks of the proof, poses and counts.
+        Of which the fields `SAVED_PARTS` are saved.
     model : SensorModel
         The model of its columns.
     extension : ModelExtension
@@ -104,10 +107,11 @@ def to_bytes(
 
     """
     arrays: list[np.ndarray] = []
-    of_model = {f.name: getattr(model, f.name) for f in fields(model) if f.name != 'catalogue'}
+    session_fields = {name: getattr(gathered, name) for name in SAVED_PARTS}
+    model_fields = {f.name: getattr(model, f.name) for f in fields(model) if f.name != 'catalogue'}
     content = (
-        {name: getattr(gathered, name) for name in SAVED_PARTS},
-        of_model,
+        session_fields,
+        model_fields,
         model.definitions,
         replace(extension, clipped=None),
     )
@@ -123,22 +127,28 @@ def to_bytes(
 
 def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
     """
-    Return a column of values as plain lists, one column per part of values of equal type.
+    Return the values of one column as nested plain lists, which `_unpacked` reverses.
 
-    Arrays of one shape are appended as one.
+    The structure is written once for all values of a column. The possible results are::
+
+        ['plain', values]                       text, numbers and None
+        ['mixed', number of each value's kind, [packed values of each kind]]
+        ['array', shape (n, ...)]               the values are appended to `arrays` as one array
+        ['list', length of each value, packed items of all values]
+        [type name, n, [packed column of each field], packed keys]   tuples, dicts, dataclasses
     """
     if all(issubclass(kind, SAVED_PLAIN) for kind in set(map(type, values))):
         return ['plain', values]
     kinds = [_kind(value) for value in values]
     if len(set(kinds)) > 1:
-        each: dict[Any, list] = {}  # kind -> its values
+        values_of_kind: dict[Any, list] = {}
         for value, kind in zip(values, kinds):
-            each.setdefault(kind, []).append(value)
-        order = list(each)
+            values_of_kind.setdefault(kind, []).append(value)
+        order = list(values_of_kind)
         return [
             'mixed',
             [order.index(kind) for kind in kinds],
-            [_packed(own, arrays) for own in each.values()],
+            [_packed(alike, arrays) for alike in values_of_kind.values()],
         ]
     first = values[0]
     if isinstance(first, np.ndarray):
@@ -151,11 +161,14 @@ def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
             _packed(list(chain.from_iterable(values)), arrays),
         ]
     keys = tuple(first) if isinstance(first, dict) else ()
-    rows = (
-        values
-        if isinstance(first, tuple)
-        else [(value if isinstance(value, dict) else vars(value)).values() for value in values]
-    )
+    rows: list[Iterable] = []  # the fields of each value
+    for value in values:
+        if isinstance(value, tuple):
+            rows.append(value)
+        elif isinstance(value, dict):
+            rows.append(value.values())
+        else:
+            rows.append(vars(value).values())
     return [
         type(first).__name__,
         len(values),
@@ -166,7 +179,10 @@ def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
 
 def _kind(value: Any) -> Any:
     """
-    Return the shape, the keys, the length or the type, which values of one column have in common.
+    Return the structure that values of one column must share.
+
+    The shape of an array, type and keys of a dict, the length of a tuple, None for plain values,
+    otherwise the type.
     """
     if isinstance(value, np.ndarray):
         return value.shape
@@ -178,11 +194,14 @@ def _kind(value: Any) -> Any:
 
 
 class _SavedNumbers(io.BytesIO):
-    """The numbers of an archive, and how many more values its columns may have together."""
+    """The numbers of an archive as a file, with a limit for the values of all its columns."""
 
     def __init__(self, data: bytes, most_values: int):
         super().__init__(data)
-        self._most_values = self._remaining = most_values
+        self._most_values = most_values
+        """The limit, for the message."""
+        self._remaining = most_values
+        """Values that further columns may still have."""
 
     def count(self, n_values: int) -> None:
         """Count the values of a column; raises ValueError above the limit."""
@@ -195,10 +214,11 @@ class _SavedNumbers(io.BytesIO):
 
 def _unpacked(column: list, numbers: _SavedNumbers) -> list:
     """
-    Return the values that `_packed` wrote.
+    Return the values of a column from the lists that `_packed` wrote.
 
-    Their arrays are read from the beginning of the file `numbers`.
+    Their arrays are the next ones of the file `numbers`.
     """
+    # The meaning of the second item depends on the name, see `_packed`.
     name, size, *parts = column
     if name == 'plain':
         return size
@@ -212,8 +232,8 @@ def _unpacked(column: list, numbers: _SavedNumbers) -> list:
         numbers.count(size)
     columns = [_unpacked(part, numbers) for part in parts[0]]
     if name == 'mixed':
-        each = [iter(values) for values in columns]
-        return [next(each[number]) for number in size]
+        values_of_kind = [iter(values) for values in columns]
+        return [next(values_of_kind[number]) for number in size]
     kind: Any = SAVED_TYPES[name]
     rows = list(zip(*columns, strict=True)) or [()] * size
     # The test narrows the type to an instance or a class; only classes are saved.
@@ -224,12 +244,20 @@ def _unpacked(column: list, numbers: _SavedNumbers) -> list:
     return [kind(dict(zip(keys, row)) if issubclass(kind, dict) else row) for row in rows]
 
 
-def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
-    """
-    Return (SessionData, SensorModel, added effects) in an archive.
+class SavedSession(NamedTuple):
+    """Content of an archive."""
 
-    The SensorModel is that of the columns of the data. The effects are the ones added to the
-    requested model.
+    gathered: SessionData
+    """The reduced windows."""
+    model: SensorModel
+    """The model of their columns."""
+    extension: ModelExtension
+    """Effects added to the requested model."""
+
+
+def from_bytes(data: bytes) -> SavedSession:
+    """
+    Return the content of an archive of `to_bytes`.
 
     Raises
     ------
@@ -247,12 +275,11 @@ def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
                 )
             size = arrays['header'].nbytes + arrays['numbers'].nbytes
             numbers = _SavedNumbers(arrays['numbers'].tobytes(), MOST_EMPTY + SAVED_DEPTH * size)
-            ((parts, of_model, definitions, extension),) = _unpacked(header['content'], numbers)
-            return (
-                SessionData(**parts),
-                SensorModel(**of_model, catalogue=CATALOGUE.with_definitions(definitions)),
-                extension,
-            )
+            (content,) = _unpacked(header['content'], numbers)
+            session_fields, model_fields, definitions, extension = content
+            catalogue = CATALOGUE.with_definitions(definitions)
+            model = SensorModel(**model_fields, catalogue=catalogue)
+            return SavedSession(SessionData(**session_fields), model, extension)
     except ImuCalibrationError:
         raise
     except Exception as error:  # damaged archives, arrays and headers raise many kinds
@@ -266,29 +293,56 @@ def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
 
 def require_columns(known: SensorModel, model: SensorModel) -> None:
     """
-    Raise a DocumentError unless the columns of a saved accumulator match.
+    Raise a DocumentError unless a saved accumulator has the columns of `model`.
 
-    The columns of the accumulator, of the model `known`, must be the columns of `model`.
+    `known`: the model of the columns of the accumulator.
     """
     if not known.has_columns_of(model):
         raise DocumentError(
             'a saved accumulator must contain the columns of the requested model, it has'
-            f' {_text(known)}, requested is {_text(model)}; start without resume, or with the old'
-            ' model',
+            f' {_effects_text(known)}, requested is {_effects_text(model)}; start without resume,'
+            ' or with the old model',
             code='other_model',
         )
 
 
-def _text(model: SensorModel) -> str:
+def _effects_text(model: SensorModel) -> str:
+    """Return the effects of each section and the reference temperature, for a message."""
     effects = ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in SECTIONS)
     return f'{effects} at {model.temperature_ref_c:g} C'
 
 
 class Collector:
     """
-    Feeds blocks to the window finder and reduces its windows.
+    Finds the windows in blocks of samples and adds their statistics to a `SessionData`.
 
     The same object serves bags and live topics.
+
+    Parameters
+    ----------
+    table : Table
+        The reference.
+    model : SensorModel
+        Defines the columns.
+    settings : WindowSettings
+        How windows are found.
+    nominal : RawReadings, optional
+        For readings in volts or counts.
+    session : int
+        Number of the recording.
+    watchers : sequence of Watcher
+        Checks that see the cleaned samples.
+    windows : optional
+        Receives all windows with their samples, unused ones too.
+    spread : bool
+        Whether windows are kept for the search of effects.
+    judged_from : float
+        Windows from this time on are judged by a proof, s.
+    without : array, shape (n, 2)
+        Ranges of stamps whose samples are omitted, ns.
+    unusable : sequence of str
+        Sensors that are omitted.
+
     """
 
     def __init__(
@@ -343,12 +397,15 @@ class Collector:
         self.gathered.counts = dict(counts)
 
     def _note_imu(self, imu: ImuSamples) -> None:
-        found = self.gathered
-        if found.first_stamp_ns is None:
-            found.first_stamp_ns, found.frame_id = int(imu.stamp_ns[0]), imu.frame_id
-        found.last_stamp_ns = max(int(imu.stamp_ns[-1]), found.last_stamp_ns or 0)
+        """Update the frame and the first and last stamp."""
+        gathered = self.gathered
+        if gathered.first_stamp_ns is None:
+            gathered.first_stamp_ns = int(imu.stamp_ns[0])
+            gathered.frame_id = imu.frame_id
+        gathered.last_stamp_ns = max(int(imu.stamp_ns[-1]), gathered.last_stamp_ns or 0)
 
     def _note_temperature(self, temperature_c: np.ndarray) -> None:
+        """Extend the range of temperatures."""
         finite = temperature_c[np.isfinite(temperature_c)]
         if len(finite):
             low, high = self.gathered.temperature_c or (np.inf, -np.inf)
@@ -358,6 +415,7 @@ class Collector:
             )
 
     def _take(self, windows: Sequence[Window]) -> list[Window]:
+        """Add all windows except unused ones to the gathered data, and return them."""
         if self.windows is not None:
             self.windows.extend(windows)
         used = [window for window in windows if window.kind != 'unused']
@@ -366,26 +424,27 @@ class Collector:
         return used
 
     def _add(self, window: Window) -> None:
+        """Add the statistics, the pose and the largest readings of a window."""
         reduced = reduce_window(window, self.model, self.table, session=self.session)
-        found = self.gathered
-        found.take(reduced)
-        found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
+        gathered = self.gathered
+        gathered.take(reduced)
+        largest_force = float(np.max(np.abs(window.force_s)))
+        gathered.largest_force = max(gathered.largest_force, largest_force)
         if window.kind == 'static':
-            found.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
-            del found.poses[:-KEPT_POSES]
+            gathered.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
+            del gathered.poses[:-KEPT_POSES]
         else:
-            found.largest_rate = max(
-                found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max()))
-            )
+            largest_rate = float(np.sqrt((window.rate_s**2).sum(axis=1).max()))
+            gathered.largest_rate = max(gathered.largest_rate, largest_rate)
         self._store(window, reduced)
 
     def _store(self, window: Window, _reduced: WindowStatistics) -> None:
+        """Keep the samples of moving windows for plots, and windows for the search of effects."""
         kept = self.gathered.kept
-        if (
-            window.kind != 'static'
-            and sum(len(w.time) for w in kept) + len(window.time) <= KEPT_SAMPLES
-        ):
-            kept.append(window)
+        if window.kind != 'static':
+            n_samples = sum(len(w.time) for w in kept) + len(window.time)
+            if n_samples <= KEPT_SAMPLES:
+                kept.append(window)
         if self.spread:
             self.gathered.spreads[0].add(owned_window(window))
 
@@ -412,12 +471,12 @@ class GatherStep:
     """Windows from this time on are judged by a proof, s."""
 
     def gather(self, source: BlockSource, session: int) -> SessionData:
-        """Return the SessionData of a recording and its number."""
+        """Return the data of the recording with number `session`, with the usual checks."""
         with naming(self.names, session):
             return self.read(source, session, Preflight(self.table.gravity_value, one_sensor=True))
 
     def blocks(self, source: BlockSource) -> Iterable[SampleBlock]:
-        """Return the blocks of a recording as they are gathered."""
+        """Return the blocks of a recording; a subclass may change them."""
         return source
 
     def read(
@@ -432,8 +491,8 @@ class GatherStep:
         Return the SessionData of a recording, which is read once for its windows and the checks.
 
         Where the checks find parts without readings, or a sensor that cannot be used, it is read
-        again without them. All windows,
-        unused ones too, are appended to `windows`, which is empty before.
+        again without them. All windows, unused ones too, are appended to `windows`, which must be
+        empty.
 
         Raises
         ------
@@ -467,6 +526,7 @@ class GatherStep:
         without: np.ndarray = NO_RANGES,
         unusable: Sequence[str] = (),
     ) -> SessionData:
+        """Return the data of blocks; `without`, `unusable` are the samples that are omitted."""
         collector = Collector(
             self.table,
             self.model,
@@ -486,7 +546,23 @@ class GatherStep:
 
 
 class LiveCollector(Collector):
-    """A Collector that keeps a bounded number of windows."""
+    """
+    A Collector of a live session: its memory is bounded, and its model may change.
+
+    Parameters
+    ----------
+    table : Table
+        The reference.
+    model : SensorModel
+        Defines the columns.
+    options : CalibrationOptions
+        Settings of windows and readings.
+    session : int
+        Number of the recording.
+    store : WindowStore
+        Receives the windows with their samples, from which other columns can be computed.
+
+    """
 
     def __init__(
         self,
@@ -502,6 +578,7 @@ class LiveCollector(Collector):
         self.gathered.spreads = [DecimatedWindows(MAX_LIVE_SAMPLES)]
 
     def _store(self, window: Window, reduced: WindowStatistics) -> None:
+        """Keep a copy of a window for other columns and for the search of effects."""
         kept = owned_window(window)
         self.store.add(kept, reduced)
         self.gathered.spreads[0].add(kept)
@@ -510,12 +587,11 @@ class LiveCollector(Collector):
         """
         Gather the columns of another model from now on.
 
-        Those of all kept windows are computed again.
+        The statistics of all stored windows are computed again.
         """
-        self.model, self.gathered = (
-            model,
-            self.gathered.anew(self.store.reduced(model, self.table, self.session)),
-        )
+        windows = self.store.reduced(model, self.table, self.session)
+        self.gathered = self.gathered.with_windows(windows)
+        self.model = model
 
     def snapshot(self, pending: bool) -> tuple[SessionData, WindowStore]:
         """
@@ -524,7 +600,8 @@ class LiveCollector(Collector):
         With `pending`, open windows are closed in the copies.
         """
         twin = copy.copy(self)
-        twin.gathered, twin.store = copied(self.gathered), self.store.copy()
+        twin.gathered = copied(self.gathered)
+        twin.store = self.store.copy()
         if pending:
             twin.gatherer = copy.deepcopy(self.gatherer)
             twin.finish()

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 
@@ -48,57 +47,61 @@ from imu_calibration.references.turntable.window_observations import TableResult
 
 @dataclass(frozen=True, eq=False)
 class LiveSnapshot:
-    """Unchanging copies of the gathered data."""
+    """State of a live session at one time, which later samples do not change."""
 
     gathered: SessionData
-    """An earlier run included, with the windows of the search."""
+    """Reduced windows of this run and of an earlier one, and the windows for the search."""
     model: SensorModel
-    """The model of its columns."""
+    """The model of the columns of `gathered`."""
     table: Table
     """The reference."""
     options: CalibrationOptions
     """Options of the requested model."""
     extension: ModelExtension
-    """Effects added to the model."""
+    """Effects added to the requested model."""
     store: WindowStore
-    """The windows of this run, while they are all kept."""
+    """All windows of this run with their samples, as long as they fit."""
     session: int
-    """Number of this run."""
+    """Number of this run among the recordings in `gathered`."""
     temperature_c: float | None
     """The first temperature, degrees Celsius; None: no temperature received."""
 
     def model_for(self, options: CalibrationOptions) -> SensorModel:
-        """Return the model of the columns for options."""
+        """Return the model that options request, at the first temperature if it needs one."""
         model = choose_model(options, self.table)
-        return (
-            model.with_reference_temperature(self.temperature_c)
-            if model.needs_temperature and self.temperature_c is not None
-            else model
-        )
+        if model.needs_temperature and self.temperature_c is not None:
+            return model.with_reference_temperature(self.temperature_c)
+        return model
 
     def solved(self, options: CalibrationOptions) -> SolvedWindows:
         """
-        Return the solution for other options, as from a recording.
+        Return the solution of the model that options request.
 
-        If the windows are no longer kept, the gathered columns are used.
+        With all windows stored, columns are computed and linearised again as from a recording.
+        Otherwise the gathered columns are solved once.
         """
         check_units(self.gathered, self.model, self.table)
         if not self.store.complete:
             data = WindowObservations(self.table, self.gathered, self.model)
             return solved_windows(data, options)
-        asked = self.model_for(options)
-        model = self.model if asked.has_columns_of(self.model) else asked
+        model = self.model_for(options)
+        if model.has_columns_of(self.model):
+            model = self.model  # the gathered columns serve for the first pass
         return solve_in_passes(self, model, options)
 
     def solved_at(
         self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
     ) -> SolvedWindows:
-        """Reduce the stored windows once more, if other columns or a part of them are wanted."""
-        total = self.gathered
-        if model is not self.model or judged_from != self.gathered.judged_from:
-            reduced = self.store.reduced(model, self.table, self.session)
-            total = self.gathered.anew(reduced, judged_from)
-        return solved_windows(WindowObservations(self.table, total, model), options)
+        """
+        Return the solution with the columns of a model; see `WindowSource.solved_at`.
+
+        The stored windows are reduced again if the model or the judged part is a different one.
+        """
+        gathered = self.gathered
+        if model is not self.model or judged_from != gathered.judged_from:
+            windows = self.store.reduced(model, self.table, self.session)
+            gathered = gathered.with_windows(windows, judged_from)
+        return solved_windows(WindowObservations(self.table, gathered, model), options)
 
     def evidence(self) -> Solved[Solution]:
         """Return the solution with the supported effects, as `calibrate_by_evidence`."""
@@ -109,8 +112,8 @@ class LiveSnapshot:
         )
 
 
-HELD_BACK = 200
-"""Blocks that wait for the first temperature at most, when a thermal effect needs one."""
+MAX_EARLY_BLOCKS = 200
+"""Most blocks kept until the first temperature, when a thermal effect needs one."""
 
 
 class LiveCalibration(LiveSession):
@@ -151,16 +154,25 @@ class LiveCalibration(LiveSession):
         self.table = table
         self.options = options
         self.settings = settings
-        self.earlier, known, extension = (
-            (None, None, ModelExtension()) if saved is None else from_bytes(saved)
-        )
-        self.extension = ModelExtension() if options.as_asked else extension
+        earlier_run = None if saved is None else from_bytes(saved)
+        self.earlier: SessionData | None = None
+        """The reduced windows of the earlier run; they are never changed."""
+        self.extension = ModelExtension()
         """Effects added to the requested model."""
-        self._asked = choose_model(self.extension.options(options), table)
-        self._waiting: list[SampleBlock] = []
+        if earlier_run is not None:
+            self.earlier = earlier_run.gathered
+            if not options.as_asked:
+                self.extension = earlier_run.extension
+        self._requested_model = choose_model(self.extension.options(options), table)
+        """With the added effects, at a nominal reference temperature."""
+        self._early_blocks: list[SampleBlock] = []
+        """Blocks before the first temperature, which the collector gets when it begins."""
         self._collector: LiveCollector | None = None
+        """Finds and reduces windows; None while a thermal effect waits for a temperature."""
         self._first_temperature_c: float | None = None
+        """Reference temperature of thermal effects; None before the first temperature."""
         self.result: TableResult | None = None
+        """The last solution."""
         self.last: LiveSnapshot | None = None
         """The data of the last solution."""
         self.needs_linearising = False
@@ -168,14 +180,14 @@ class LiveCalibration(LiveSession):
         Whether the last solution is outside the validity of its linearisation, and the store is too
         small to linearise again.
         """
-        asked = self._asked
-        if known is not None:
-            if asked.needs_temperature:
-                self._first_temperature_c = known.temperature_ref_c
-                asked = asked.with_reference_temperature(known.temperature_ref_c)
-            require_columns(known, asked)
-        if known is not None or not asked.needs_temperature:
-            self._begin(asked)
+        model = self._requested_model
+        if earlier_run is not None:
+            if model.needs_temperature:
+                self._first_temperature_c = earlier_run.model.temperature_ref_c
+                model = model.with_reference_temperature(earlier_run.model.temperature_ref_c)
+            require_columns(earlier_run.model, model)
+        if earlier_run is not None or not model.needs_temperature:
+            self._begin(model)
 
     observations = WindowObservations.unit
     needs_joints = True
@@ -183,8 +195,16 @@ class LiveCalibration(LiveSession):
     @property
     def n_windows(self) -> int:
         """Windows gathered so far, those of an earlier run included."""
-        parts = (self.earlier, self._collector and self._collector.gathered)
-        return sum(sum(part.accumulator.windows.values()) for part in parts if part)
+        return sum(sum(run.accumulator.windows.values()) for run in self._runs())
+
+    def _runs(self) -> list[SessionData]:
+        """Return the data of the earlier run and of this one, where they exist."""
+        runs = []
+        if self.earlier is not None:
+            runs.append(self.earlier)
+        if self._collector is not None:
+            runs.append(self._collector.gathered)
+        return runs
 
     @property
     def counts(self) -> dict[str, int]:
@@ -202,24 +222,22 @@ class LiveCalibration(LiveSession):
     @property
     def needs_temperature(self) -> bool:
         """Whether a requested effect depends on temperature."""
-        return self._asked.needs_temperature
+        return self._requested_model.needs_temperature
 
     @property
     def frame_id(self) -> str:
         """Frame of the sensor; '' before the first message."""
-        known = []
-        for part in (self.earlier, self._collector and self._collector.gathered):
-            if part:
-                known.append(part.frame_id)
-        return next(filter(None, known), '')
+        for run in self._runs():
+            if run.frame_id:
+                return run.frame_id
+        return ''
 
     def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> bool:
         """
-        Use other settings from now on, those of gravity without effect.
+        Use other settings from now on, and return whether the windows have to be solved again.
 
-        Return whether the windows have to be solved again.
-
-        Raises an InputError when they cannot be changed any more.
+        That is never so on a table; its description has the gravity, and settings of gravity
+        are ignored. Raises an InputError for settings that can no longer be changed.
         """
         if isinstance(settings, LiveSettings):
             self.settings = settings
@@ -267,18 +285,27 @@ class LiveCalibration(LiveSession):
             return self._push_before_temperature(block)
         return self._collector.push(block)
 
-    def _push_before_temperature(self, block: SampleBlock) -> list:
-        self._waiting.append(block)
-        del self._waiting[:-HELD_BACK]
+    def _push_before_temperature(self, block: SampleBlock) -> list[Window]:
+        """
+        Keep a block until the first temperature, then process all kept blocks.
+
+        Returns the windows that they completed.
+        """
+        self._early_blocks.append(block)
+        del self._early_blocks[:-MAX_EARLY_BLOCKS]
         if self._first_temperature_c is None:
             return []
-        self._begin(self._asked.with_reference_temperature(self._first_temperature_c))
-        # Made by `_begin`.
-        assert self._collector is not None
-        blocks, self._waiting = self._waiting, []
-        return list(chain.from_iterable(map(self._collector.push, blocks)))
+        model = self._requested_model.with_reference_temperature(self._first_temperature_c)
+        collector = self._begin(model)
+        early_blocks = self._early_blocks
+        self._early_blocks = []
+        windows = []
+        for early_block in early_blocks:
+            windows += collector.push(early_block)
+        return windows
 
-    def _begin(self, model: SensorModel) -> None:
+    def _begin(self, model: SensorModel) -> LiveCollector:
+        """Make the collector of this run, with the columns of a model, and return it."""
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
@@ -286,10 +313,11 @@ class LiveCalibration(LiveSession):
         self._collector = LiveCollector(
             self.table, model, self.options, session=session, store=store
         )
+        return self._collector
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> TableResult:
         """
-        Solve the gathered data and return the CalibrationResult, which is kept in `result`.
+        Solve the gathered data and return the result, which is kept in `result`.
 
         Parameters
         ----------
@@ -307,18 +335,18 @@ class LiveCalibration(LiveSession):
             When the units are plainly wrong, or the stream holds the readings of two IMUs.
 
         """
-        collector = self._begun()
+        collector = self._require_collector()
         collector.gatherer.cleaner.sources.require_one()
         gathered, store = collector.snapshot(pending)
         snapshot = LiveSnapshot(
-            self._with_earlier(gathered),
-            collector.model,
-            self.table,
-            self.options,
-            self.extension,
-            store,
-            collector.session,
-            self._first_temperature_c,
+            gathered=self._with_earlier(gathered),
+            model=collector.model,
+            table=self.table,
+            options=self.options,
+            extension=self.extension,
+            store=store,
+            session=collector.session,
+            temperature_c=self._first_temperature_c,
         )
         options = self.extension.options(self.options)
         solved = snapshot.solved(options)
@@ -340,13 +368,12 @@ class LiveCalibration(LiveSession):
         kept.
         """
         collector = self._collector
-        if (
-            collector is None
-            or self.last is None
-            or self.options.as_asked
-            or extension.is_nothing
-            and self.extension.is_nothing
-        ):
+        # Effects are adopted after a solution only, from its diagnosis.
+        if collector is None or self.last is None:
+            return False
+        if self.options.as_asked:
+            return False
+        if extension.is_nothing and self.extension.is_nothing:
             return False
         model = self.last.model_for(extension.options(self.options))
         if not model.has_columns_of(collector.model):
@@ -364,9 +391,10 @@ class LiveCalibration(LiveSession):
 
     def saved(self, pending: bool = False) -> bytes:
         """Return all gathered data as bytes, for another run (`collector.to_bytes`)."""
-        return to_bytes(self.gathered(pending), self._begun().model, self.extension)
+        return to_bytes(self.gathered(pending), self._require_collector().model, self.extension)
 
-    def _begun(self) -> LiveCollector:
+    def _require_collector(self) -> LiveCollector:
+        """Return the collector; raises an InputError while no temperature was received."""
         if self._collector is None:
             raise InputError(
                 'a thermal effect needs temperatures, none were received; publish imu/temperature'
@@ -376,44 +404,44 @@ class LiveCalibration(LiveSession):
         return self._collector
 
     def _with_earlier(self, gathered: SessionData) -> SessionData:
+        """Return data of this run merged with a copy of those of the earlier run."""
         if self.earlier is None:
             return gathered
         return merge([copied(self.earlier), gathered])
 
     def residuals(self, windows: Sequence[Window]) -> ImuSamples | None:
         """
-        Return measured minus predicted of windows from `push`, as ImuSamples.
+        Return measured minus predicted samples of windows from `push`.
 
-        Or None before the first solution.
-
-        Every k-th sample, so that there are at most `residual_rate` per second.
+        Every k-th sample of a window, so that there are at most `residual_rate` per second. None
+        before the first solution.
         """
         if self.result is None or not windows or not self.settings.residual_rate:
             return None
         return ImuSamples.concatenate([self._residual(window) for window in windows])
 
     def _residual(self, window: Window) -> ImuSamples:
-        every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
-        some = slice(every // 2 if len(window) > every // 2 else 0, None, every)
+        """Return every k-th residual of a window, NaN for a sensor without readings."""
+        stride = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
+        middle = stride // 2  # of the samples that one published sample stands for
+        published = slice(middle if len(window) > middle else 0, None, stride)
         # Residuals exist after a solution of the gathered windows.
         assert self.result is not None and self._collector is not None
         # Of all samples, because a lag interpolates between them.
         residuals = self.result.residuals_of(window)
         absent = np.full((len(window), 3), np.nan)
         return ImuSamples(
-            window.stamp_ns[some],
-            residuals.get('accelerometer', absent)[some],
-            residuals.get('gyroscope', absent)[some],
+            window.stamp_ns[published],
+            residuals.get('accelerometer', absent)[published],
+            residuals.get('gyroscope', absent)[published],
             self._collector.gathered.frame_id,
         )
 
     def coverage(self) -> Coverage:
         """Return the Coverage: the gain of each attitude, and the motion with the largest gain."""
-        return (
-            replace(NOTHING_SEEN, frame_id=self.frame_id)
-            if self.result is None
-            else table_coverage(self.result, self.frame_id)
-        )
+        if self.result is None:
+            return replace(NOTHING_SEEN, frame_id=self.frame_id)
+        return table_coverage(self.result, self.frame_id)
 
     def waiting(self) -> list[GroupState]:
         """Return the state of every effect before the first solution."""

@@ -39,95 +39,107 @@ from imu_calibration.references.turntable.window_statistics import (
     reduce_window,
 )
 
-STATIC_MOST = 4096
-"""Static windows kept at most."""
+MAX_STATIC_WINDOWS = 4096
+"""Most static windows of a `WindowStore`."""
+
+
+@dataclass(frozen=True, eq=False)
+class StaticWindow:
+    """A static window without its samples, from which other columns can be computed."""
+
+    statistics: WindowStatistics
+    """Its statistics with the columns of some model."""
+    motion: JointMotion
+    """Motion of the joints."""
+    temperature_c: np.ndarray | None
+    """Mean temperature, shape (1,), degrees Celsius; None: not measured."""
+
+    def reduced(self, model: SensorModel, table: Table) -> WindowStatistics:
+        """Return the statistics with the columns of a model."""
+        references = References(model, table, self.motion, temperature_c=self.temperature_c)
+        sensors = {}
+        for name, known in self.statistics.sensors.items():
+            output = known.mean[-N_AXES:]
+            mean = np.concatenate([columns(references, name).mean(axis=0), output])
+            # At rest there are no centred rows, but their width is that of the columns.
+            sensors[name] = replace(known, mean=mean, within=np.zeros((0, len(mean))))
+        pieces = {}
+        for name, statistics in sensors.items():
+            pieces[name] = pieces_at_rest(statistics.mean, self.statistics.duration)
+        return replace(self.statistics, sensors=sensors, pieces=pieces)
 
 
 class WindowStore:
     """
     All windows of a session as long as they fit, none of them afterwards.
 
-    A static window is stored as its reduced form with one row of motion; of other windows every
-    sample is kept.
+    A static window is stored without its samples; of other windows every sample is kept.
 
     Parameters
     ----------
-    most : int
-        Samples in moving windows that are kept at most.
+    max_samples : int
+        Most samples in moving windows.
     complete : bool
         False when windows were missed already, as after a restart.
 
     """
 
-    def __init__(self, most: int, complete: bool = True):
-        self._most = most
-        self._entries = []
+    def __init__(self, max_samples: int, complete: bool = True):
+        self._max_samples = max_samples
+        self._windows: list[Window | StaticWindow] = []
+        """In the order of time."""
         self._n_samples = 0
+        """Samples of the moving windows."""
         self._n_static = 0
-        self.complete = complete and most > 0
+        """Number of static windows."""
+        self.complete = complete and max_samples > 0
+        """Whether all windows of the session are stored."""
 
     def copy(self) -> 'WindowStore':
         """Return a copy that shares the windows."""
         twin = copy(self)
-        twin._entries = list(self._entries)
+        twin._windows = list(self._windows)
         return twin
 
     def add(self, window: Window, reduced: WindowStatistics) -> None:
         """
-        Add a copy of one window (`owned_window`), and its statistics.
+        Add a window in separate memory (`owned_window`), and its statistics.
 
-        When it does not fit, discard all windows.
+        When it does not fit, all windows are discarded.
         """
         if not self.complete:
             return
         if window.kind == 'static':
             self._n_static += 1
-            temperature = (
-                None if window.temperature_c is None else np.array([window.temperature_c.mean()])
-            )
-            self._entries.append((reduced, window.motion, temperature))
+            temperature_c = None
+            if window.temperature_c is not None:
+                temperature_c = np.array([window.temperature_c.mean()])
+            self._windows.append(StaticWindow(reduced, window.motion, temperature_c))
         else:
             self._n_samples += len(window)
-            self._entries.append(window)
-        if self._n_samples > self._most or self._n_static > STATIC_MOST:
-            self.complete, self._entries = False, []
+            self._windows.append(window)
+        if self._n_samples > self._max_samples or self._n_static > MAX_STATIC_WINDOWS:
+            self.complete = False
+            self._windows = []
 
     def reduced(self, model: SensorModel, table: Table, session: int) -> Iterator[WindowStatistics]:
         """
-        Yield all windows in order with the columns of `model`.
+        Yield the statistics of all windows in order of time, with the columns of a model.
 
-        As `references.turntable.collector` reduces them.
+        They equal the ones of `Collector`.
         """
-        for entry in self._entries:
-            if isinstance(entry, Window):
-                yield reduce_window(entry, model, table, session=session)
+        for window in self._windows:
+            if isinstance(window, Window):
+                yield reduce_window(window, model, table, session=session)
             else:
-                yield _again(entry, model, table)
-
-
-def _again(
-    entry: tuple[WindowStatistics, JointMotion, np.ndarray | None], model: SensorModel, table: Table
-) -> WindowStatistics:
-    """Return a static window's statistics with recomputed columns."""
-    reduced, motion, temperature = entry
-    references = References(model, table, motion, temperature_c=temperature)
-    sensors = {}
-    for name, known in reduced.sensors.items():
-        mean = np.concatenate([columns(references, name).mean(axis=0), known.mean[-3:]])
-        # At rest there are no centred rows, but their width is that of the columns.
-        sensors[name] = replace(known, mean=mean, within=np.zeros((0, len(mean))))
-    return replace(
-        reduced,
-        sensors=sensors,
-        pieces={
-            name: pieces_at_rest(known.mean, reduced.duration) for name, known in sensors.items()
-        },
-    )
+                yield window.reduced(model, table)
 
 
 def owned_window(window: Window) -> Window:
     """
-    Return a copy of the window in separate memory: slices would keep the complete chunk in memory.
+    Return a copy of a window in separate memory.
+
+    Its arrays are slices of a chunk of samples, which would be kept in memory with them.
     """
     motion = JointMotion.concatenate([window.motion])
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)
@@ -150,10 +162,10 @@ KEPT_IN_MEMORY = 250_000
 
 @dataclass(eq=False)
 class KeptWindows:
-    """The used windows of a recording; of a long recording none."""
+    """The windows of a recording that are not unused; none of a long recording."""
 
     windows: list[Window] = field(default_factory=list)
-    """In the order of time; none where there were too many."""
+    """In the order of time; empty when there were too many."""
     n_samples: int = 0
     """Samples of all used windows so far."""
 
@@ -190,32 +202,38 @@ BLOCKS = 3 * TABLE_FOLDS
 
 @dataclass(eq=False)
 class HeldOutBlock:
-    """Every so many-th window of each kind."""
+    """
+    One block of windows, for the fit of parameters and for the judgement of others.
+
+    Pieces are the means of short pieces of a window (`WindowStatistics.pieces`). They are stored as
+    triangular factors, with the same sum of squared errors for any parameters.
+    """
 
     accumulator: Accumulator = field(
         default_factory=lambda: Accumulator(in_blocks=False, share=BLOCKS)
     )
-    """For fitting."""
+    """Statistics of all its windows, from which parameters are estimated."""
     pieces: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
-    """(sensor, regime) -> triangular factor of the rows of short pieces, for judging."""
+    """(sensor, regime) -> triangular factor of the pieces of judged windows."""
     counts: dict[str, int] = field(default_factory=dict)
-    """Regime -> number of pieces."""
+    """Regime -> number of pieces of judged windows."""
     judged: int = 0
-    """Windows with pieces for judging."""
+    """Number of judged windows."""
     earlier: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
-    """As `pieces`, of the windows that are not judged."""
+    """As `pieces`, of the windows before `SessionData.judged_from`, which are not judged."""
 
     def add(self, window: WindowStatistics, judged: bool = True) -> None:
         """Add a window, and its pieces if it is judged."""
         self.accumulator.add(window)
         pieces = self.pieces if judged else self.earlier
-        for sensor, of_regimes in window.pieces.items():
-            for regime, rows in of_regimes.items():
+        for sensor, rows_of_regimes in window.pieces.items():
+            for regime, rows in rows_of_regimes.items():
                 factor = rows if len(rows) <= rows.shape[1] else triangular(rows)
                 stack(pieces, (sensor, regime), factor)
         if not judged:
             return
         self.judged += 1
+        # Both sensors have the same pieces; that of a window at rest is one weighted row.
         for regime, rows in next(iter(window.pieces.values())).items():
             count = count_pieces(window.duration) if window.kind == 'static' else len(rows)
             self.counts[regime] = self.counts.get(regime, 0) + count
@@ -243,36 +261,37 @@ class HeldOutBlock:
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
         """Return the block with the columns of the model `narrow` only."""
-        chosen = {
-            sensor: np.concatenate([columns[:-N_AXES], np.arange(-2 * N_AXES, 0)])
-            for sensor, columns in selected_columns(wide, narrow).items()
-        }
+        chosen = {}
+        for sensor, indices in selected_columns(wide, narrow).items():
+            # The rows of pieces end with the derivative of the input and the output.
+            chosen[sensor] = np.concatenate([indices[:-N_AXES], np.arange(-2 * N_AXES, 0)])
         return HeldOutBlock(
-            restrict(self.accumulator, wide, narrow),
-            chosen_columns(self.pieces, chosen),
-            self.counts,
-            self.judged,
-            chosen_columns(self.earlier, chosen),
+            accumulator=restrict(self.accumulator, wide, narrow),
+            pieces=chosen_columns(self.pieces, chosen),
+            counts=self.counts,
+            judged=self.judged,
+            earlier=chosen_columns(self.earlier, chosen),
         )
 
 
 @dataclass(eq=False)
 class HeldOut:
     """
-    Blocks of windows.
+    The windows of a session in blocks, for cross-validation.
 
-    Undivided windows of each kind are assigned to blocks in turn, so that every block has windows
-    of each kind, and memory does not grow with the session.
+    Windows of each kind are assigned to blocks in turn, so that every block has windows of each
+    kind.
     """
 
     blocks: list[HeldOutBlock] = field(
         default_factory=lambda: [HeldOutBlock() for _ in range(BLOCKS)]
     )
+    """Block k belongs to fold k modulo `TABLE_FOLDS`."""
 
     def add(self, window: WindowStatistics, judged: bool = True) -> None:
         """Add a window, and its pieces if it is judged."""
-        dealt = sum(block.accumulator.windows.get(window.kind, 0) for block in self.blocks)
-        self.blocks[dealt % BLOCKS].add(window, judged)
+        number_of_kind = sum(block.accumulator.windows.get(window.kind, 0) for block in self.blocks)
+        self.blocks[number_of_kind % BLOCKS].add(window, judged)
 
     def merge(self, other: 'HeldOut') -> None:
         """Add the content of another object; its windows follow the existing ones."""
@@ -285,11 +304,9 @@ class HeldOut:
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOut':
         """Return the same with the columns of the model `narrow` only."""
-        return (
-            self
-            if wide is narrow
-            else HeldOut([block.restricted(wide, narrow) for block in self.blocks])
-        )
+        if wide is narrow:
+            return self
+        return HeldOut([block.restricted(wide, narrow) for block in self.blocks])
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -301,43 +318,45 @@ class HeldOut:
 
     @property
     def n_windows(self) -> int:
-        """Windows dealt out."""
+        """Number of windows in all blocks."""
         return sum(sum(block.accumulator.windows.values()) for block in self.blocks)
 
     @property
     def n_judged(self) -> int:
-        """Windows with kept pieces."""
+        """Number of judged windows."""
         return sum(block.judged for block in self.blocks)
 
     def values_without(self, solution: Solution) -> list[np.ndarray]:
         """
-        Return the parameters without each fold.
+        Return the parameters estimated without each fold, each shape (n_params,).
 
-        One Gauss-Newton step from the solution, on the rows of the remaining folds.
-
-        Noise and held parameters are those of the solution; a parameter that only the fold
+        One Gauss-Newton step from the solution, with the rows of the remaining folds and of the
+        prior. Noise and held parameters are those of the solution; a parameter that only the fold
         determines is set to its prior.
         """
         model = solution.model
         prior = make_prior(solution.model)
         values = solution.values
         free = ~fixed_parameters(model) & ~solution.held
-        parts = [
+        rows_of_folds = [
             _linearised(self.blocks[fold::TABLE_FOLDS], solution) for fold in range(TABLE_FOLDS)
         ]
-        known = np.column_stack([prior.root, prior.root @ (prior.mean - values)])
-        found = []
+        prior_rows = np.column_stack([prior.root, prior.root @ (prior.mean - values)])
+        values_without = []
         for fold in range(TABLE_FOLDS):
-            rows = np.concatenate([known, *(part for k, part in enumerate(parts) if k != fold)])
-            found.append(after_one_step(values, rows[:, :-1][:, free], rows[:, -1], free=free))
-        return found
+            others = (rows for number, rows in enumerate(rows_of_folds) if number != fold)
+            equations = np.concatenate([prior_rows, *others])
+            design = equations[:, :-1][:, free]
+            residual = equations[:, -1]
+            values_without.append(after_one_step(values, design, residual, free=free))
+        return values_without
 
 
 def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution) -> np.ndarray:
     """
-    Return the triangular factor of ``[columns | residual]``.
+    Return the triangular factor of ``[design | residual]`` of the windows of some blocks.
 
-    It covers all windows of some blocks, weighed by noise.
+    The rows are in units of their noise; shape (at most n_params + 1, n_params + 1).
     """
     n_params = len(solution.values)
     rows = []
@@ -362,27 +381,32 @@ Most samples kept of a live session; a diagnosis needs about 1.5 kB of memory fo
 
 class DecimatedWindows:
     """
-    Every so many-th window of each kind, so that memory and the time of a search are bounded.
+    Every k-th window of each kind, so that memory and the time of a search are bounded.
 
-    The selection depends only on the recording. Above `most` samples every second window of each
-    kind is removed.
+    The selection depends only on the recording: k is doubled whenever there are more than
+    `max_samples` samples.
     """
 
-    def __init__(self, most: int = MAX_KEPT_SAMPLES) -> None:
-        self.most = most
+    def __init__(self, max_samples: int = MAX_KEPT_SAMPLES) -> None:
+        self.max_samples = max_samples
         self.n_samples = 0
+        """Samples of the kept windows."""
         self._stride = 1
-        self._counts = {}
-        self._kept = []
+        """The number k."""
+        self._last_numbers: dict[str, int] = {}
+        """Kind -> number of its last window, from 0."""
+        self._kept: list[tuple[int, Window]] = []
+        """(number among the windows of its kind, window) of each kept window."""
 
     def add(self, window: Window) -> None:
-        """Add a window in order of time, as a copy in separate memory (`owned_window`)."""
-        number = self._counts[window.kind] = self._counts.get(window.kind, -1) + 1
+        """Add the next window in order of time, in separate memory (`owned_window`)."""
+        number = self._last_numbers.get(window.kind, -1) + 1
+        self._last_numbers[window.kind] = number
         if number % self._stride:
             return
         self._kept.append((number, window))
         self.n_samples += len(window.time)
-        while self.n_samples > self.most and len(self._kept) > 1:
+        while self.n_samples > self.max_samples and len(self._kept) > 1:
             self._stride *= 2
             self._kept = [
                 (number, window) for number, window in self._kept if number % self._stride == 0
@@ -392,7 +416,8 @@ class DecimatedWindows:
     def copy(self) -> 'DecimatedWindows':
         """Return an independent copy; the windows are shared."""
         twin = copy(self)
-        twin._counts, twin._kept = dict(self._counts), list(self._kept)
+        twin._last_numbers = dict(self._last_numbers)
+        twin._kept = list(self._kept)
         return twin
 
     @property
@@ -403,7 +428,7 @@ class DecimatedWindows:
 
 KEPT_SAMPLES = 200_000
 """Samples of moving windows kept for plots and for the autocorrelation of residuals."""
-MOST_ASKED = 4
+MAX_SEARCHED = 4
 """Most recordings with windows kept for the search of effects."""
 KEPT_POSES = 2000
 """Most static windows with kept joint positions."""
@@ -411,18 +436,18 @@ KEPT_POSES = 2000
 
 @dataclass(eq=False)
 class SessionData(GatheredData):
-    """Reduced data of a recording on a table."""
+    """Reduced windows of one or more recordings on a table."""
 
     accumulator: Accumulator = field(default_factory=Accumulator)
-    """The least-squares system."""
+    """Statistics of all windows, from which parameters are estimated."""
     held_out: HeldOut = field(default_factory=HeldOut)
-    """The same windows in folds for cross-validation."""
+    """The same windows in blocks for cross-validation."""
     spreads: list[DecimatedWindows] = field(default_factory=lambda: [DecimatedWindows()])
     """
-    Windows for the search of effects, of each of the recordings with most samples, the largest
-    first; empty without a search.
+    Windows for the search of effects: one item for each of the `MAX_SEARCHED` recordings with most
+    samples, the largest first; without windows where there is no search.
     """
-    poses: list = field(default_factory=list)
+    poses: list[tuple[float, int, np.ndarray]] = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
@@ -432,14 +457,16 @@ class SessionData(GatheredData):
         self.accumulator.add(window)
         self.held_out.add(window, window.time >= self.judged_from)
 
-    def anew(self, windows: Iterable[WindowStatistics], judged_from: float = 0.0) -> 'SessionData':
-        """Return the same with the windows reduced again."""
-        fresh = replace(
+    def with_windows(
+        self, windows: Iterable[WindowStatistics], judged_from: float = 0.0
+    ) -> 'SessionData':
+        """Return these data with other statistics of the same windows."""
+        gathered = replace(
             self, accumulator=Accumulator(), held_out=HeldOut(), judged_from=judged_from
         )
         for window in windows:
-            fresh.take(window)
-        return fresh
+            gathered.take(window)
+        return gathered
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -448,53 +475,59 @@ class SessionData(GatheredData):
         return tuple(sensor for sensor in SENSORS if rows and sensor not in rows[0].sensors)
 
     @property
-    def moving(self) -> list:
+    def moving(self) -> list[Window]:
         """
-        Moving windows with all their kept samples; live, the windows of the search of effects.
+        Moving windows with their samples: the kept ones, or else those for the search of effects.
         """
+        if self.kept:
+            return self.kept
         windows = chain.from_iterable(spread.windows for spread in self.spreads)
-        return self.kept or [window for window in windows if window.kind != 'static']
+        return [window for window in windows if window.kind != 'static']
 
 
 def merge(parts: Iterable[SessionData]) -> SessionData:
-    """Merge the reduced data of several recordings: the merge step of calibration."""
+    """Return the first of several recordings, to which the data of the others are added."""
     parts = list(parts)
     total = parts[0]
     for part in parts[1:]:
         total.accumulator.merge(part.accumulator)
         total.held_out.merge(part.held_out)
-        windows = total.kept + part.kept  # up to KEPT_SAMPLES samples
+        total.poses = total.poses + part.poses
+
+        # The first windows, up to KEPT_SAMPLES samples.
+        windows = total.kept + part.kept
         ends = np.cumsum([len(window.time) for window in windows])
-        total.kept, total.poses = (
-            windows[: int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))],
-            total.poses + part.poses,
-        )
-        total.spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)[
-            :MOST_ASKED
-        ]
-        total.counts = {
-            key: total.counts.get(key, 0) + part.counts.get(key, 0)
-            for key in {**total.counts, **part.counts}
-        }
+        total.kept = windows[: int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))]
+
+        spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)
+        total.spreads = spreads[:MAX_SEARCHED]
+        counts = dict(total.counts)
+        for key, count in part.counts.items():
+            counts[key] = counts.get(key, 0) + count
+        total.counts = counts
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)
         total.frame_id = total.frame_id or part.frame_id
         total.findings += part.findings
         total.unusable = {**part.unusable, **total.unusable}
-        ranges = [r for r in (total.temperature_c, part.temperature_c) if r]
-        total.temperature_c = (
-            (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else None
-        )
+        total.temperature_c = _joint_range(total.temperature_c, part.temperature_c)
+
+        # The duration is the sum of the durations.
         if part.first_stamp_ns is not None and part.last_stamp_ns is not None:
-            total.first_stamp_ns = (
-                part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
-            )
-            total.last_stamp_ns = (
-                (total.last_stamp_ns or total.first_stamp_ns)
-                + part.last_stamp_ns
-                - part.first_stamp_ns
-            )
+            if total.first_stamp_ns is None:
+                total.first_stamp_ns = part.first_stamp_ns
+            end_ns = total.last_stamp_ns or total.first_stamp_ns
+            total.last_stamp_ns = end_ns + part.last_stamp_ns - part.first_stamp_ns
     return total
+
+
+def _joint_range(
+    first: tuple[float, float] | None, second: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    """Return the smallest and the largest value of two ranges, one or both of which may be None."""
+    if not first or not second:
+        return first or second
+    return min(first[0], second[0]), max(first[1], second[1])
 
 
 @contextmanager
@@ -544,6 +577,7 @@ def join(
 def _require_like_the_first(
     first: SessionData, part: SessionData, first_name: str, name: str
 ) -> None:
+    """Raise an InputError unless a recording has windows, and sensors and frame of the first."""
     if not part.accumulator.rows:
         raise InputError(
             f'{name}: every recording must contain a static window, spin or dynamic segment, this'

@@ -149,7 +149,7 @@ class RecordingReadOnce(TableRecordings):
         """Return the windows of the recording, reduced with the columns of a model."""
         if self.first_pass and self.windows.is_complete:
             used = (reduce_window(window, step.model, step.table) for window in self.windows.used())
-            return [self.first_pass[0].anew(used, step.judged_from)]
+            return [self.first_pass[0].with_windows(used, step.judged_from)]
         self.windows.clear()
         self.first_pass.clear()
         (source,) = self.sources
