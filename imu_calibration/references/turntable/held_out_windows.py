@@ -2,9 +2,9 @@
 Held-out windows on a table: errors of short pieces, and plain fits of them.
 
 The error of a piece is its mean reading, corrected as compensation corrects it, minus the
-reference, before with nominal parameters and after with the calibration. The position of the
-table's reference point and the delay of the readings, which compensation does not correct, are
-estimated for each side: so a wrong scale that compensates for a lag is visible.
+reference. It is computed with nominal parameters (before) and with the calibration (after). The
+position of the sensor on the table and the delay of the readings, which compensation does not
+correct, are estimated for both: so a wrong scale that compensates for a lag is visible.
 """
 
 from collections.abc import Iterator, Sequence
@@ -52,11 +52,11 @@ MAX_SEARCHED_DELAY = 0.1
 @dataclass(frozen=True, eq=False)
 class HeldOutWindows(HeldOutData[Solution]):
     """
-    Windows in folds.
+    Windows in folds, each predicted with parameters that were estimated without it.
 
-    The correction is linearised at the reference motion, ``true + matrix^-1 (measured -
-    output(true))``, which the statistics of windows allow; it differs from that of readings by the
-    square of the errors.
+    The correction is linearised at the reference motion, ``corrected = true + matrix^-1 (measured -
+    output(true))``, because statistics of windows suffice for it. It differs from the correction
+    of single readings by the square of the errors.
     """
 
     windows: HeldOut
@@ -78,17 +78,17 @@ class HeldOutWindows(HeldOutData[Solution]):
 
     @cached_property
     def _nominal_sensors(self) -> np.ndarray:
-        """The same with the table and the clock as estimated."""
+        """Nominal parameters of the sensors, with the table and the clock as estimated."""
         return with_reference(self.solution.model, self._nominal, self.solution.values)
 
     @cached_property
     def judged(self) -> dict[str, JudgedData]:
-        """Sensor -> its pieces."""
-        found = judged_pieces(self.windows)
+        """Sensor -> numbers of its pieces."""
+        judged = judged_pieces(self.windows)
         accumulators = [block.accumulator for block in self.windows.blocks]
-        if 'accelerometer' in found and one_attitude(accumulators, self.solution.model):
-            found['accelerometer'] = replace(found['accelerometer'], one_attitude=True)
-        return found
+        if 'accelerometer' in judged and one_attitude(accumulators, self.solution.model):
+            judged['accelerometer'] = replace(judged['accelerometer'], one_attitude=True)
+        return judged
 
     def errors(self, sensor: str, folds: Sequence[np.ndarray]) -> HeldOutErrors:
         """Return the errors of the pieces of a sensor."""
@@ -159,40 +159,48 @@ def prove_readings(
     before: HeldOut, after: HeldOut, model: SensorModel, *, reference: np.ndarray
 ) -> Proof:
     """
-    Return the proof of corrected readings `after` and raw readings `before`.
+    Return the errors of raw and of corrected readings in the same windows, with their ratio.
 
-    With the columns of `model`: bias, matrix, reference.
+    Parameters
+    ----------
+    before, after : HeldOut
+        The windows with raw and with corrected readings.
+    model : SensorModel
+        The model of their columns: bias, matrix, reference.
+    reference : array, shape (n_params,)
+        Parameters of which those of the table and the clock are used.
 
-    `reference` has the parameters of the table and the clock, shape (n_params,).
     """
     nominal = nominal_values(model)
     # Each side may be compared with the table as it was estimated or as it was described.
     candidates = (nominal, with_reference(model, nominal, reference))
     proof: dict[str, ProofEntry] = {}
     for sensor, judged in judged_pieces(before).items():
-        raw = smallest(errors_of(before, model, sensor, folds=[each]) for each in candidates)
-        corrected = smallest(errors_of(after, model, sensor, folds=[each]) for each in candidates)
+        raw = smallest(errors_of(before, model, sensor, folds=[values]) for values in candidates)
+        corrected = smallest(
+            errors_of(after, model, sensor, folds=[values]) for values in candidates
+        )
         proof[sensor] = proof_entry(judged, raw, corrected)
     return proof
 
 
 def judged_pieces(windows: HeldOut) -> dict[str, JudgedData]:
-    """Return sensor -> the pieces of its windows; none with too few blocks."""
+    """Return sensor -> numbers of its pieces by block and regime; empty with too few blocks."""
     regimes = _regimes_of(windows)
     counts = np.array([[block.counts.get(name, 0) for name in regimes] for block in windows.blocks])
     if (counts.sum(axis=1) > 0).sum() < MIN_REGIME_BLOCKS:
         return {}
-    found = {}
+    judged = {}
     for sensor in windows.sensors:
-        found[sensor] = JudgedData(
+        judged[sensor] = JudgedData(
             counts,
             UNITS[sensor],
-            windows.n_judged,
-            N_AXES,
+            windows=windows.n_judged,
+            components=N_AXES,
             regimes=tuple(regimes),
             piece_time=PIECE_TIME,
         )
-    return found
+    return judged
 
 
 def _regimes_of(windows: HeldOut) -> list[Regime]:
@@ -201,16 +209,16 @@ def _regimes_of(windows: HeldOut) -> list[Regime]:
 
 
 def nominal_values(model: SensorModel) -> np.ndarray:
-    """Return the parameters of a sensor as its data sheet has it on a table as described."""
+    """Return the prior means of the parameters, 0 where there is none, shape (n_params,)."""
     values = model.prior()[0]
     return np.where(np.isfinite(values), values, 0.0)
 
 
 def reference_model(calibration: Calibration, table: Table) -> SensorModel:
     """
-    Return the model of a recording of corrected readings.
+    Return the model of a recording with corrected readings.
 
-    Bias, matrix, and the effects of the table and the clock that are known.
+    It has bias, matrix, and the effects of the table and the clock that the calibration has.
     """
     known = calibration.model
     same_joints = known.joint_names == table.joint_names
@@ -236,7 +244,7 @@ def reference_model(calibration: Calibration, table: Table) -> SensorModel:
 
 def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray:
     """
-    Return nominal values of the sensors with those of a calibration for the table and the clock.
+    Return nominal values of the sensors, and those of a calibration for the table and the clock.
 
     Shape (n_params,).
     """
@@ -246,7 +254,9 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
 
 def with_reference(model: SensorModel, values: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
-    Return the values with the table and the clock of other values `reference`, shape (n_params,).
+    Return `values` with the parameters of the table and the clock from `reference`.
+
+    All three have the shape (n_params,).
     """
     return np.where(model.mask(is_of_reference), reference, values)
 
@@ -259,13 +269,14 @@ def errors_of(
     folds: Sequence[np.ndarray],
 ) -> HeldOutErrors:
     """
-    Return the errors of parameters (one set for each fold in turn).
+    Return the errors of the pieces of a sensor, corrected with parameters of each fold.
 
-    With the delay and the common arm that suit them best.
+    Block k is corrected with ``folds[k % len(folds)]``. The nuisances, a delay and an arm common to
+    all pieces, are those with the smallest errors.
     """
     regimes = _regimes_of(held_out)
     corrections = [_Correction(model, sensor, values) for values in folds]
-    places: list[tuple[int, int]] = []
+    places: list[tuple[int, int]] = []  # (block, index of the regime) of each item of `stacks`
     stacks: list[np.ndarray] = []
     for k, block in enumerate(held_out.blocks):
         for (name, regime), rows in block.pieces.items():
@@ -273,7 +284,6 @@ def errors_of(
                 places.append((k, regimes.index(Regime(regime))))
                 stacks.append(corrections[k % len(folds)].errors(rows))
 
-    # error + sum(nuisance change), with the same nuisances for all pieces.
     nuisances, without_delay = _nuisances(np.concatenate(stacks, axis=1))
     squares = np.zeros((len(held_out.blocks), len(regimes)))
     for place, (error, *changes) in zip(places, stacks, strict=True):
@@ -284,52 +294,64 @@ def errors_of(
 
 def _nuisances(stacked: np.ndarray) -> tuple[np.ndarray, float]:
     """
-    Return the nuisances that minimise ``error + sum(nuisance change)``.
+    Return the nuisances n with the smallest ``|error + sum_j n_j change_j|^2``.
 
-    The delay is the first nuisance. The sum of squares without a delay is returned as well.
+    The second result is the smallest sum of squares without a delay.
+
+    Parameters
+    ----------
+    stacked : array, shape (1 + n_nuisances, k, 3)
+        Error, then its change with each nuisance; the first nuisance is the delay.
+
     """
     error = stacked[0].ravel()
     changes = stacked[1:].reshape(len(stacked) - 1, -1)
-    best = np.linalg.lstsq(changes.T, -error, rcond=1e-9)[0]
-    others = changes[1:]
-    rest = np.linalg.lstsq(others.T, -error, rcond=1e-9)[0] if len(others) else np.zeros(0)
-    without = error + rest @ others
-    best[0] = np.clip(best[0], -MAX_SEARCHED_DELAY, MAX_SEARCHED_DELAY)
-    return best, float(without @ without)
+    nuisances = np.linalg.lstsq(changes.T, -error, rcond=1e-9)[0]
+    arm_changes = changes[1:]
+    arm = np.zeros(0)
+    if len(arm_changes):
+        arm = np.linalg.lstsq(arm_changes.T, -error, rcond=1e-9)[0]
+    without_delay = error + arm @ arm_changes
+    nuisances[0] = np.clip(nuisances[0], -MAX_SEARCHED_DELAY, MAX_SEARCHED_DELAY)
+    return nuisances, float(without_delay @ without_delay)
 
 
 class _Correction:
-    """
-    How rows of columns and outputs become errors of corrected readings.
-
-    The rows are ``[columns | d(true input)/dt | output]``. How nuisances change these errors is
-    included.
-    """
+    """Errors of the corrected readings of one sensor, with one set of parameters."""
 
     def __init__(self, model: SensorModel, sensor: str, values: np.ndarray):
-        total = coefficients(model, sensor, values)
+        self.coefficients = coefficients(model, sensor, values)
+        """Of the columns, shape (n_columns, 3): ``output = columns @ coefficients``."""
         self.matrix = model.matrix(sensor, values)
         self.inverse = np.linalg.inv(self.matrix)
-        self.total = total
         arm = model.part(sensor, Role.ARM)
-        self.arms = _slopes(model, sensor, values, range(arm.start, arm.stop))
+        self.arm_slopes = _slopes(model, sensor, values, range(arm.start, arm.stop))
+        """Derivative of the coefficients by each component of the arm."""
 
     def errors(self, rows: np.ndarray) -> np.ndarray:
         """
-        Return errors and their change with each nuisance, (1 + n_nuisances, k, 3).
+        Return errors of corrected readings and their change with each nuisance.
 
-        The delay, s, and the arm, m.
+        Parameters
+        ----------
+        rows : array, shape (k, n_columns + 6)
+            ``[columns | d(true input)/dt | output]``.
+
+        Returns
+        -------
+        array, shape (1 + n_nuisances, k, 3)
+            ``matrix^-1 (output - columns @ coefficients)``, its change per s of delay, and per m
+            of each component of the arm.
+
         """
         columns = rows[:, : -2 * N_AXES]
         slope = rows[:, -2 * N_AXES : -N_AXES]
         output = rows[:, -N_AXES:]
         # measured(t) = matrix @ true(t - delay): the error is the delay times the slope.
-        parts = [
-            output - columns @ self.total,
-            slope @ self.matrix.T,
-            *(-columns @ arm for arm in self.arms),
-        ]
-        return np.stack(parts) @ self.inverse.T
+        error_and_changes = [output - columns @ self.coefficients, slope @ self.matrix.T]
+        for arm_slope in self.arm_slopes:
+            error_and_changes.append(-columns @ arm_slope)
+        return np.stack(error_and_changes) @ self.inverse.T
 
 
 def _slopes(
@@ -339,7 +361,11 @@ def _slopes(
     places: Sequence[int] | np.ndarray,
     steps: np.ndarray | float = 1.0,
 ) -> list[np.ndarray]:
-    """Return the change of the coefficients of a sensor with a step of each of some parameters."""
+    """
+    Return the change of the coefficients of a sensor with a step of each parameter in turn.
+
+    `places`: indices of the parameters. Each change has the shape (n_columns, 3).
+    """
     total = coefficients(model, sensor, values)
     slopes = []
     for place, step in zip(places, np.broadcast_to(steps, len(places)), strict=True):
@@ -359,19 +385,19 @@ def _linearised(
     steps: np.ndarray | float = 1.0,
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """
-    Return the equations ``output - columns @ coefficients(values) = design @ change`` of groups.
+    Return the equations of groups, ``output - columns @ coefficients(values) = design @ change``.
 
     Parameters
     ----------
     groups : sequence of array
         Rows that begin with the columns and end with the output, shape (m, n_columns + 3 or more).
     places, steps : array, shape (n,)
-        Parameters that change, and the unit of each change.
+        Indices of the parameters that change, and the unit of each change.
 
     Returns
     -------
     tuple
-        Of each group the design, shape (3 m, n), and the left side, shape (3 m,).
+        The design of each group, shape (3 m, n), and the left side of each, shape (3 m,).
 
     """
     total = coefficients(model, sensor, values)
@@ -387,20 +413,24 @@ def _linearised(
 
 
 def _groups_by_regime(held_out: HeldOut, sensor: str) -> list[np.ndarray]:
-    """Return ``[columns | output]`` of the pieces of each regime of motion, as factors."""
+    """Return the triangular factor of ``[columns | output]`` of the pieces of each regime."""
     stacked: dict[tuple[str, str], np.ndarray] = {}
     for block in held_out.blocks:
-        for kept in (block.pieces, block.earlier):
-            for (name, regime), part in kept.items():
+        for factors in (block.pieces, block.earlier):
+            for (name, regime), factor in factors.items():
                 if name == sensor:
                     # without the derivative of the true input
-                    rows = np.delete(part, np.s_[-2 * N_AXES : -N_AXES], axis=1)
+                    rows = np.delete(factor, np.s_[-2 * N_AXES : -N_AXES], axis=1)
                     stack(stacked, (name, regime), rows)
     return list(stacked.values())
 
 
 def _groups_by_time(held_out: HeldOut, sensor: str) -> list[np.ndarray]:
-    """Return ``[columns | output]`` of the window means of each part of a session, as factors."""
+    """
+    Return the triangular factor of ``[columns | output]`` of each part of a session.
+
+    Its rows are the window means, weighted by their numbers of pieces.
+    """
     windows = [row for block in held_out.blocks for row in block.accumulator.rows]
     end = max((row.time for row in windows), default=0.0)
     stacked: dict[tuple[str, str], np.ndarray] = {}
@@ -423,29 +453,44 @@ def _error_on_groups(
     n_pieces: int = 1,
 ) -> float:
     """
-    Return the root of the sum of squared errors on groups, each predicted from the remaining ones.
+    Return the root of the sum of squared errors of the groups, each predicted from the others.
 
-    One step from `values`, with parameters as compensation applies them where there is a `centre`.
-    `n_pieces`: number of pieces that the factors stand for, for the weight of the prior.
+    Parameters
+    ----------
+    groups : sequence of array
+        Triangular factor of ``[columns | output]`` of each group.
+    model, sensor
+        The columns.
+    values : array, shape (n_params,)
+        Start of the one step of least squares.
+    free : array, shape (n_params,)
+        True for the parameters that are estimated.
+    centre : Centre, optional
+        With it the parameters are used as compensation applies them.
+    prior : Prior, optional
+        Of the parameters; default: none.
+    n_pieces : int
+        Number of pieces in all groups, for the weight of the prior.
+
     """
     # Changes in standard deviations of the prior: the coefficients are linear over them.
     index = np.flatnonzero(free)
     sd = model.prior()[1][index]
     designs, targets = _linearised(groups, model, sensor, values, places=index, steps=sd)
 
-    # The prior has the weight of its information relative to the residual.
-    known = np.zeros((0, len(index)))
-    known_targets = np.zeros(0)
+    # The rows of the data have the residual as noise: those of the prior are scaled to it.
+    prior_design = np.zeros((0, len(index)))
+    prior_target = np.zeros(0)
     if prior is not None:
         residual_sd = np.sqrt(np.sum(np.concatenate(targets) ** 2) / (N_AXES * n_pieces))
-        known = residual_sd * prior.root[:, index] * sd
-        known_targets = residual_sd * (prior.root @ (prior.mean - values))
+        prior_design = residual_sd * prior.root[:, index] * sd
+        prior_target = residual_sd * (prior.root @ (prior.mean - values))
 
     squares = 0.0
-    for held, group in enumerate(groups):
-        others = [k for k in range(len(groups)) if k != held]
-        design = np.concatenate([known, *(designs[k] for k in others)])
-        target = np.concatenate([known_targets, *(targets[k] for k in others)])
+    for held_out, group in enumerate(groups):
+        others = [k for k in range(len(groups)) if k != held_out]
+        design = np.concatenate([prior_design, *(designs[k] for k in others)])
+        target = np.concatenate([prior_target, *(targets[k] for k in others)])
         fitted = values.copy()
         fitted[index] += sd * scaled_lstsq(design, target)
         if centre is not None:
@@ -464,9 +509,9 @@ class _Pieces(PlainEquations):
     """
 
     rows: list[np.ndarray]
-    """Derivatives by the fitted parameters of each block, shape (m, n_fitted)."""
+    """Of each block: derivatives by the fitted parameters, shape (m, n_fitted)."""
     targets: list[np.ndarray]
-    """Output minus prediction at the start of each block, shape (m,)."""
+    """Of each block: output minus the output predicted with the start values, shape (m,)."""
 
     @classmethod
     def of(
@@ -477,14 +522,14 @@ class _Pieces(PlainEquations):
         blocks = []
         for block in held_out.blocks:
             pieces = [np.zeros((0, width))]
-            for kept in (block.pieces, block.earlier):
-                pieces += [part for (name, _), part in kept.items() if name == sensor]
+            for factors in (block.pieces, block.earlier):
+                pieces += [factor for (name, _), factor in factors.items() if name == sensor]
             blocks.append(np.concatenate(pieces))
         places = np.flatnonzero(plan.fitted)
         return cls(plan, *_linearised(blocks, model, sensor, plan.values, places=places))
 
     def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        """Return the parameters that fit some of the blocks, from any values."""
+        """Return the parameters that fit the blocks of a mask; `values` do not matter."""
         blocks = np.flatnonzero(kept)
         design = np.concatenate([self.rows[k] for k in blocks])
         target = np.concatenate([self.targets[k] for k in blocks])

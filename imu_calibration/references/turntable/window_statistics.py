@@ -16,9 +16,14 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, joined_motion
 
 PIECE_TIME = 0.25
-"""Length of a piece, s: noise averages out, and a sweep of a table is still several pieces."""
-MAX_SLOW_RATE, MIN_FAST_RATE = 30.0 * DEG, 120.0 * DEG
-"""Rates between the regimes, rad/s."""
+"""
+Length of a piece for held-out evaluation, s: noise averages out, and a sweep of a table is still
+several pieces.
+"""
+MAX_SLOW_RATE = 30.0 * DEG
+"""Mean rate up to which a piece is in slow rotation, rad/s."""
+MIN_FAST_RATE = 120.0 * DEG
+"""Mean rate above which a piece is in fast rotation, rad/s."""
 ACCELERATING = 90.0 * DEG
 """Change of the rate per second from which on a piece counts as accelerating, rad/s^2."""
 N_AXES = 3
@@ -36,16 +41,17 @@ class Regime(StrEnum):
 
 def pieces_at_rest(mean: np.ndarray, duration: float) -> dict[str, np.ndarray]:
     """
-    Return {regime: rows} of a static window.
+    Return {regime: rows} of a static window: one row ``[columns | d(true input)/dt | output]``.
 
-    Its mean row ``[columns | output]``, weighed as so many pieces, and no change of input.
+    The mean row ``[columns | output]`` with a zero derivative, times the root of the number of
+    pieces that the window counts as.
     """
     row = np.concatenate([mean[:-N_AXES], np.zeros(N_AXES), mean[-N_AXES:]])
     return {Regime.REST: np.sqrt(count_pieces(duration)) * row[None]}
 
 
 def count_pieces(duration: float) -> int:
-    """Return as how many pieces a window of a length counts."""
+    """Return the number of pieces in a window with a duration in s, at least one."""
     return max(round(duration / PIECE_TIME), 1)
 
 
@@ -53,11 +59,10 @@ def moving_pieces(
     rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *, rate_s: np.ndarray
 ) -> dict[str, np.ndarray]:
     """
-    Return {regime: rows} of a moving window, a row for the mean over each piece.
+    Return {regime: rows} of a moving window, one row for each piece.
 
-    The rows are ``[columns | d(true input)/dt | output]``.
-
-    The mean derivative is the difference of the true input at both ends of the piece; it separates
+    A row is the mean over its piece of ``[columns | d(true input)/dt | output]``. The mean
+    derivative is the difference of the true input at both ends of the piece; it separates
     an unmodelled delay of the sensor from a wrong scale.
 
     Parameters
@@ -79,20 +84,26 @@ def moving_pieces(
     )
 
     rate = np.linalg.norm(np.add.reduceat(rate_s, edges[:-1], axis=0) / length, axis=1)
-    change = np.linalg.norm(_slope(rate_s, time, edges), axis=1)
+    acceleration = np.linalg.norm(_slope(rate_s, time, edges), axis=1)
     regimes = (Regime.SLOW, Regime.MEDIUM, Regime.FAST, Regime.ACCELERATING)
+    # Index into `regimes` of each piece: the first condition that holds, otherwise 0.
     number = np.select(
-        [change > ACCELERATING, rate > MIN_FAST_RATE, rate > MAX_SLOW_RATE], [3, 2, 1]
+        [acceleration > ACCELERATING, rate > MIN_FAST_RATE, rate > MAX_SLOW_RATE], [3, 2, 1]
     )
-    found: dict[str, np.ndarray] = {}
+    pieces_of: dict[str, np.ndarray] = {}
     for index, regime in enumerate(regimes):
         if np.any(number == index):
-            found[regime] = pieces[number == index]
-    return found
+            pieces_of[regime] = pieces[number == index]
+    return pieces_of
 
 
 def _slope(values: np.ndarray, time: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return the mean derivative over each piece, from edge to edge."""
+    """
+    Return the mean derivative over each piece, shape (n_pieces, 3).
+
+    The difference of the values at both ends of a piece over the time between them. The value at
+    an inner edge is the mean of the samples before and after it, half a period from both.
+    """
     period = (time[-1] - time[0]) / max(len(time) - 1, 1)
     inner = edges[1:-1]
     at_edges = np.concatenate([values[:1], 0.5 * (values[inner - 1] + values[inner]), values[-1:]])
@@ -106,17 +117,18 @@ Length of the pieces whose means separate correlated misfit from white noise, s:
 filters, shorter than motions.
 """
 BATCHES = 16
-"""Pieces of a window at rest whose means determine the noise at low frequency."""
+"""Equal pieces of a window at rest, the scatter of whose means is the noise at low frequency."""
 BATCH_DOF = 2 * (BATCHES - 1) ** 2 / (3 * BATCHES - 4)
-"""Degrees of freedom of that estimate: differences of neighbours are correlated (von Neumann)."""
+"""
+Degrees of freedom of the variance from differences of neighbouring means, which are correlated
+(von Neumann).
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorStatistics:
     """
-    The rows ``[columns | output]`` of one sensor in one window.
-
-    They are split into mean row and centred rows.
+    The rows ``[columns | output]`` of one sensor in one window, as mean row and centred rows.
 
     The mean row has a random offset of the window (of its bias) in addition to the averaged noise;
     the centred rows have none. With separate weights, the two are an exact summary for the model
@@ -131,26 +143,26 @@ class SensorStatistics:
     """
     noise_variance: np.ndarray
     """
-    Variance of the output about its mean in static windows, at least that of rounding; in others
-    that of rounding; shape (3,).
+    Variance of the output, shape (3,): in static windows about its mean, at least that of rounding;
+    in moving windows that of rounding only.
     """
     inflation: np.ndarray
     """
-    Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not
-    static.
+    Variance of the means of equal pieces over that of white noise (`batch_statistics`), shape (3,);
+    NaN for a moving window.
     """
     slow: np.ndarray | None = None
     """
-    Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; for
-    the test of correlated misfit.
+    Triangular factor of the means of the centred rows over pieces of SLOW_TIME, times the root of
+    their number of samples, for the test of correlated misfit; None for a static window.
     """
     slow_rows: int = 0
-    """Number of these pieces."""
+    """Number of pieces in `slow`."""
 
 
 @dataclass(frozen=True, eq=False)
 class WindowStatistics:
-    """Reduced window for both sensors."""
+    """Statistics of one window for both sensors."""
 
     kind: str
     """'static', 'spin' or 'dynamic'."""
@@ -165,16 +177,16 @@ class WindowStatistics:
     session: int = 0
     """Recording of the window."""
     encoder_step: float = 0.0
-    """Largest step of the encoders that shows in the readings, rad; 0 where none does."""
+    """Largest step of the encoders that is seen in the readings, rad; 0: none."""
     pieces: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     """
-    Sensor -> regime -> rows ``[columns | d(true input)/dt | output]`` of short pieces, where a
-    proof is wanted (see `pieces`).
+    Sensor -> regime -> rows ``[columns | d(true input)/dt | output]`` of short pieces, for
+    held-out evaluation; empty without it.
     """
 
 
 def references_of(windows: Sequence[Window], model: SensorModel, table: Table) -> References:
-    """Return the motion of all windows in one piece, as the sensors of a model felt it."""
+    """Return the reference motion of both sensors at the samples of all windows, joined."""
     motion, temperature = joined_motion(windows)
     return References(model, table, motion, temperature_c=temperature)
 
@@ -211,8 +223,8 @@ def reduce_windows(
     edges = np.cumsum([0] + [len(window.motion) for window in windows])
     reduced = []
     for window, first, last in zip(windows, edges, edges[1:]):
-        own = {sensor: design[first:last] for sensor, design in designs.items()}
-        reduced.append(_reduced(window, own, session))
+        of_window = {sensor: design[first:last] for sensor, design in designs.items()}
+        reduced.append(_reduced(window, of_window, session))
     return reduced
 
 
@@ -221,12 +233,9 @@ def reduce_window(
 ) -> WindowStatistics:
     """Reduce one window to its statistics, with the short pieces for held-out evaluation."""
     references = references_of([window], model, table)
-    return _reduced(
-        window,
-        {s: columns(references, s) for s in SENSORS},
-        session,
-        {s: model.columns_of(s, Role.LINEAR) for s in SENSORS},
-    )
+    designs = {sensor: columns(references, sensor) for sensor in SENSORS}
+    inputs = {sensor: model.columns_of(sensor, Role.LINEAR) for sensor in SENSORS}
+    return _reduced(window, designs, session, inputs)
 
 
 def _reduced(
@@ -274,14 +283,14 @@ def _reduced(
             )
     step = 0.0 if window.joint_step is None else float(np.max(window.joint_step, initial=0.0))
     return WindowStatistics(
-        window.kind,
-        float(window.time.mean()),
-        duration,
-        len(window.time),
-        sensors,
-        session,
-        step,
-        pieces,
+        kind=window.kind,
+        time=float(window.time.mean()),
+        duration=duration,
+        count=len(window.time),
+        sensors=sensors,
+        session=session,
+        encoder_step=step,
+        pieces=pieces,
     )
 
 
@@ -290,7 +299,10 @@ def _reduce_static(design: np.ndarray, output: np.ndarray) -> SensorStatistics:
     mean = np.concatenate([design.mean(axis=0), output.mean(axis=0)])
     variance, inflation = batch_statistics(output)
     return SensorStatistics(
-        mean, np.zeros((0, len(mean))), np.maximum(variance, rounding_variance(output)), inflation
+        mean,
+        within=np.zeros((0, len(mean))),
+        noise_variance=np.maximum(variance, rounding_variance(output)),
+        inflation=inflation,
     )
 
 
@@ -302,7 +314,7 @@ def _reduce_moving(design: np.ndarray, output: np.ndarray, length: int) -> Senso
     slow = slow_part(rows, length)
     return SensorStatistics(
         mean,
-        triangular(rows),
+        within=triangular(rows),
         noise_variance=rounding_variance(output),
         inflation=np.full(N_AXES, np.nan),
         slow=triangular(slow),
@@ -315,29 +327,32 @@ def _piece_length(window: Window) -> int:
     if window.kind == 'static':
         return 0
     span = window.time[-1] - window.time[0]
-    return max(int(round(SLOW_TIME * (len(window.time) - 1) / span)), 1) if span > 0 else 1
+    if span <= 0:
+        return 1
+    return max(int(round(SLOW_TIME * (len(window.time) - 1) / span)), 1)
 
 
 def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
     """
-    Return the means of pieces of `length` rows times the root of their length.
+    Return the means of pieces of `length` rows times the root of `length`.
 
-    There are none when a piece is a single row.
+    They have the variance of single rows if the rows are white. Shape (n_pieces, n_columns); no
+    rows when a piece is a single row.
     """
-    pieces = len(rows) // length if length > 1 else 0
-    if not pieces:
+    n_pieces = len(rows) // length if length > 1 else 0
+    if not n_pieces:
         return rows[:0]
-    return rows[: pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(length)
+    return rows[: n_pieces * length].reshape(n_pieces, length, -1).sum(axis=1) / np.sqrt(length)
 
 
 def batch_statistics(output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the variance of each column and the excess scatter of its means.
+    Return (variance of each column, inflation of the variance of its means), each shape (m,).
 
-    The excess is the factor by which means of the column scatter more than white noise.
-
-    The factor is the variance of the means of `BATCHES` equal pieces, times their length, over the
-    sample variance: a sensor's low-pass filter makes it larger than one. Pieces exclude slow drift.
+    The means m_k of `BATCHES` pieces of n samples of white noise with variance s² have the variance
+    s² / n. The inflation is ``var(m) n / s²``, with var(m) from the differences of neighbouring
+    means, which excludes slow drift: ``var(m) = var(m_k - m_(k-1)) / 2``. The low-pass filter of a
+    sensor makes it larger than one.
     """
     variance = output.var(axis=0, ddof=1)
     length = len(output) // BATCHES

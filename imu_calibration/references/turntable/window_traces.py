@@ -1,7 +1,7 @@
 """Measurement on a table against the simulation of two models, for plots."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,35 +72,37 @@ def residual_traces(
         Extended model.
 
     """
+    # A single model is predicted once: the items 0 and -1 are then the same.
     models = [before] if after is before else [before, after]
     sensors = tuple(before.noise)
     sums = DistanceSums()
-    spans: list[tuple[float, float]] = []
-    parts: list[ResidualBlocks] = []
+    spans: list[tuple[float, float]] = []  # first and last time of every window
+    blocks_of_groups: list[ResidualBlocks] = []
     for group in chunks(_used(windows, spans)):
-        of_models = [residuals(group, table, each.model, values=each.values) for each in models]
-        old = of_models[0]
-        new = of_models[-1]
+        residuals_of_models = [
+            residuals(group, table, model.model, values=model.values) for model in models
+        ]
+        old = residuals_of_models[0]
+        new = residuals_of_models[-1]
         for window, stop in zip(group, np.cumsum([len(window) for window in group])):
             rows = slice(stop - len(window), stop)
             old_rows = {sensor: residual[rows] for sensor, residual in old.items()}
             new_rows = {sensor: residual[rows] for sensor, residual in new.items()}
             sums.add(window, [old_rows, new_rows], before.noise)
-        parts.append(_blocks_of(group, table, before, old, new))
+        blocks_of_groups.append(_blocks_of(group, table, before, old, new))
 
-    blocks = _joined(parts)
+    blocks = _joined(blocks_of_groups)
+    recording = _Recording(windows, spans, table, models)
     segments = {}
     for sensor in sensors:
         segments[sensor] = []
         for axis in range(3):
-            start, stop = _largest(blocks.time, blocks.before[sensor][:, axis])
-            segments[sensor].append(
-                _segment(windows, spans, table, models, sensor, axis, start, stop)
-            )
+            start, stop = _segment_of_largest(blocks.time, blocks.before[sensor][:, axis])
+            segments[sensor].append(recording.overlay(sensor, axis, start, stop))
     with_both = len(sensors) == len(SENSORS)
     return Traces(
         **vars(blocks),
-        dead_reckoning=_dead_reckoning(windows, spans, table, models) if with_both else None,
+        dead_reckoning=_dead_reckoning(recording) if with_both else None,
         segments=segments,
         distances=sums.distances(),
     )
@@ -114,12 +116,19 @@ def _blocks_of(
     after: Mapping[str, np.ndarray],
 ) -> ResidualBlocks:
     """
-    Return the means over the blocks of windows.
+    Return means of the reference and of residuals over blocks of `PLOT_BLOCK_SECONDS`.
 
-    The reference is at the values of a model; `before`, `after`: sensor -> residuals at all
-    samples, shape (n, 3).
+    Parameters
+    ----------
+    windows : sequence of Window
+    table : Table
+    model : Solution
+        The reference is at its values.
+    before, after : mapping
+        Sensor -> residuals at the samples of all windows, shape (n, 3).
+
     """
-    starts = _starts(windows)
+    starts = _block_starts(windows)
     lengths = [len(window) for window in windows]
     motion, temperature, rows = all_samples(windows)
     reference = _references(model, table, motion, temperature)
@@ -140,7 +149,7 @@ def _blocks_of(
 
 
 def _joined(parts: Sequence[ResidualBlocks]) -> ResidualBlocks:
-    """Return the blocks of all parts; the temperature is known only if each part has it."""
+    """Return all blocks in one object; with temperatures only if each part has them."""
     temperatures = [part.temperature_c for part in parts if part.temperature_c is not None]
     before, after = {}, {}
     for sensor in parts[0].before:
@@ -163,7 +172,9 @@ def _used(
     windows: Sequence[Window] | StoredWindows, spans: list[tuple[float, float]]
 ) -> Iterator[Window]:
     """
-    Yield the windows that are not unused, and append (first, last) time of every window to `spans`.
+    Yield the windows that are not unused.
+
+    The (first, last) time of every window, s, is appended to `spans`.
     """
     for number in range(len(windows)):
         window = windows[number]
@@ -172,11 +183,12 @@ def _used(
             yield window
 
 
-def _largest(time: np.ndarray, residual: np.ndarray) -> tuple[float, float]:
+def _segment_of_largest(time: np.ndarray, residual: np.ndarray) -> tuple[float, float]:
     """
-    Return start and end of the segment with the largest residual.
+    Return start and end of the segment with the largest sum of squared residuals, s.
 
-    The segment has `SEGMENT` seconds and the largest sum of squares of a residual.
+    Among the segments of `SEGMENT` seconds that begin at a block; `time`, `residual`: of the
+    blocks, shape (n,).
     """
     sums = np.concatenate([[0.0], np.cumsum(residual**2)])
     stop = np.searchsorted(time, time + SEGMENT)
@@ -184,35 +196,41 @@ def _largest(time: np.ndarray, residual: np.ndarray) -> tuple[float, float]:
     return time[first] - PLOT_BLOCK_SECONDS, time[first] + SEGMENT
 
 
-def _segment(
-    windows: Sequence[Window] | StoredWindows,
-    spans: Sequence[tuple[float, float]],
-    table: Table,
-    models: Sequence[Solution | Calibration],
-    sensor: str,
-    axis: int,
-    start: float,
-    stop: float,
-) -> OverlaySegment:
-    inside = [
-        windows[k] for k, (first, last) in enumerate(spans) if last >= start and first <= stop
-    ]
-    time = np.concatenate([window.time for window in inside])
-    simulated = [
-        predict_windows(inside, table, each.model, values=each.values)[sensor][:, axis]
-        for each in models
-    ]
-    found = {
-        'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside]),
-        'simulated before': simulated[0],
-        'simulated after': simulated[-1],
-    }
-    rows = np.flatnonzero((time >= start) & (time <= stop))
-    size = max(1, len(rows) // POINTS)
-    rows = rows[: len(rows) // size * size].reshape(-1, size)
-    return OverlaySegment(
-        time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()}
-    )
+@dataclass(frozen=True, eq=False)
+class _Recording:
+    """The windows of a recording and the models that predict them."""
+
+    windows: Sequence[Window] | StoredWindows
+    """In the order of time, with unused ones."""
+    spans: Sequence[tuple[float, float]]
+    """First and last time of each window, s."""
+    table: Table
+    """The reference."""
+    models: Sequence[Solution | Calibration]
+    """The model before, and the model after if it is another one."""
+
+    def overlay(self, sensor: str, axis: int, start: float, stop: float) -> OverlaySegment:
+        """Return measured and predicted readings from `start` to `stop`, s, for one axis."""
+        inside = []
+        for number, (first, last) in enumerate(self.spans):
+            if last >= start and first <= stop:
+                inside.append(self.windows[number])
+        time = np.concatenate([window.time for window in inside])
+        simulated = []
+        for model in self.models:
+            predicted = predict_windows(inside, self.table, model.model, values=model.values)
+            simulated.append(predicted[sensor][:, axis])
+        signals = {
+            'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside]),
+            'simulated before': simulated[0],
+            'simulated after': simulated[-1],
+        }
+        # About POINTS means, each over `size` samples.
+        rows = np.flatnonzero((time >= start) & (time <= stop))
+        size = max(1, len(rows) // POINTS)
+        rows = rows[: len(rows) // size * size].reshape(-1, size)
+        means = {name: signal[rows].mean(axis=1) for name, signal in signals.items()}
+        return OverlaySegment(time[rows].mean(axis=1), means)
 
 
 def _references(
@@ -226,38 +244,46 @@ def _references(
     return {sensor: references.at(sensor) for sensor in SENSORS}
 
 
-def _starts(windows: Sequence[Window]) -> np.ndarray:
+def _block_starts(windows: Sequence[Window]) -> np.ndarray:
     """
-    Return the first sample of each block of the windows in one piece; blocks end with their window.
+    Return the index of the first sample of each block among the samples of all windows.
+
+    Blocks have `PLOT_BLOCK_SECONDS` from the start of their window and end with it.
     """
-    places = [
-        ((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int) for window in windows
-    ]
-    return np.flatnonzero(np.concatenate([np.diff(place, prepend=-1) for place in places]))
+    is_first = []
+    for window in windows:
+        number = ((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int)
+        is_first.append(np.diff(number, prepend=-1))
+    return np.flatnonzero(np.concatenate(is_first))
 
 
-def _dead_reckoning(
-    windows: Sequence[Window] | StoredWindows,
-    spans: Sequence[tuple[float, float]],
-    table: Table,
-    models: Sequence[Solution | Calibration],
-) -> dict[str, float] | None:
-    """Return medians over stretches of 50 s without gaps, or None."""
-    stretches, run = [], []
+def _dead_reckoning(recording: _Recording) -> dict[str, float] | None:
+    """
+    Return medians of the dead-reckoning errors over stretches of `DEAD_RECKONING` seconds, or None.
+
+    A stretch is a sequence of windows without a gap.
+    """
+    spans = recording.spans
+    stretches = []
+    stretch: list[int] = []  # numbers of its windows so far
     for number, (first, last) in enumerate(spans):
-        if run and not 0 < first - spans[run[-1]][1] <= MAX_STRETCH_STEP:
-            run = []
-        run.append(number)
-        if last - spans[run[0]][0] > DEAD_RECKONING:
-            stretches.append(run)
-            run = []
+        if stretch:
+            end_before = spans[stretch[-1]][1]
+            if not 0 < first - end_before <= MAX_STRETCH_STEP:
+                stretch = []
+        stretch.append(number)
+        if last - spans[stretch[0]][0] > DEAD_RECKONING:
+            stretches.append(stretch)
+            stretch = []
     if not stretches:
         return None
-    places = np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int)
-    chosen = [stretches[place] for place in np.unique(places)]
+    evenly = np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int)
+    chosen = [stretches[number] for number in np.unique(evenly)]
     drifts = []
     for stretch in chosen:
-        drifts.append(_drifts([windows[number] for number in stretch], table, models))
+        windows = [recording.windows[number] for number in stretch]
+        drifts.append(_drifts(windows, recording.table, recording.models))
+    # Shape (n_stretches, n_models, 2).
     velocity, position = np.median(drifts, axis=0).T
     return {
         'seconds': DEAD_RECKONING,
@@ -273,9 +299,9 @@ def _drifts(
     windows: Sequence[Window], table: Table, models: Sequence[Solution | Calibration]
 ) -> list[list[float]]:
     """
-    Return the dead-reckoning errors of velocity and position of each model.
+    Return the [velocity, position] error of dead reckoning with each model, m/s and m.
 
-    The errors, in m/s and m, are the ones `DEAD_RECKONING` seconds after the start of some windows.
+    After `DEAD_RECKONING` seconds from the start of the windows, which must have no gap.
     """
     motion, temperature, rows = all_samples(windows)
     time = np.concatenate([window.time for window in windows])
@@ -283,22 +309,22 @@ def _drifts(
     for model in models:
         error = residuals(windows, table, model.model, values=model.values)
         reference = _references(model, table, motion, temperature)
-        # Input of a navigation: the true one plus the residual in its units.
-        felt = {}
+        # Input of the navigation: true input + matrix^-1 residual.
+        navigated = {}
         for sensor in SENSORS:
             matrix = model.model.matrix(sensor, model.values)
-            felt[sensor] = (
-                getattr(reference[sensor], INPUT_OF[sensor])[rows]
-                + np.linalg.solve(matrix, error[sensor].T).T
-            )
+            true_input = getattr(reference[sensor], INPUT_OF[sensor])[rows]
+            navigated[sensor] = true_input + np.linalg.solve(matrix, error[sensor].T).T
         true = replace(
             reference['accelerometer'].select(rows),
             time=time,
             rate_s=reference['gyroscope'].rate_s[rows],
         )
-        some = slice(np.searchsorted(time, time[0] + DEAD_RECKONING) + 1)
+        first_part = slice(np.searchsorted(time, time[0] + DEAD_RECKONING) + 1)
         errors = dead_reckoning_errors(
-            true.select(some), felt['accelerometer'][some], felt['gyroscope'][some]
+            true.select(first_part),
+            navigated['accelerometer'][first_part],
+            navigated['gyroscope'][first_part],
         )
         drifts.append([float(np.linalg.norm(error[-1])) for error in errors])
     return drifts
