@@ -48,7 +48,7 @@ class _Side:
     applied: np.ndarray
     """Effects that compensation cannot undo are at their centre, shape (n_params,)."""
     latest: SensorModel
-    """At the largest probable time constants: what has settled (`trust.latest_settling`)."""
+    """At the largest probable time constants (`trust.latest_settling`)."""
 
 
 def gain_of_findings(
@@ -96,9 +96,9 @@ def gains_of_formulas(
     """
     Return sensor -> Gain of the proposed formulas over the findings on the locked windows.
 
-    The residual is the error of corrected readings, sample by sample, as for findings; that of the
-    model where compensation cannot undo the formula. Model and formulas are estimated together from
-    the other windows.
+    The residual is the error of corrected readings, sample by sample. Where compensation cannot
+    undo the formula, it is the residual of the model. Model and formulas are estimated together
+    from the other windows.
 
     Parameters
     ----------
@@ -134,11 +134,11 @@ def gains_of_formulas(
     after = _Side(model.at(estimated), estimated, applied, latest)
 
     # A formula that compensation cannot undo has a gain in the residual of the model only.
-    sums_of = {}
+    sums_of: dict[str, DistanceSums] = {}  # by APPLIED or OF_MODEL
     gains = {}
     for proposal in proposals:
-        undone = any(effect.compensation == 'exact' for effect in proposal.effects)
-        error_kind = APPLIED if undone else OF_MODEL
+        is_compensated = any(effect.compensation == 'exact' for effect in proposal.effects)
+        error_kind = APPLIED if is_compensated else OF_MODEL
         if error_kind not in sums_of:
             sums_of[error_kind] = _locked_errors(found, table, [before, after], of=error_kind)
         gain = sums_of[error_kind].gains(proposal.sensor, error_kind)[SAMPLES]
@@ -155,9 +155,10 @@ def _locked_errors(
     of: str = APPLIED,
 ) -> DistanceSums:
     """
-    Return the sums over the locked windows of the errors of corrected readings, or of the model.
+    Return the sums of squared errors of each side over the locked windows.
 
-    The windows are those of `HeldOutData` and the documents: after effects have settled.
+    `of`: `APPLIED`, the errors of corrected readings, or `OF_MODEL`, the residuals of the model.
+    Windows before effects have settled are omitted, as in `HeldOutData`.
     """
     problem = found.problem
     start = max(judged_from_of(side.latest, problem.duration) for side in sides)
@@ -176,11 +177,7 @@ def _locked_errors(
 
 
 def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Side:
-    """
-    Return a choice of effects as compensation applies it.
-
-    It is estimated without the locked windows.
-    """
+    """Return the model with some effects, estimated without the locked windows."""
     problem = found.problem
     gathered = problem.recording.model  # with all effects under test
     model = replace(problem.baseline, temperature_ref_c=gathered.temperature_ref_c)
@@ -205,7 +202,7 @@ def _errors(
     """
     Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3).
 
-    The true readings are those of an ideal sensor on the table as this side estimates it.
+    The true readings are the output of an ideal sensor on the table as this side estimates it.
     """
     # Ideal sensors at the estimated reference (angles, places, delays of the table).
     motion, temperature, rows = all_samples(windows)
@@ -242,9 +239,7 @@ def _errors(
 def _model_errors(
     windows: Sequence[Window], table: Table, side: _Side
 ) -> Iterator[dict[str, np.ndarray]]:
-    """
-    Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3).
-    """
+    """Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3)."""
     residual_of = residuals(windows, table, side.model, values=side.values)
     for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
         yield {sensor: residual[start:stop] for sensor, residual in residual_of.items()}

@@ -30,16 +30,17 @@ from imu_calibration.references.turntable.separating_motion import (
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 
-MATE = 0.5
+MIN_SHARE_OF_MATE = 0.5
 """
 Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's
 reduction.
 """
 
 
-HALF = 0.5
+MIN_SHARE_REPLACED = 0.5
 """
-Share of a finding that an unnamed effect would replace, from which it is reported with the finding.
+Least share of a parameter of a finding that a rejected effect replaces if it is added to the model;
+the effect is then reported with the finding.
 """
 
 
@@ -70,7 +71,10 @@ def build_diagnosis(
             problem.space, problem.noise, problem.baseline, chosen=named, saturations=found.limits
         )
 
+    # Findings are added in their order: the functions below compare the model with the findings
+    # before `place` and that with the finding at `place` too.
     def gain_of(place: int) -> Gain:
+        """Return the gain of a finding over the ones before it."""
         return gain_of_findings(
             found,
             table,
@@ -80,14 +84,16 @@ def build_diagnosis(
         )
 
     def shows(place: int, mate: Question, gain: Gain) -> bool:
+        """Return whether a mate reduces the residual of a sensor nearly as the finding does."""
         if gain.sensor not in mate.effect.sensors:
             return False
         before = named[:place]
         by_finding = gain_in_turn(problem, before, [*before, named[place]], sensors=[gain.sensor])
         by_mate = gain_in_turn(problem, before, [*before, mate], sensors=[gain.sensor])
-        return MATE * by_finding.reduction <= by_mate.reduction
+        return MIN_SHARE_OF_MATE * by_finding.reduction <= by_mate.reduction
 
     def motion_of(question: Question, mate: Question) -> str:
+        """Return the motion that separates two effects."""
         if len(table.joint_names) == 1:
             return motions_of_one_joint(question, mate)
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
@@ -114,32 +120,34 @@ def build_diagnosis(
         )
     sensors = sorted(affected) or list(unexplained)
     proposals = [rest.proposal for rest in unexplained.values() if rest.proposal is not None]
+    candidates = candidates_of(
+        problem.search,
+        named,
+        agree=_agreement(problem),
+        withdrawn=found.unstable,
+        replaced=analysis.replaced,
+    )
     return Diagnosis(
-        tuple(findings),
-        unexplained,
-        candidates_of(
-            problem.search,
-            named,
-            agree=_agreement(problem),
-            withdrawn=found.unstable,
-            replaced=analysis.replaced,
-        ),
-        tuple(found.not_testable),
-        baseline,
-        solution,
-        gain_of_findings(found, table, [], after=named, sensors=sensors),
-        len(found.used),
-        int(np.sum(problem.locked)),
+        findings=tuple(findings),
+        unexplained=unexplained,
+        candidates=candidates,
+        not_testable=tuple(found.not_testable),
+        baseline=baseline,
+        solution=solution,
+        gain=gain_of_findings(found, table, [], after=named, sensors=sensors),
+        windows=len(found.used),
+        locked=int(np.sum(problem.locked)),
         onset=found.onset,
         stamp_jitter=analysis.stamp_jitter,
         formula_gains=gains_of_formulas(found, table, proposals),
     )
 
 
-def _agreement(problem: LinearisedProblem) -> Callable:
-    """Return whether windows and both halves of the recording agree on a chosen effect."""
+def _agreement(problem: LinearisedProblem) -> Callable[[Sequence[Question], Question], bool]:
+    """Return a function that tests the agreement of parts of a recording on a chosen effect."""
 
     def agree(chosen: Sequence[Question], question: Question) -> bool:
+        """Return whether the windows and both halves agree on one of the chosen effects."""
         if not problem.windows_agree(chosen, question):
             return False
         return problem.search.agrees_in_halves(chosen, question)
@@ -149,43 +157,45 @@ def _agreement(problem: LinearisedProblem) -> Callable:
 
 def _rivals(found: Investigation, question: Question) -> list[Question]:
     """
-    Return alternatives to a finding, and doubtful effects that would replace it.
+    Return effects that may be the cause in place of a finding.
 
-    The alternatives fit nearly as well. The doubtful effects would replace half of the finding.
+    Effects that fit nearly as well, and rejected effects that change a parameter of the finding by
+    more than `MIN_SHARE_REPLACED` of its value when they are added to the model.
     """
-    near = [rival.other for rival in found.rivals if rival.question.name == question.name]
-    values = dict(zip(found.problem.space.names, found.problem.values(found.named)))
-    own = [found.problem.space.names[k] for k in question.parameters]
+    alternatives = [rival.other for rival in found.rivals if rival.question.name == question.name]
+    names = found.problem.space.names
+    values = dict(zip(names, found.problem.values(found.named)))
     for other in found.rejected:
-        moved = found.search.moved_by(found.named, other, found.problem.space.names)
-        near += (
-            [other]
-            if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own)
-            else []
-        )
-    return near
+        moved = found.search.moved_by(found.named, other, names)
+        for index in question.parameters:
+            name = names[index]
+            if abs(moved.get(name, 0.0)) > MIN_SHARE_REPLACED * abs(values[name]):
+                alternatives.append(other)
+                break
+    return alternatives
 
 
 def _clipping(limit: Saturation, solution: Solution) -> Finding:
+    """Return the finding of a limited range, with the limit that a solution has."""
     effect = solution.model.effect_of(limit.sensor, Role.LIMIT)
     parameters = parameters_of(solution, limit.sensor, effect.name)
     gain = Gain(
-        limit.sensor,
-        'clipped samples',
-        limit.rms_before,
-        limit.rms_after,
-        (float('nan'), float('nan')),
-        0,
+        sensor=limit.sensor,
+        measure='clipped samples',
+        heldout_rms_before=limit.rms_before,
+        heldout_rms_after=limit.rms_after,
+        ci95=(float('nan'), float('nan')),
+        windows=0,
     )
     return Finding(
-        effect.name,
-        limit.sensor,
-        sentence(effect, parameters, None, n_clipped=limit.n_clipped),
-        parameters,
-        limit.p_value,
-        limit.n_expected,
-        1.0,
-        gain,
-        (),
-        '',
+        effect=effect.name,
+        sensor=limit.sensor,
+        explanation=sentence(effect, parameters, None, n_clipped=limit.n_clipped),
+        parameters=parameters,
+        p_value=limit.p_value,
+        heldout_gain=limit.n_expected,
+        share=1.0,
+        gain=gain,
+        indistinguishable_from=(),
+        separating_motion='',
     )

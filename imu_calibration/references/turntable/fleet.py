@@ -6,7 +6,7 @@ Plain functions, for any scheduler.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -64,18 +64,16 @@ class UnitResult:
     @property
     def verdicts(self) -> dict[str, str]:
         """Sensor -> decision, or 'refused'."""
-        return (
-            dict.fromkeys(SENSORS, self.verdict)
-            if self.calibration is None
-            else {**self.calibration.decisions}
-        )
+        if self.calibration is None:
+            return dict.fromkeys(SENSORS, self.verdict)
+        return {**self.calibration.decisions}
 
     @property
     def verdict_text(self) -> str:
         """The decisions in one phrase, or 'refused'."""
-        return (
-            self.verdict if self.calibration is None else decisions_text(self.calibration.decisions)
-        )
+        if self.calibration is None:
+            return self.verdict
+        return decisions_text(self.calibration.decisions)
 
 
 @dataclass(frozen=True)
@@ -101,6 +99,7 @@ class FleetStep:
             return UnitResult(unit.name, error=text, reasons=(text,))
 
     def _calibrated(self, unit: Unit) -> UnitResult:
+        """Return the result of a unit; raises the errors of its calibration."""
         provenance = unit.provenance()
         recordings = TableRecordings.of(unit.sources, self.table, names=unit.bags or None)
         result = calibrate_by_evidence(recordings, self.options, provenance=provenance)
@@ -110,9 +109,9 @@ class FleetStep:
             texts[REPORT] = report_of(result)
         return UnitResult(
             unit.name,
-            result.calibration,
-            str(result.verdict.word),
-            exit_code(result.calibration),
+            calibration=result.calibration,
+            verdict=str(result.verdict.word),
+            exit_code=exit_code(result.calibration),
             files=texts,
             reasons=tuple(shortcomings(result.calibration)),
         )
@@ -164,10 +163,12 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
             f'at least one unit must be calibrated, none of {len(results)} was{first}',
             code='no_unit_calibrated',
         )
-    values, units = {}, {}
-    for unit, calibration in good:
+    estimates_of: dict[str, list[_Estimate]] = {}  # parameter -> estimates that are not held
+    si_units: dict[str, str] = {}  # parameter -> SI unit
+    for unit_name, calibration in good:
         for effect in calibration.model.effects:
-            units |= {name: effect.unit_of(k) for k, name in enumerate(effect.param_names())}
+            for index, name in enumerate(effect.param_names()):
+                si_units[name] = effect.unit_of(index)
         for name, value, sd, status in zip(
             calibration.param_names,
             calibration.values,
@@ -175,27 +176,39 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
             calibration.status,
             strict=True,
         ):
-            found = values.setdefault(name, [])
+            estimates = estimates_of.setdefault(name, [])
             if status != HELD:
-                found.append((float(value), float(sd), unit))
-    return [_spread(name, units[name], found) for name, found in values.items()]
+                estimates.append(_Estimate(float(value), float(sd), unit_name))
+    return [_spread(name, si_units[name], estimates) for name, estimates in estimates_of.items()]
 
 
-def _spread(name: str, unit: str, found: Sequence[tuple[float, float, str]]) -> Spread:
-    if not found:
+class _Estimate(NamedTuple):
+    """A parameter of one unit."""
+
+    value: float
+    """SI."""
+    sd: float
+    """Its reported standard deviation, SI."""
+    unit_name: str
+    """Name of the unit."""
+
+
+def _spread(name: str, si_unit: str, estimates: Sequence[_Estimate]) -> Spread:
+    """Return the spread of a parameter over the units; NaN without any estimate."""
+    if not estimates:
         missing = float('nan')
-        return Spread(name, unit, 0, missing, missing, missing, (missing, ''), (missing, ''))
-    value, sd = (np.array(column) for column in list(zip(*found, strict=True))[:2])
-    low = found[int(np.argmin(value))]
-    high = found[int(np.argmax(value))]
-    spread = float(value.std(ddof=1)) if len(value) > 1 else float('nan')
+        return Spread(name, si_unit, 0, missing, missing, missing, (missing, ''), (missing, ''))
+    value = np.array([estimate.value for estimate in estimates])
+    sd = np.array([estimate.sd for estimate in estimates])
+    lowest = estimates[int(np.argmin(value))]
+    highest = estimates[int(np.argmax(value))]
     return Spread(
         name,
-        unit,
-        len(value),
-        float(value.mean()),
-        spread,
-        float(np.sqrt(np.mean(sd**2))),
-        (low[0], low[2]),
-        (high[0], high[2]),
+        si_unit,
+        count=len(value),
+        mean=float(value.mean()),
+        spread=float(value.std(ddof=1)) if len(value) > 1 else float('nan'),
+        typical_sd=float(np.sqrt(np.mean(sd**2))),
+        lowest=(lowest.value, lowest.unit_name),
+        highest=(highest.value, highest.unit_name),
     )

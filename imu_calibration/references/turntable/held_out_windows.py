@@ -453,7 +453,7 @@ def _error_on_groups(
     n_pieces: int = 1,
 ) -> float:
     """
-    Return the root of the sum of squared errors of the groups, each predicted from the others.
+    Return the root of the sum of squared errors of the groups, each predicted from the remaining.
 
     Parameters
     ----------
@@ -478,7 +478,7 @@ def _error_on_groups(
     sd = model.prior()[1][index]
     designs, targets = _linearised(groups, model, sensor, values, places=index, steps=sd)
 
-    # The rows of the data have the residual as noise: those of the prior are scaled to it.
+    # The noise of the data rows is the residual, to which the rows of the prior are scaled.
     prior_design = np.zeros((0, len(index)))
     prior_target = np.zeros(0)
     if prior is not None:

@@ -19,15 +19,17 @@ CONTRADICTING_SDS = 5.0
 """Standard deviations beyond which the estimate contradicts the latitude."""
 NAMED_SDS = 3.0
 """
-The same where a g-sensitivity is in the model, which may stand for another latitude; without one, a
-note from here on.
+The same where a g-sensitivity is in the model, which may be the effect of another latitude; without
+one, a note from here on.
 """
 LEAST_EARTH_SHARE = 0.1
-"""The same as a share of the Earth's rate: below, small errors of the model explain it."""
+"""
+Least contradiction as a share of the Earth's rate: below, small errors of the model explain it.
+"""
 AGREEING_SDS = 4.0
 """Standard deviations within which an estimate agrees with a cause."""
 AGREEING_SHARE = 0.15
-"""The same as a share of the effect of the cause."""
+"""Share of the effect of a cause within which an estimate agrees with it."""
 LEAST_WINDOWS = 8
 """Windows, beyond the number of unknowns, from which a latitude is tested."""
 WINDOWS_PER_COSINE = 20
@@ -43,7 +45,7 @@ FARTHEST_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class WindowRates:
-    """Means of n windows: rates of the gyroscopes, of the reference, and which way was up."""
+    """Means of n windows: rates of the gyroscopes and of the reference, and the vertical."""
 
     measured: np.ndarray
     """Measured rates in the sensor frame, rad/s, shape (n, 3)."""
@@ -75,12 +77,12 @@ def window_rates(gathered: SessionData, model: SensorModel, table: Table) -> Win
     rates = np.array([row.sensors['gyroscope'].mean for row in rows])
     forces = np.array([row.sensors['accelerometer'].mean for row in rows])
     return WindowRates(
-        rates[:, -3:],
-        rates[:, model.columns_of('gyroscope', Role.LINEAR)],
-        forces[:, model.columns_of('accelerometer', Role.LINEAR)] / table.gravity_value,
-        np.array([row.time for row in rows]),
-        np.array([row.session for row in rows]),
-        np.array([str(row.kind) for row in rows]),
+        measured=rates[:, -3:],
+        reference=rates[:, model.columns_of('gyroscope', Role.LINEAR)],
+        up=forces[:, model.columns_of('accelerometer', Role.LINEAR)] / table.gravity_value,
+        time=np.array([row.time for row in rows]),
+        session=np.array([row.session for row in rows]),
+        kind=np.array([str(row.kind) for row in rows]),
     )
 
 
@@ -91,9 +93,9 @@ def latitude_findings(
     Return the contradictions between the latitude and the estimates.
 
     ``omega_up = Omega sin(latitude)`` and ``|omega| = Omega`` do not depend on the azimuth. Where
-    the table gives the azimuth, the reference contains the Earth's rate, and another latitude
-    leaves ``Omega (sin(true) - sin(stated))`` about the vertical. Where the table gives no
-    latitude, a rate ``|omega| > Omega`` has another cause.
+    the table gives the azimuth, the reference contains the Earth's rate, and with another latitude
+    the measured rate about the vertical is larger by ``Omega (sin(true) - sin(stated))``. Where the
+    table gives no latitude, a rate ``|omega| > Omega`` has another cause.
 
     Parameters
     ----------
@@ -111,17 +113,22 @@ def latitude_findings(
     """
     model = solution.model
     # The Earth's rate is the effect of which the size is known.
-    free = next((effect for effect in model.effects if effect.known_size), None)
-    if free is not None:
-        return _of_free_rate(solution, table, model.slices[free.key])
+    earth_rate = next((effect for effect in model.effects if effect.known_size), None)
+    if earth_rate is not None:
+        return _of_estimated_rate(solution, table, model.slices[earth_rate.key])
     if windows is None or table.azimuth_deg is None:
         return ()
-    named = model.find('gyroscope', Role.CROSS) is not None
-    return _of_windows(windows, table, NAMED_SDS if named else CONTRADICTING_SDS)
+    has_g_sensitivity = model.find('gyroscope', Role.CROSS) is not None
+    return _of_windows(windows, table, NAMED_SDS if has_g_sensitivity else CONTRADICTING_SDS)
 
 
-def _of_free_rate(solution: Solution, table: Table, part: slice) -> tuple[CheckFinding, ...]:
-    """Compare the vertical component and the length of the estimated Earth's rate."""
+def _of_estimated_rate(solution: Solution, table: Table, part: slice) -> tuple[CheckFinding, ...]:
+    """
+    Return the contradiction of the estimated Earth's rate to the latitude, or none.
+
+    The vertical component is compared first, then the length; `part` are the parameters of the
+    rate in the level frame.
+    """
     if solution.held[part].any():
         return ()
     rate = solution.values[part]
@@ -152,53 +159,32 @@ def _length(rate: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
 
 
 def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFinding, ...]:
-    """Compare the rate about the vertical that the reference leaves with that of the latitude."""
-    # Biases and their slow wandering, c + d x + sum_k a_k cos(pi k x) for each recording, with x
-    # from 0 to 1: it looks like a dependence on up where attitudes follow each other slowly.
-    wandering = [np.zeros((len(windows.time), 0))]
-    for session in np.unique(windows.session):
-        inside = windows.session == session
-        time = windows.time[inside]
-        x = (time - time.min()) / max(np.ptp(time), 1e-9)
-        orders = np.arange(2, round(len(time) / WINDOWS_PER_COSINE) + 1)
-        columns = np.zeros((len(windows.time), 2 + len(orders)))
-        cosines = np.cos(np.pi * np.outer(x, orders))
-        columns[inside] = np.column_stack([np.ones_like(x), x, cosines])
-        wandering.append(columns)
-    # Any linear dependence on up: w = K up + M r + bias.
-    design = np.column_stack([windows.up, *wandering])
-    if np.abs(windows.reference).max(initial=0.0) > LEAST_RATE:
-        design = np.column_stack([design, windows.reference])
-    if len(design) < design.shape[1] + LEAST_WINDOWS:
+    """
+    Return the contradiction of the rate about the vertical in windows to the latitude, or none.
+
+    The reference contains the Earth's rate at the stated latitude. The difference to the true one
+    is a rate k about the vertical: K = k I in the regression ``measured = K up + M reference +
+    bias(time)``. `sds`: standard deviations from which k is a contradiction.
+    """
+    dependence = _dependence_on_up(windows)
+    if dependence is None:
         return ()
-    weight = _weights_of_kinds(windows, design)
-    design = design * weight[:, None]
-    measured = windows.measured * weight[:, None]
-    left, singular, right = np.linalg.svd(design, full_matrices=False)
-    if singular[-1] <= 1e-6 * singular[0]:
-        return ()
-    # The windows differ in length and motion, so that their variances are not equal. With the
-    # solution K = G w, sd(K)^2 = sum_k G_k^2 (e_k / (1 - h_k))^2, h_k the leverage (HC3 of
-    # MacKinnon and White 1985).
-    gain = (right.T / singular) @ left.T
-    solved = gain @ measured
-    leverage = (left**2).sum(axis=1)
-    residual = (measured - design @ solved) / np.maximum(1.0 - leverage, 1e-3)[:, None]
-    dependence = solved[:3].T
-    dependence_sd = np.sqrt(gain[:3] ** 2 @ residual**2).T
     # A rate about the vertical is K = k I: the weighted mean of the diagonal.
-    precision = 1.0 / np.maximum(dependence_sd.diagonal() ** 2, 1e-300)
-    vertical = float(precision @ dependence.diagonal() / precision.sum())
+    precision = 1.0 / np.maximum(dependence.sd.diagonal() ** 2, 1e-300)
+    vertical = float(precision @ dependence.matrix.diagonal() / precision.sum())
     vertical_sd = float(1.0 / np.sqrt(precision.sum()))
     severity = _severity(vertical, vertical_sd, sds)
     if severity is None:
         return ()
-    # A g-sensitivity has other entries too, and no latitude gives more than the Earth's rate.
-    remaining = np.abs(dependence - vertical * np.eye(3))
-    tolerated = np.maximum(AGREEING_SDS * dependence_sd, AGREEING_SHARE * abs(vertical))
+    # A g-sensitivity has other entries too.
+    remaining = np.abs(dependence.matrix - vertical * np.eye(3))
+    tolerated = np.maximum(AGREEING_SDS * dependence.sd, AGREEING_SHARE * abs(vertical))
+    if np.any(remaining > tolerated):
+        return ()
+    # At no latitude the vertical component is larger than the Earth's rate.
     expected_up = _vertical_rate(table)
     measured_up = expected_up + vertical
-    if np.any(remaining > tolerated) or _contradicts_length(measured_up, vertical_sd):
+    if _contradicts_length(measured_up, vertical_sd):
         return ()
     if severity == WARNING and _agrees(measured_up + expected_up, vertical_sd, expected_up):
         raise _wrong_sign(table, measured_up, expected_up)
@@ -209,8 +195,67 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Dependence:
+    """Linear dependence of measured rates on the vertical, ``measured = matrix @ up + ...``."""
+
+    matrix: np.ndarray
+    """rad/s, shape (3, 3)."""
+    sd: np.ndarray
+    """Standard deviation of each entry, shape (3, 3)."""
+
+
+def _dependence_on_up(windows: WindowRates) -> _Dependence | None:
+    """Return the dependence of the measured rates on the vertical; None if not determined."""
+    # Unknowns: K of up, bias and its wandering, M of the reference where it turns.
+    design = np.column_stack([windows.up, *_bias_columns(windows)])
+    if np.abs(windows.reference).max(initial=0.0) > LEAST_RATE:
+        design = np.column_stack([design, windows.reference])
+    if len(design) < design.shape[1] + LEAST_WINDOWS:
+        return None
+    weight = _weights_of_kinds(windows, design)
+    design = design * weight[:, None]
+    measured = windows.measured * weight[:, None]
+    left, singular, right = np.linalg.svd(design, full_matrices=False)
+    if singular[-1] <= 1e-6 * singular[0]:
+        return None
+    # The windows differ in length and motion, so that their variances are not equal. With the
+    # solution K = G w, sd(K)^2 = sum_k G_k^2 (e_k / (1 - h_k))^2, h_k the leverage (HC3 of
+    # MacKinnon and White 1985).
+    gain = (right.T / singular) @ left.T
+    solved = gain @ measured
+    leverage = (left**2).sum(axis=1)
+    residual = (measured - design @ solved) / np.maximum(1.0 - leverage, 1e-3)[:, None]
+    return _Dependence(solved[:3].T, np.sqrt(gain[:3] ** 2 @ residual**2).T)
+
+
+def _bias_columns(windows: WindowRates) -> list[np.ndarray]:
+    """
+    Return the columns of bias and its slow wandering in each recording, each shape (n, k).
+
+    ``c + d x + sum_k a_k cos(pi k x)``, with x from 0 to 1 in the recording and zeros outside it.
+    Without them, wandering passes for a dependence on the vertical where attitudes follow each
+    other slowly.
+    """
+    columns_of_sessions = [np.zeros((len(windows.time), 0))]
+    for session in np.unique(windows.session):
+        inside = windows.session == session
+        time = windows.time[inside]
+        x = (time - time.min()) / max(np.ptp(time), 1e-9)
+        orders = np.arange(2, round(len(time) / WINDOWS_PER_COSINE) + 1)
+        columns = np.zeros((len(windows.time), 2 + len(orders)))
+        cosines = np.cos(np.pi * np.outer(x, orders))
+        columns[inside] = np.column_stack([np.ones_like(x), x, cosines])
+        columns_of_sessions.append(columns)
+    return columns_of_sessions
+
+
 def _weights_of_kinds(windows: WindowRates, design: np.ndarray) -> np.ndarray:
-    """Return the inverse rms of what rests, spins and other motions leave, for each window."""
+    """
+    Return the weight of each window, the inverse rms residual of its kind, shape (n,).
+
+    The residual is that of the measured rates after unweighted least squares.
+    """
     solved = np.linalg.lstsq(design, windows.measured, rcond=1e-6)[0]
     squares = ((windows.measured - design @ solved) ** 2).mean(axis=1)
     weight = np.ones(len(design))
@@ -221,7 +266,7 @@ def _weights_of_kinds(windows: WindowRates, design: np.ndarray) -> np.ndarray:
 
 
 def _contradicts_length(rate: float, sd: float) -> bool:
-    """Return whether one component is larger than the rate of the Earth."""
+    """Return whether a component or a length is significantly larger than the Earth's rate."""
     return abs(rate) > EARTH_RATE and _contradicts(abs(rate) - EARTH_RATE, sd)
 
 
@@ -232,22 +277,25 @@ def _vertical_rate(table: Table) -> float:
 
 
 def _contradicts(difference: float, sd: float, sds: float = CONTRADICTING_SDS) -> bool:
+    """Return whether a difference exceeds `sds` standard deviations and a share of the rate."""
     return abs(difference) > max(sds * sd, LEAST_EARTH_SHARE * EARTH_RATE)
 
 
 def _severity(difference: float, sd: float, sds: float = CONTRADICTING_SDS) -> Severity | None:
-    """Return WARNING beyond `sds` standard deviations, NOTE where it may be chance, or None."""
+    """Return WARNING beyond `sds` standard deviations, NOTE beyond `NAMED_SDS`, otherwise None."""
     if _contradicts(difference, sd, sds):
         return WARNING
     return NOTE if _contradicts(difference, sd, NAMED_SDS) else None
 
 
 def _agrees(difference: float, sd: float, size: float) -> bool:
+    """Return whether a difference is small in standard deviations or relative to an effect."""
     tolerated = max(AGREEING_SDS * sd, AGREEING_SHARE * abs(size))
     return abs(difference) < min(tolerated, FARTHEST_SHARE * abs(size))
 
 
 def _wrong_sign(table: Table, measured: float, expected: float) -> InputError:
+    """Return the error of a latitude with the wrong sign; rates of the vertical in rad/s."""
     return InputError(
         f"the latitude must give the vertical component of the Earth's rate, {table.latitude:g} deg"
         f' gives {_hourly(expected)} deg/h and the gyroscopes measured {_hourly(measured)} deg/h:'
@@ -261,6 +309,7 @@ def _wrong_sign(table: Table, measured: float, expected: float) -> InputError:
 def _finding(
     name: str, measured: float, sd: float, *, expected: float, severity: Severity
 ) -> CheckFinding:
+    """Return the finding that a quantity of the Earth's rate differs from its value, rad/s."""
     return CheckFinding(
         LATITUDE_CHECK,
         severity,
@@ -272,6 +321,7 @@ def _finding(
 
 
 def _excess(measured: float, sd: float) -> CheckFinding:
+    """Return the finding of a rate that is larger than the Earth's, rad/s."""
     return CheckFinding(
         LATITUDE_CHECK,
         WARNING,
@@ -283,4 +333,5 @@ def _excess(measured: float, sd: float) -> CheckFinding:
 
 
 def _hourly(rate: float) -> str:
+    """Return a rate in deg/h with three digits."""
     return significant(rate / DEG_H, 3)

@@ -18,7 +18,7 @@ from imu_calibration.references.turntable.diagnosis_of_windows import build_diag
 from imu_calibration.references.turntable.live_windows import LiveSnapshot
 from imu_calibration.references.turntable.selection.investigation import too_few_windows
 from imu_calibration.references.turntable.selection.window_evidence import MIN_FOLD_WINDOWS
-from imu_calibration.references.turntable.window_search import windows_to_ask
+from imu_calibration.references.turntable.window_search import windows_to_search
 
 
 class Outcome(StrEnum):
@@ -38,8 +38,10 @@ class Outcome(StrEnum):
     """It ended by a fault."""
 
 
-MATES_KEY, SIZE_KEY = 'mates of ', 'size of '
-"""Prefix of the name of each finding, and of EFFECT.PARAMETER with a number in SI: for programs."""
+MATES_KEY = 'mates of '
+"""Status key for programs: this prefix and the name of a finding -> effects collinear with it."""
+SIZE_KEY = 'size of '
+"""Status key for programs: this prefix and EFFECT.PARAMETER -> its value in SI."""
 WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = Outcome
 
 
@@ -78,17 +80,15 @@ class DiagnosisQuestion:
         try:
             evidence = self.snapshot.evidence()
             if evidence.found is None:
-                raise too_few_windows(
-                    sum(len(spread.windows) for spread in self.snapshot.gathered.spreads)
-                )
-            found, extension = evidence.found, evidence.extension
+                spreads = self.snapshot.gathered.spreads
+                raise too_few_windows(sum(len(spread.windows) for spread in spreads))
+            found = evidence.found
+            extension = evidence.extension
             calibrated = None if extension.changes.lacking else evidence.solution
-            # Its columns, of a wider model than those of the session, need much memory.
+            # Its columns of a wider model need much memory.
             del evidence
-            return Answer(
-                live_state_of(build_diagnosis(self.snapshot.table, found, calibrated=calibrated)),
-                extension,
-            )
+            diagnosis = build_diagnosis(self.snapshot.table, found, calibrated=calibrated)
+            return Answer(live_state_of(diagnosis), extension)
         except ImuCalibrationError as error:
             return Answer(LiveState(WAITING, str(error)))
 
@@ -97,33 +97,29 @@ def question_about(live: LiveSession) -> DiagnosisQuestion | None:
     """
     Return the DiagnosisQuestion about the last solution of a session.
 
-    Or None without one or while there are too few windows.
+    None before a solution, and while there are too few windows.
     """
-    return (
-        DiagnosisQuestion(live.last)
-        if live.last is not None and windows_to_ask(live.last.gathered)
-        else None
-    )
+    if live.last is None or not windows_to_search(live.last.gathered):
+        return None
+    return DiagnosisQuestion(live.last)
 
 
 def live_state_of(diagnosis: Diagnosis) -> LiveState:
     """
-    Return the LiveState of a Diagnosis: the first finding, or none, or the unexplained residual.
+    Return the LiveState of a Diagnosis: its first finding, otherwise the unexplained residual.
     """
     values: dict[str, Any] = {
         'windows': diagnosis.windows,
         'windows held out for the gain': diagnosis.locked,
     }
-    rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
-    values |= {
-        f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)
-        for sensor, found in diagnosis.unexplained.items()
-        if found.significant
-    }
+    for sensor, residual in diagnosis.unexplained.items():
+        if residual.significant:
+            values[f'unexplained {sensor} rms'] = in_words(residual.rms, sensor, residual.unit)
     if not diagnosis.findings:
-        return LiveState(
-            UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values
-        )
+        lines = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
+        if lines:
+            return LiveState(UNEXPLAINED, '; '.join(lines), values)
+        return LiveState(NOTHING, nothing_named(diagnosis), values)
     first = diagnosis.findings[0]
     message = f'{first.title}: {first.explanation}'
     if first.indistinguishable_from:
@@ -133,14 +129,14 @@ def live_state_of(diagnosis: Diagnosis) -> LiveState:
             f' {first.separating_motion}'
         )
     low, high = first.gain.ci95
+    parameters = {}
+    for name, (value, sd, unit) in first.parameters.items():
+        parameters[name] = f'{value:.4g} +- {sd:.2g} {unit}'
     values = {
         'effect': first.effect,
         'sensor': first.sensor,
         'explanation': first.explanation,
-        **{
-            name: f'{value:.4g} +- {sd:.2g} {unit}'
-            for name, (value, sd, unit) in first.parameters.items()
-        },
+        **parameters,
         'p-value': f'{first.p_value:.2g}',
         'held-out reduction': f'{first.gain.reduction:.3f}',
         'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',

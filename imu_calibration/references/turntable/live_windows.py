@@ -423,7 +423,7 @@ class LiveCalibration(LiveSession):
     def _residual(self, window: Window) -> ImuSamples:
         """Return every k-th residual of a window, NaN for a sensor without readings."""
         stride = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
-        middle = stride // 2  # of the samples that one published sample stands for
+        middle = stride // 2  # of each `stride` samples, one of which is published
         published = slice(middle if len(window) > middle else 0, None, stride)
         # Residuals exist after a solution of the gathered windows.
         assert self.result is not None and self._collector is not None

@@ -54,7 +54,7 @@ class CommonTurn:
 
     def noted(self, axis: np.ndarray) -> bool:
         """
-        Return whether the turn is larger than usual axes allow, as a whole or about an axis.
+        Return whether the turn is larger than usual axes allow, in total or about an axis.
 
         Parameters
         ----------
@@ -62,10 +62,11 @@ class CommonTurn:
             Unit vector of the last joint in the axes of the stated mount.
 
         """
-        whole = np.sum((self.vector / self.sd) ** 2) / len(self.vector)
+        # F ratios of the squared turn and its variance.
+        total = np.sum((self.vector / self.sd) ** 2) / len(self.vector)
         about_axis = (axis @ self.vector) ** 2 / (axis**2 @ self.sd**2)
-        chance = min(f_sf(whole, 3, self.freedom), f_sf(about_axis, 1, self.freedom))
-        return bool(chance < NOTED_CHANCE)
+        p_value = min(f_sf(total, 3, self.freedom), f_sf(about_axis, 1, self.freedom))
+        return bool(p_value < NOTED_CHANCE)
 
 
 def common_turn(solution: Solution) -> CommonTurn | None:

@@ -29,10 +29,10 @@ def motions_needed(
     solution: Solution, tolerances: np.ndarray, table: Table, *, quality: Mapping
 ) -> dict[str, tuple[str, float]]:
     """
-    Return undetermined parameter -> (best motion, its sd after a minute of it).
+    Return undetermined parameter -> (best motion, predicted sd after a minute of it).
 
-    The motion is the one that would serve best a parameter that is not determined; where no motion
-    serves it, the remedy for the cause and NaN (`estimation.solution.remedy`).
+    The best motion reduces the sd of the parameter most. Where another cause than a lack of motion
+    makes it large, (remedy for the cause, NaN) (`estimation.solution.remedy`).
 
     Parameters
     ----------
@@ -53,26 +53,27 @@ def motions_needed(
         possible=possible_motions(table),
     )
     data_sd = sd_of_data(solution, prior_sd)
-    of_bias_process = np.diag(solution.terms[BIAS_PROCESS])
+    wander_variance = np.diag(solution.terms[BIAS_PROCESS])
     counted = _counted(solution)
+    # Whether each parameter is determined if noise is the only error.
     is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
-    of_place = PLACE_REMEDY if table.latitude is None else AZIMUTH_REMEDY
-    of_known_size: set[str] = set()
+    earth_rate_remedy = PLACE_REMEDY if table.latitude is None else AZIMUTH_REMEDY
+    earth_rate_names: set[str] = set()
     for effect in solution.model.effects:
         if effect.known_size:
-            of_known_size.update(effect.param_names())
+            earth_rate_names.update(effect.param_names())
     for name in list(needed):
         if name not in counted:
             del needed[name]
             continue
-        if name in of_known_size:
-            needed[name] = (of_place, float('nan'))
+        if name in earth_rate_names:
+            needed[name] = (earth_rate_remedy, float('nan'))
             continue
         index = solution.param_names.index(name)
         section = name.partition('.')[0]
         # Both sensors determine table and clock.
         sensors = (section,) if section in SENSORS else SENSORS
-        of_misfit: tuple[str, ...] = ()
+        of_misfit: tuple[str, ...] = ()  # terms of the covariance that a misfit causes
         if any(incomplete_windows(quality, sensor) for sensor in sensors):
             # Bias processes describe the error of the model.
             of_misfit = (BIAS_PROCESS,)
@@ -81,7 +82,7 @@ def motions_needed(
             of_misfit = (BIAS_PROCESS, HELD_PRIORS)
         text = remedy(solution.terms, index, tolerances[index], of_misfit=of_misfit)
         wanders = any(_wanders(solution, sensor) for sensor in sensors)
-        if not text and wanders and of_bias_process[index] > tolerances[index] ** 2:
+        if not text and wanders and wander_variance[index] > tolerances[index] ** 2:
             # The mean of the bias over the recording is as uncertain after more motions.
             text = WANDER_REMEDY
         if text:
@@ -91,10 +92,10 @@ def motions_needed(
 
 def _wanders(solution: Solution, sensor: str) -> bool:
     """
-    Return whether the scatter of window means is that of a bias that wanders.
+    Return whether window means scatter more by a wandering bias than by independent offsets.
 
-    The offsets of windows are independent, so that more windows reduce their part; a bias that
-    wanders keeps its value from window to window.
+    More windows reduce the effect of independent offsets; a bias that wanders is correlated from
+    window to window.
     """
     noise = solution.noise.get(sensor)
     return noise is not None and noise.bias_variance > noise.offset_sd**2
@@ -104,36 +105,38 @@ def possible_motions(table: Table) -> tuple[Motion, ...] | None:
     """Return the standard motions that a table with a single joint can do; None: any."""
     if len(table.joints) != 1 or not table.joints[0].turns:
         return None
-    return motions_about(
-        *(table.mat_sl @ np.asarray(direction) for direction in (table.joints[0].axis, table.up))
-    )
+    axis_s = table.mat_sl @ np.asarray(table.joints[0].axis)
+    up_s = table.mat_sl @ np.asarray(table.up)
+    return motions_about(axis_s, up_s)
 
 
 def weak_on_table(
     solution: Solution, tolerances: np.ndarray, needed: dict[str, tuple[str, float]]
 ) -> tuple[dict, ...]:
     """
-    Return the weak directions with helpful motions, and the unnamed parameters.
+    Return {'parameters', 'needs'} of each weak direction, and of the other needed parameters.
 
-    The motions would help with the weak directions. The parameters are the ones that none of the
-    directions names.
+    'parameters' are the weights of a direction in tolerances, or the sds in tolerances of
+    parameters that no direction names; 'needs' is the motion for them.
     """
     names = _counted(solution)
     present = np.isin(solution.param_names, names)
     directions = weak_directions(
         solution.covariance[np.ix_(present, present)], tolerances[present], names
     )
-    others = _besides(directions, needed, dict(zip(solution.param_names, solution.sd / tolerances)))
-    known = [(weights, _need(weights, needed)) for weights in directions]
-    return tuple({'parameters': weights, 'needs': need} for weights, need in (*known, *others))
+    entries = [{'parameters': weights, 'needs': _need(weights, needed)} for weights in directions]
+    sd_in_tolerances = dict(zip(solution.param_names, solution.sd / tolerances))
+    for sds, need in _in_no_direction(directions, needed, sd_in_tolerances):
+        entries.append({'parameters': sds, 'needs': need})
+    return tuple(entries)
 
 
 def _counted(solution: Solution) -> list[str]:
     """
-    Return the parameters for which a motion can be asked.
+    Return the names of the parameters that further motions can determine.
 
-    Those of an absent sensor are nominal. The other one may not see the table and the clock: only
-    its own parameters count.
+    Without one of the sensors, only the parameters of the present sensor: it may not determine the
+    table and the clock.
     """
     if not solution.absent:
         return solution.param_names
@@ -149,17 +152,19 @@ def _need(weights: Mapping[str, float], needed: Mapping[str, tuple[str, float]])
     return 'more of the same motion'
 
 
-def _besides(
+def _in_no_direction(
     directions: Sequence[Mapping[str, float]],
     needed: Mapping[str, tuple[str, float]],
     in_tolerances: Mapping[str, float],
 ) -> list[tuple[dict[str, float], str]]:
     """
-    Return (sds in tolerances, motion) of the parameters that none of the worst directions names.
+    Return (name -> sd in tolerances, motion) of needed parameters that no direction names.
+
+    Parameters with the same motion are in one item.
     """
     named: set[str] = set().union(*directions)
-    others: dict[str, dict[str, float]] = {}
-    for name, (text, _) in needed.items():
+    sds_of_motion: dict[str, dict[str, float]] = {}
+    for name, (motion, _) in needed.items():
         if name not in named:
-            others.setdefault(text, {})[name] = round(float(in_tolerances[name]), 3)
-    return [(names, text) for text, names in others.items()]
+            sds_of_motion.setdefault(motion, {})[name] = round(float(in_tolerances[name]), 3)
+    return [(sds, motion) for motion, sds in sds_of_motion.items()]

@@ -20,19 +20,15 @@ SAME_VARIANCE = 0.05
 
 @dataclass(frozen=True)
 class ReferenceNoise:
-    """
-    Contribution of the reference to the variance of window means.
-
-    Quantisation of the joint readings.
-    """
+    """Variance of window means due to the quantisation of the joint readings."""
 
     turn: float = 0.0
     """
-    Standard deviation of the turn between two readings, rad; divided by the window length, of the
-    mean rate.
+    Standard deviation of the turn from the first to the last reading of a moving window, rad. That
+    of the mean rate is ``turn / duration``.
     """
     level: float = 0.0
-    """Standard deviation of gravity's components at rest, m/s^2."""
+    """Standard deviation of gravity's components in a window at rest, m/s^2."""
 
     @classmethod
     def of_steps(cls, step: float, sensor: str) -> 'ReferenceNoise':
@@ -42,11 +38,9 @@ class ReferenceNoise:
         The error of a reading is ``step / sqrt(12)``, of a turn ``step / sqrt(6)``. An error of the
         attitude about one axis affects two of the three components of gravity.
         """
-        return (
-            cls(turn=step / np.sqrt(6))
-            if sensor == 'gyroscope'
-            else cls(level=STANDARD_GRAVITY * step / np.sqrt(12) * np.sqrt(2 / 3))
-        )
+        if sensor == 'gyroscope':
+            return cls(turn=step / np.sqrt(6))
+        return cls(level=STANDARD_GRAVITY * step / np.sqrt(12) * np.sqrt(2 / 3))
 
     def variance(self, kinds: Sequence[str] | np.ndarray, durations: np.ndarray) -> np.ndarray:
         """Return the variance of the means of windows of these kinds and lengths, s, shape (k,)."""
@@ -63,17 +57,18 @@ class MovingFactors:
     """
 
     every: np.ndarray
-    """On the variance of the centred rows."""
+    """Factor on the variance of the centred rows."""
     slow: np.ndarray
     """
-    On the variance of their slow part, where it fits better than the fast one; otherwise as
-    `every`.
+    Factor on the variance of the slow part of the centred rows, where that is smaller; otherwise
+    equal to `every`.
     """
     means: np.ndarray = field(default_factory=lambda: np.ones(3))
-    """On the variance of the window means due to the noise within windows."""
+    """Factor on the variance of window means due to the noise within windows."""
     along: float = 1.0
     """
-    Part of `every` due to misfit along the columns of the model, correlated in time; at least 1.
+    Factor contained in `every` for misfit along the columns of the model, which is correlated in
+    time; at least 1.
     """
 
 
@@ -89,7 +84,7 @@ class NoiseModel(SensorNoise):
     """
 
     known: tuple[BiasProcess, ...] = ()
-    """The ones that were measured separately, on a recording at rest."""
+    """Bias processes that were measured separately, on a recording at rest."""
     middle_wander: float = 0.0
     """
     Standard deviation of the bias process on the middle one of the axes, where it is large enough
@@ -103,7 +98,9 @@ class NoiseModel(SensorNoise):
     there is one.
     """
     session_variance: float = 0.0
-    """Its square, increased for few recordings; used in weights and standard deviations."""
+    """
+    Square of `session_sd`, increased for few recordings; used in weights and standard deviations.
+    """
     reference: ReferenceNoise = ReferenceNoise()
     """Contribution of the reference to the window means."""
     shaken: dict[tuple[int, float], np.ndarray] = field(default_factory=dict)
@@ -117,11 +114,9 @@ class NoiseModel(SensorNoise):
     @property
     def bias_time(self) -> float | None:
         """Correlation time of the largest bias process, s; None when there is none."""
-        return (
-            max(self.bias_processes, key=lambda process: process.sd).time
-            if self.bias_processes
-            else None
-        )
+        if not self.bias_processes:
+            return None
+        return max(self.bias_processes, key=lambda process: process.sd).time
 
     def mean_variance(
         self,
@@ -132,27 +127,30 @@ class NoiseModel(SensorNoise):
         keys: Sequence[tuple[int, float]] = (),
     ) -> np.ndarray:
         """
-        Return the variance of means of windows of these kinds and lengths, (k, 3).
+        Return the variance of the means of k windows from noise in them and the reference, (k, 3).
 
-        The lengths are in samples and in s. The variance is due to the noise within the windows and
-        to the reference.
+        Parameters
+        ----------
+        kinds : sequence of str
+        counts : array, shape (k,)
+            Numbers of samples.
+        durations : array, shape (k,), optional
+            s; without them the reference has no errors.
+        keys : sequence of (int, float), optional
+            (recording, middle in s) of the windows. The variance of a vibrating window is at least
+            the one in `shaken`.
 
-        The variance of vibrating windows with `keys` (recording, middle in s) is at least the one
-        estimated from their samples.
         """
-        factors = {kind: moving.means for kind, moving in self.moving.items()}
-        white = (
-            self.low_variance
-            * np.stack([factors.get(kind, np.ones(3)) for kind in kinds])
-            / np.asarray(counts, float)[:, None]
-        )
+        no_excess = np.ones(3)
+        factors = []
+        for kind in kinds:
+            factors.append(self.moving[kind].means if kind in self.moving else no_excess)
+        variance = self.low_variance * np.stack(factors) / np.asarray(counts, float)[:, None]
         if self.shaken and keys:
-            white = np.maximum(white, [self.shaken.get(key, np.zeros(3)) for key in keys])
-        return (
-            white
-            if durations is None
-            else white + self.reference.variance(kinds, durations)[:, None]
-        )
+            variance = np.maximum(variance, [self.shaken.get(key, np.zeros(3)) for key in keys])
+        if durations is None:
+            return variance
+        return variance + self.reference.variance(kinds, durations)[:, None]
 
     def variance_beside_bias(
         self,
@@ -163,47 +161,41 @@ class NoiseModel(SensorNoise):
         keys: Sequence[tuple[int, float]] = (),
     ) -> np.ndarray:
         """
-        Return the same relative to the bias in the middle of each window.
+        Return the variance of window means about the bias in the middle of the window, (k, 3).
 
-        With its change within the window, shape (k, 3).
+        That of `mean_variance`, and that of the change of the bias within the window.
         """
-        return (
-            self.mean_variance(kinds, counts, durations, keys=keys)
-            + means_beside_middles(self.bias_processes, durations)[:, None]
-        )
+        noise = self.mean_variance(kinds, counts, durations, keys=keys)
+        return noise + means_beside_middles(self.bias_processes, durations)[:, None]
 
     def wander_within(self, offsets: np.ndarray) -> np.ndarray:
         """
-        Return the covariance of the bias at instants, given its value in the middle.
+        Return the covariance of the bias at n instants, given its value in the middle, (n, n).
 
-        The instants are about the middle of a window, in s, and the result has shape (n, n).
+        For instants s, t relative to the middle (`offsets`, s), summed over the processes:
+        ``sd^2 (exp(-|s - t| / time) - exp(-(|s| + |t|) / time))``.
         """
-        away = np.abs(offsets)
-        apart = np.abs(np.subtract.outer(offsets, offsets))
-        return sum(
-            (
-                process.sd**2
-                * (np.exp(-apart / process.time) - np.exp(-np.add.outer(away, away) / process.time))
-                for process in self.bias_processes
-            ),
-            np.zeros(apart.shape),
-        )
+        to_middle = np.abs(offsets)
+        distance = np.abs(np.subtract.outer(offsets, offsets))
+        by_middle = np.add.outer(to_middle, to_middle)
+        covariance = np.zeros(distance.shape)
+        for process in self.bias_processes:
+            correlation = np.exp(-distance / process.time) - np.exp(-by_middle / process.time)
+            covariance = covariance + process.sd**2 * correlation
+        return covariance
 
     def row_variance(self, kind: str) -> np.ndarray:
         """Return the variance per centred row of windows of `kind`, shape (3,)."""
-        return (
-            self.low_variance * self.moving[kind].every
-            if kind in self.moving
-            else self.low_variance
-        )
+        if kind in self.moving:
+            return self.low_variance * self.moving[kind].every
+        return self.low_variance
 
     def slow_weight(self, kind: str) -> np.ndarray:
         """
-        Return the additional weight w of the slow part of centred rows, ``w^2 = 1/slow - 1/every``.
+        Return the additional weight w of the slow part of centred rows, shape (3,).
 
-        Shape (3,).
-
-        The sum of squares is then ``fast / every + slow / slow``, without a difference of factors.
+        ``w^2 = (1/slow - 1/every) / low_variance``: all rows have the weight ``1/every``, so that
+        the slow part has ``1/slow`` in total.
         """
         if kind not in self.moving:
             return np.zeros(3)
@@ -211,38 +203,32 @@ class NoiseModel(SensorNoise):
         return np.sqrt(np.maximum(1 / factors.slow - 1 / factors.every, 0.0) / self.low_variance)
 
     def at_rest_only(self, *processes: BiasProcess) -> 'NoiseModel':
-        """
-        Return the model of noise only.
-
-        No offsets, no misfit along the columns, and only the given bias processes.
-        """
-        moving = {
-            kind: replace(factors, every=factors.every / factors.along)
-            for kind, factors in self.moving.items()
-        }
-        moving = {
-            kind: replace(factors, means=np.minimum(factors.means, np.maximum(factors.every, 1.0)))
-            for kind, factors in moving.items()
-        }
+        """Return the noise without window offsets and misfit, with the given bias processes."""
+        moving = {}
+        for kind, factors in self.moving.items():
+            every = factors.every / factors.along
+            means = np.minimum(factors.means, np.maximum(every, 1.0))
+            moving[kind] = replace(factors, every=every, means=means)
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
 
     def weighs_alike(self, other: 'NoiseModel') -> bool:
         """
-        Return whether slow parts count no more than fast ones, or the weights are equal.
+        Return whether the weights of moving windows are those of `other` within `SAME_VARIANCE`.
 
-        Weights are equal if they agree with the weights of `other` within `SAME_VARIANCE`.
+        A kind of window without additional weight of its slow part is not compared.
         """
-        for kind, mine in self.moving.items():
-            if np.all(mine.slow == mine.every):
+        variance_ratio = self.low_variance / other.low_variance
+        for kind, factors in self.moving.items():
+            if np.all(factors.slow == factors.every):
                 continue
             if kind not in other.moving:
                 return False
-            its = other.moving[kind]
-            unit = self.low_variance / other.low_variance
-            if any(
-                np.any(np.abs(unit * a / b - 1) > SAME_VARIANCE)
-                for a, b in ((mine.every, its.every), (mine.slow, its.slow))
-            ):
+            other_factors = other.moving[kind]
+            change_of_every = variance_ratio * factors.every / other_factors.every - 1
+            change_of_slow = variance_ratio * factors.slow / other_factors.slow - 1
+            if np.any(np.abs(change_of_every) > SAME_VARIANCE):
+                return False
+            if np.any(np.abs(change_of_slow) > SAME_VARIANCE):
                 return False
         return True
 

@@ -1,4 +1,4 @@
-"""Observability of parameters: what standard motions add to the information of a recording."""
+"""Observability of parameters, and the information that standard motions add to a recording."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ SAMPLES_PER_POINT = 2.0
 @dataclass(frozen=True, eq=False)
 class MotionInformation:
     """
-    What standard motions would add to the information about the parameters of a model.
+    Information about the parameters of a model that standard motions add.
 
     Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this
     session.
@@ -63,9 +63,9 @@ class _HashableLayout:
     """The columns of one sensor, equal to those of another model with the same columns."""
 
     rows: tuple[tuple[str, int, int], ...]
-    """Name, first column and last column + 1 of each group."""
+    """(name, first column, last column + 1) of each group."""
     groups: tuple[ColumnGroup, ...]
-    """What the columns of the groups are."""
+    """Definition of the columns of each group."""
     point: tuple[tuple[str, bytes], ...]
     """Values of the effects where the columns were linearised."""
     layout: ColumnLayout = field(compare=False)
@@ -73,6 +73,7 @@ class _HashableLayout:
 
     @classmethod
     def of(cls, layout: ColumnLayout) -> '_HashableLayout':
+        """Return a layout with the values by which it is compared."""
         rows = tuple((name, part.start, part.stop) for name, part in layout.rows.items())
         point = tuple(
             (name, np.asarray(values, float).tobytes()) for name, values in layout.point.items()
@@ -95,18 +96,18 @@ class _MotionColumns:
 
     def information(self, slope: np.ndarray, noise: SensorNoise) -> np.ndarray:
         """
-        Return the information, shape (n_params, n_params).
+        Return the sum of ``A' V^-1 A`` over all rows and axes, shape (n_params, n_params).
 
-        ``slope`` is the derivative of the coefficients by the parameters, shape (n_columns, 3,
+        `slope` is the derivative of the coefficients by the parameters, shape (n_columns, 3,
         n_params).
         """
         information = np.zeros((slope.shape[2], slope.shape[2]))
         for axis in range(3):
-            # The mean has an offset of the window besides its noise, the centred rows have none.
+            # Only the mean has an offset of the window in addition to its noise.
             rows = self.means @ slope[:, axis]
             variance = noise.low_variance[axis]
-            of_mean = variance / self.counts + noise.offset_sd**2 + noise.bias_variance
-            information += rows.T @ (rows / of_mean[:, None])
+            mean_variance = variance / self.counts + noise.offset_sd**2 + noise.bias_variance
+            information += rows.T @ (rows / mean_variance[:, None])
             if self.within is not None:
                 information += slope[:, axis].T @ self.within @ slope[:, axis] / variance
         return information
@@ -115,7 +116,7 @@ class _MotionColumns:
 # A live session uses 26 rests and some twenty motions, for two sensors.
 @lru_cache(maxsize=128)
 def _motion_columns(columns: _HashableLayout, motion: Motion, gravity: float) -> _MotionColumns:
-    """Return the columns of a motion."""
+    """Return means and sums of squares of the columns of one sensor in the pieces of a motion."""
     layout = columns.layout
     means = []
     counts = []
@@ -129,14 +130,14 @@ def _motion_columns(columns: _HashableLayout, motion: Motion, gravity: float) ->
             continue
         counts.append(SAMPLES_PER_POINT * len(piece))
         centred = design - means[-1]
-        of_piece = SAMPLES_PER_POINT * centred.T @ centred
-        within = of_piece if within is None else within + of_piece
+        squares = SAMPLES_PER_POINT * centred.T @ centred
+        within = squares if within is None else within + squares
     return _MotionColumns(np.array(means), np.array(counts), within)
 
 
 def _columns(layout: ColumnLayout, name: str, rows: slice, piece: Reference) -> np.ndarray:
     """
-    Return the columns of a group.
+    Return the columns of a group at the samples of a piece, shape (n, width).
 
     Zeros where the motion has no temperature or no joints, and for columns of a warp.
     """
@@ -151,12 +152,11 @@ def _columns(layout: ColumnLayout, name: str, rows: slice, piece: Reference) -> 
 
 def tolerance_scaled_singular_values(information: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
     """
-    Return the singular values of the scaled design, descending.
+    Return the singular values of the design in units of the tolerances, descending.
 
-    The design has its parameters in units of their tolerance.
-
-    A value of one means that the direction is determined to one tolerance; below one it is weak.
-    Rank is no sufficient criterion.
+    They are the roots of the eigenvalues of ``T information T``, T the tolerances. A value of one
+    means that the direction is determined to one tolerance; below one it is weak. Rank is no
+    sufficient criterion.
     """
     scaled = information * np.outer(tolerances, tolerances)
     return np.sqrt(np.clip(scipy.linalg.eigvalsh((scaled + scaled.T) / 2)[::-1], 0, None))
@@ -176,16 +176,16 @@ def weak_directions(
     """
     scaled = covariance / np.outer(tolerances, tolerances)
     variances, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
-    found = []
+    directions = []
     for variance, vector in sorted(zip(variances, vectors.T), key=lambda pair: -pair[0]):
-        if variance <= 1.0 or len(found) >= limit:
+        if variance <= 1.0 or len(directions) >= limit:
             break
+        # The largest weight is positive; small ones are omitted.
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
-        strong = np.abs(vector) >= 0.2 * np.max(np.abs(vector))
-        found.append(
-            {names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(strong).tolist()}
-        )
-    return found
+        is_large = np.abs(vector) >= 0.2 * np.max(np.abs(vector))
+        weights = {names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(is_large).tolist()}
+        directions.append(weights)
+    return directions
 
 
 def needed_motions(
@@ -197,12 +197,10 @@ def needed_motions(
     possible: Sequence[Motion] | None = None,
 ) -> dict[str, tuple[str, float]]:
     """
-    Return the most helpful standard motion for each undetermined parameter.
+    Return the standard motion that reduces the sd of each undetermined parameter most.
 
-    It is the motion that reduces the standard deviation of the parameter most.
-
-    Every motion of the catalogue is tried: its information is added, and the predicted standard
-    errors are compared with the tolerances. A table that turns the sensor about one axis only can
+    Every motion of the catalogue is tried: its information is added to that of the recording. A
+    table that turns the sensor about one axis only can
     do few of them (`possible`): where none of these would help, the IMU must be remounted.
 
     Returns
@@ -215,23 +213,25 @@ def needed_motions(
     if not len(lacking):
         return {}
     base = _information_of(solution, prior_sd)
-    # The model error remains: a motion reduces the noise only.
-    remaining = np.maximum(solution.sd / _sd_of(base), 1.0)
+    # A motion reduces the noise only: the ratio of the sd with model errors to that without them
+    # is assumed to be constant.
+    ratio = np.maximum(solution.sd / _sd_of(base), 1.0)
     information = MotionInformation(solution.model, solution.values, solution.noise, gravity)
     predicted = {}
     for motion in MOTIONS if possible is None else possible:
-        predicted[motion] = _sd_of(base + information.added_by(motion)) * remaining
-    return {
-        solution.param_names[k]: _best(solution, k, predicted, one_joint=possible is not None)
-        for k in lacking.tolist()
-    }
+        predicted[motion] = _sd_of(base + information.added_by(motion)) * ratio
+    needed = {}
+    for k in lacking.tolist():
+        name = solution.param_names[k]
+        needed[name] = _best(solution, k, predicted, one_joint=possible is not None)
+    return needed
 
 
 def sd_of_data(solution: Solution, prior_sd: np.ndarray) -> np.ndarray:
     """
-    Return the standard deviations that the recording has from noise, shape (n_params,).
+    Return the standard deviations of the parameters from noise only, shape (n_params,).
 
-    No parameter is held, and there are no allowances.
+    With the information of the recording and the prior, without model errors or held parameters.
     """
     return _sd_of(_information_of(solution, prior_sd))
 
@@ -250,9 +250,10 @@ def _best(
     solution: Solution, index: int, predicted: dict[Motion, np.ndarray], *, one_joint: bool
 ) -> tuple[str, float]:
     """
-    Return (text, predicted sd) of the best motion.
+    Return (text, predicted sd) of the best motion for one parameter.
 
-    Where none helps, another mount or the motion of the effect, and NaN.
+    Where none helps, (another mount or the motion of the effect, NaN). `predicted`: motion -> sd of
+    all parameters after it.
     """
     motion = min(predicted, key=lambda m: predicted[m][index], default=None)
     if motion is not None and predicted[motion][index] <= 0.7 * solution.sd[index]:

@@ -15,18 +15,18 @@ def unpacked(factors: Sequence[np.ndarray], width: int) -> np.ndarray:
     """
     Return packed factors of `width` columns as one stack, shape (n_factors, n_rows, width).
 
-    Rows of zeros complete the shorter ones.
+    Factors with fewer rows are completed by rows of zeros.
     """
-    places = _places(width)
+    indices = _indices_of_triangle(width)
     longest = max(map(len, factors))
-    rows = places[longest - 1] // width + 1 if longest else 0
-    found = np.zeros((len(factors), rows * width))
-    for row, factor in zip(found, factors):
-        row[places[: len(factor)]] = factor
-    return found.reshape(len(factors), rows, width)
+    n_rows = indices[longest - 1] // width + 1 if longest else 0
+    stack = np.zeros((len(factors), n_rows * width))
+    for flat, factor in zip(stack, factors):
+        flat[indices[: len(factor)]] = factor
+    return stack.reshape(len(factors), n_rows, width)
 
 
 @lru_cache(maxsize=8)
-def _places(width: int) -> np.ndarray:
-    """Return the places of the upper triangle among the elements of a square matrix, row by row."""
+def _indices_of_triangle(width: int) -> np.ndarray:
+    """Return the indices of the upper triangle in a flattened square matrix, row by row."""
     return np.flatnonzero(np.triu(np.ones((width, width), bool)))

@@ -1,4 +1,4 @@
-"""Columns of a model linearised again where its solution is far from their point."""
+"""Repeated linearisation of the columns of a model at its solution."""
 
 import numpy as np
 
@@ -18,25 +18,28 @@ LEAST_TIME_CONSTANT = 0.3
 
 def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
     """
-    Return the model linearised at a solution outside the validity of its linearisation, else None.
+    Return the model linearised at a solution, or None if its linearisation is valid there.
+
+    It is valid up to three standard deviations or five steps of a numerical derivative.
     """
     for effect in model.relinearised:
         if effect.key in solution.model.slices:
             part = solution.model.slices[effect.key]
-            moved = np.abs(solution.values[part] - model.point_of(effect))
-            if np.any(moved > np.maximum(3 * solution.sd[part], 5 * effect.step)):
-                return model.at(model.start_from(solution.model, _cautious(solution)))
+            distance = np.abs(solution.values[part] - model.point_of(effect))
+            if np.any(distance > np.maximum(3 * solution.sd[part], 5 * effect.step)):
+                return model.at(model.start_from(solution.model, _next_point(solution)))
     return None
 
 
-def _cautious(solution: Solution) -> np.ndarray:
+def _next_point(solution: Solution) -> np.ndarray:
     """
-    Return values to linearise at: those of the solution, except along weakly determined directions.
+    Return the next point of linearisation, shape (n_params,).
 
-    At zero, lag and delay have the same first derivative. They are separable only at a point where
-    both are nonzero; a full step along their difference would be arbitrary. The step is therefore
-    regularised with LINEAR_STEPS towards the point. A time constant is positive: its step ends at
-    the share `LEAST_TIME_CONSTANT` of the point at the latest.
+    It is the solution, except for weakly determined directions of delays and lags. At zero, lag and
+    delay have the same first derivative. They are separable only at a point where both are nonzero;
+    a full step along their difference would be arbitrary. The step d is therefore regularised, with
+    the information I of the solution and ``P = (LINEAR_STEPS step)^-2``: ``(I + P)^-1 I d``. A time
+    constant is positive: it is at least the share `LEAST_TIME_CONSTANT` of the one before.
     """
     model = solution.model
     values = solution.values.copy()
@@ -44,19 +47,17 @@ def _cautious(solution: Solution) -> np.ndarray:
         if effect.time_constant:
             last = model.slices[effect.key].stop - 1
             values[last] = max(values[last], LEAST_TIME_CONSTANT * model.point_of(effect)[-1])
-    move = np.zeros(len(values))
-    pull = np.zeros(len(values))
+    step = np.zeros(len(values))
+    precision = np.zeros(len(values))  # the diagonal of P
     for effect in model.relinearised:
         if effect.warp is not None:
             part = model.slices[effect.key]
-            move[part], pull[part] = (
-                values[part] - model.point_of(effect),
-                (LINEAR_STEPS * effect.step) ** -2,
-            )
-    moving = np.flatnonzero(pull)
-    if not len(moving):
+            step[part] = values[part] - model.point_of(effect)
+            precision[part] = (LINEAR_STEPS * effect.step) ** -2
+    warps = np.flatnonzero(precision)
+    if not len(warps):
         return values
-    known = np.linalg.inv(solution.covariance[np.ix_(moving, moving)])
-    kept = values.copy()
-    kept[moving] -= np.linalg.solve(known + np.diag(pull[moving]), pull[moving] * move[moving])
-    return kept
+    information = np.linalg.inv(solution.covariance[np.ix_(warps, warps)])
+    regularised = information + np.diag(precision[warps])
+    values[warps] -= np.linalg.solve(regularised, precision[warps] * step[warps])
+    return values

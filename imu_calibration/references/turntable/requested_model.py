@@ -16,33 +16,35 @@ from imu_calibration.references.turntable.session_data import SessionData
 
 def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     """
-    Return the model of the gathered columns.
+    Return the model that options request, with the size effect of the accelerometer by default.
 
-    `settle_model` removes the size effect if the rotation does not determine it.
-
-    With an unknown place of the mount, the size effect includes a common `lever_arm` and the origin
-    is the mean of the three sensitive points.
+    `settle_model` removes the size effect after the windows are gathered, if the rotation does not
+    determine it. With an unknown place of the mount, it includes a common `lever_arm`, and the
+    origin is the mean of the three sensitive points.
     """
     names = table.joint_names
-    asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
-    chosen = {
-        sensor: parse_effects(
+    effects = {}
+    for sensor, text in (
+        ('accelerometer', options.accelerometer_model),
+        ('gyroscope', options.gyroscope_model),
+    ):
+        effects[sensor] = parse_effects(
             sensor, text or DEFAULT_MODEL[sensor], names, catalogue=options.catalogue
         )
-        for sensor, text in asked.items()
-    }
     model = SensorModel(
-        chosen['accelerometer'],
-        chosen['gyroscope'],
+        effects['accelerometer'],
+        effects['gyroscope'],
         reference=parse_reference(options.reference_model, table),
         joint_names=names,
         catalogue=options.catalogue,
     )
-    model = with_common_arm(model) if table.mount_xyz is None else model
+    if table.mount_xyz is None:
+        model = with_common_arm(model)
     for sensor, name in options.added:
-        model = model if (sensor, name) in model.slices else model.with_effect(sensor, name)
-    known = {effect.name for effect in model.effects}
-    point = {name: value for name, value in options.point.items() if name in known}
+        if (sensor, name) not in model.slices:
+            model = model.with_effect(sensor, name)
+    in_model = {effect.name for effect in model.effects}
+    point = {name: value for name, value in options.point.items() if name in in_model}
     return replace(model, point={**model.point, **point})
 
 
@@ -52,8 +54,11 @@ def settle_model(
     """
     Return the model without the size effect if it is neither requested nor determined.
 
-    The effect is removed if it was not requested and the recording has no rotation that determines
-    it.
+    Only windows with a rotation determine it.
     """
-    turns = any(gathered.accumulator.samples.get(kind) for kind in ('spin', 'dynamic'))
-    return model if options.accelerometer_model is not None or turns else model.without_arms()
+    if options.accelerometer_model is not None:
+        return model
+    samples = gathered.accumulator.samples
+    if samples.get('spin') or samples.get('dynamic'):
+        return model
+    return model.without_arms()

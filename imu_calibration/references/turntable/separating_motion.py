@@ -1,4 +1,4 @@
-"""The motion of a table that separates an effect from one that would do as well."""
+"""The motion of a table that separates a finding from a collinear effect."""
 
 import numpy as np
 
@@ -30,43 +30,51 @@ def separating_motion(
     solution: Solution, question: Question, mate: Question, *, gravity: float
 ) -> str:
     """
-    Return the standard motion that separates the mate from the effect found.
+    Return the text of the standard motion that separates a finding from a collinear effect.
 
-    After this motion the mate could no longer pass for the effect that was found.
-
-    For each motion: its added information about the extended model and the mate, and from that the
-    part of the effect that is not collinear with the mate and the model, in squared standard
-    deviations.
+    For each motion, the model is extended by the mate, and the values v of the finding have the
+    covariance C after the motion alone. The best motion has the largest evidence ``v' C^-1 v``: it
+    counts only the part of the finding that is not collinear with the mate and the model. If no
+    evidence exceeds `MIN_EVIDENCE_GROWTH`, the motions of both effects.
 
     Parameters
     ----------
     solution : Solution
         Of the extended model.
     question, mate : Question
-        The finding and an effect that would do as well.
+        The finding and the collinear effect.
 
     """
-    best = MIN_EVIDENCE_GROWTH, motions_of(question, mate)
-    if not all(each.sensor in SENSORS and each.effect.groups for each in (question, mate)):
-        return best[1]
+    best_text = motions_of(question, mate)
+    for tested in (question, mate):
+        # The standard motions show effects of the sensors with columns only.
+        if tested.sensor not in SENSORS or not tested.effect.groups:
+            return best_text
     model = solution.model.with_effect(mate.sensor, mate.name)
     values = model.start_from(solution.model, solution.values)
     values = np.where(np.isfinite(values), values, 0.0)
     prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
-    own = model.slices[question.sensor, question.name]
+    part = model.slices[question.sensor, question.name]
     information = MotionInformation(model, values, solution.noise, gravity)
+    largest = MIN_EVIDENCE_GROWTH
     for motion in MOTIONS:
         total = np.diag(1 / prior_sd**2) + information.added_by(motion)
-        left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
-        if left > best[0]:
-            best = left, motion.text
-    return best[1]
+        covariance = inverse_normal(total)[part, part]
+        evidence = float(values[part] @ np.linalg.solve(covariance, values[part]))
+        if evidence > largest:
+            largest = evidence
+            best_text = motion.text
+    return best_text
 
 
 def motions_of_one_joint(question: Question, mate: Question) -> str:
-    """Return the same of a table that turns about one axis only, which cannot do most of them."""
-    own = dict.fromkeys(question.effect.motion + mate.effect.motion)
-    found = [ONE_JOINT[name] for name in own if name in ONE_JOINT]
-    if len(found) < len(own):
-        found.append(OTHER_MOUNT)
-    return '; '.join(found)
+    """
+    Return the text of the motions of both effects that a table with one joint can do.
+
+    If it cannot do all of them, the advice to mount the IMU differently is added.
+    """
+    names = dict.fromkeys(question.effect.motion + mate.effect.motion)
+    texts = [ONE_JOINT[name] for name in names if name in ONE_JOINT]
+    if len(texts) < len(names):
+        texts.append(OTHER_MOUNT)
+    return '; '.join(texts)

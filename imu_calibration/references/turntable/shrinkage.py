@@ -1,4 +1,4 @@
-"""Values of effects that nobody requested, shrunk towards their prior."""
+"""Values of effects that were not requested, shrunk towards their prior."""
 
 import numpy as np
 
@@ -8,12 +8,13 @@ from imu_calibration.estimation.solution import CONVENTION_SHARE, Solution, of_f
 
 def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     """
-    Return a Solution in which the values of some effects are shrunk towards their prior.
+    Return a solution in which the values of some effects are shrunk towards their prior.
 
-    The factor is ``1 - k / chi2``, at least 0 (James and Stein), chi2 the squared distance from the
-    prior in standard deviations, k its number of directions. The other parameters are updated as if
-    the effect were known at the shrunk value. An absent effect then hardly raises the error of the
-    other parameters, a significant effect is kept, and the standard deviations hold in both cases.
+    With the distance d of an effect from its prior, its covariance C and ``chi2 = d' C^-1 d`` in k
+    directions, d is multiplied by ``1 - k / chi2``, at least 0 (James and Stein). The other
+    parameters are updated as if the effect were known at the shrunk value. An absent effect then
+    adds little error to the other parameters, a significant effect is kept, and the standard
+    deviations are valid in both cases.
 
     Parameters
     ----------
@@ -26,17 +27,17 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     prior = make_prior(solution.model).mean
     covariance = of_fit(solution.terms)
     for part in parts:
-        at = np.arange(part.start, part.stop)[~solution.held[part]]
-        if not len(at):
+        index = np.arange(part.start, part.stop)[~solution.held[part]]
+        if not len(index):
             continue
-        sd = np.sqrt(np.diag(covariance)[at])
-        sizes, directions = np.linalg.eigh(covariance[np.ix_(at, at)] / np.outer(sd, sd))
-        known = sizes > CONVENTION_SHARE * sizes[-1]
-        far = directions[:, known].T @ ((values[at] - prior[at]) / sd)
-        chi2 = float((far**2 / sizes[known]).sum())
-        # Inverse covariance times the distance.
-        step = directions[:, known] @ (far / sizes[known]) / sd
-        values -= min(1.0, known.sum() / max(chi2, 1e-300)) * np.where(
-            solution.held, 0.0, covariance[:, at] @ step
-        )
+        sd = np.sqrt(np.diag(covariance)[index])
+        variances, directions = np.linalg.eigh(covariance[np.ix_(index, index)] / np.outer(sd, sd))
+        # Without the directions that a convention fixes.
+        is_free = variances > CONVENTION_SHARE * variances[-1]
+        distance = directions[:, is_free].T @ ((values[index] - prior[index]) / sd)
+        chi2 = float((distance**2 / variances[is_free]).sum())
+        weighted = directions[:, is_free] @ (distance / variances[is_free]) / sd  # C^-1 d
+        # The shift of all parameters if the effect is set to its prior: cov(all, effect) C^-1 d.
+        to_prior = np.where(solution.held, 0.0, covariance[:, index] @ weighted)
+        values -= min(1.0, is_free.sum() / max(chi2, 1e-300)) * to_prior
     return solution.at(values)

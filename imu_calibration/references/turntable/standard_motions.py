@@ -14,8 +14,10 @@ from imu_calibration.kinematics.rotations import Reference, attitudes_with_verti
 from imu_calibration.kinematics.signal_history import TemperatureSlope, ThermalBranch
 from imu_calibration.kinematics.sphere import DIRECTIONS
 
-REST, WAY = 5.0, 3.0
-"""s; a rest, and the time from one rest to the next."""
+REST = 5.0
+"""Duration of a rest, s."""
+MOVE_TIME = 3.0
+"""Time from one rest or piece to the next, s."""
 MIN_AXIS_COSINE = 0.98
 """Cosine of the angle up to which a joint lies along a sensor axis."""
 OTHER_MOUNT = (
@@ -51,13 +53,13 @@ class Motion:
         seconds = 0.0
         for piece in self.make(STANDARD_GRAVITY):
             is_rest = len(piece) == 1
-            seconds += WAY + (REST if is_rest else float(piece.time[-1] - piece.time[0]))
+            seconds += MOVE_TIME + (REST if is_rest else float(piece.time[-1] - piece.time[0]))
         return seconds
 
 
 @dataclass(frozen=True, eq=False)
 class _Surroundings:
-    """What a piece of a motion has besides the turn; None: nothing."""
+    """Conditions of a piece of a motion in addition to the turn; None: without."""
 
     arm: np.ndarray | None = None
     """Arm from the axis of the turn, m, shape (3,)."""
@@ -124,12 +126,15 @@ def _turn(
 
 
 MOTION_TIME = np.arange(0.0, 30.0, 0.02)
+"""Points in time of a moving piece, s."""
 FACES_UP = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
 """The six faces turned up, in the sensor frame, shape (6, 3)."""
-OSCILLATION_RATE, OSCILLATION_ANGLE = 2 * np.pi, 30 * DEG
-"""rad/s and rad."""
+OSCILLATION_RATE = 2 * np.pi
+"""Angular frequency of oscillations, rad/s."""
+OSCILLATION_ANGLE = 30 * DEG
+"""Amplitude of oscillations, rad."""
 OBLIQUE = (0.3, 0.4, 1.0)
-"""The vertical in the sensor in oscillations, where nothing else is wanted."""
+"""Default of the vertical in the sensor in oscillations."""
 
 
 def _spin(
@@ -142,6 +147,7 @@ def _spin(
     still = np.zeros(len(MOTION_TIME))
 
     def make(gravity: float) -> list[Reference]:
+        """Return a piece for each speed."""
         pieces = []
         for speed in speeds_deg_s:
             rate = np.full(len(MOTION_TIME), speed * DEG)
@@ -164,9 +170,11 @@ def _spin(
 
 def _oscillation(axis: ArrayLike, up: ArrayLike | None = None) -> Pieces:
     """Return the pieces of an oscillation ``a sin(w t)`` about an axis."""
-    w, a = OSCILLATION_RATE, OSCILLATION_ANGLE
+    w = OSCILLATION_RATE
+    a = OSCILLATION_ANGLE
 
     def make(gravity: float) -> list[Reference]:
+        """Return the oscillation as one piece."""
         turn = _turn(
             axis,
             MOTION_TIME,
@@ -203,6 +211,7 @@ def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ())
     """Return the pieces of rests with each direction up, once or at each temperature."""
 
     def make(gravity: float) -> list[Reference]:
+        """Return a piece for each rest."""
         if not temperatures:
             return [_rest(up, number, gravity) for number, up in enumerate(directions)]
         rests = list(enumerate(directions))
@@ -224,7 +233,7 @@ def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ())
 
 
 def _shaken(gravity: float) -> list[Reference]:
-    """Rest in six faces, quiet and while the sensor is shaken along each axis."""
+    """Return rests with each face up, quiet and while the sensor is shaken along each axis."""
     pieces = []
     for shaking in (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3)):
         shaken = _Surroundings(shaking=shaking)
@@ -234,9 +243,10 @@ def _shaken(gravity: float) -> list[Reference]:
 
 def _two_axis(gravity: float) -> list[Reference]:
     """
-    Turn about an axis that itself turns.
+    Return turns at a rate w about one axis of the sensor, which itself turns at w about another.
 
-    Rates about two axes at once, with the cross term in the angular acceleration.
+    The rate about the second axis rotates in the sensor, ``w (cos, -sin)``, with the derivative
+    ``-w^2 (sin, cos)``; the vertical rotates with it.
     """
     pieces = []
     w = 200 * DEG
@@ -246,9 +256,12 @@ def _two_axis(gravity: float) -> list[Reference]:
         third = 3 - inner - outer
         rate, alpha, up = np.zeros((3, len(MOTION_TIME), 3))
         rate[:, inner] = w
-        rate[:, outer], rate[:, third] = w * cos, -w * sin
-        alpha[:, outer], alpha[:, third] = -w * w * sin, -w * w * cos
-        up[:, outer], up[:, third] = cos, -sin
+        rate[:, outer] = w * cos
+        rate[:, third] = -w * sin
+        alpha[:, outer] = -w * w * sin
+        alpha[:, third] = -w * w * cos
+        up[:, outer] = cos
+        up[:, third] = -sin
         pieces.append(
             Reference(MOTION_TIME, attitudes_with_vertical(up), gravity * up, rate, alpha, gravity)
         )
@@ -256,7 +269,7 @@ def _two_axis(gravity: float) -> list[Reference]:
 
 
 def _three_speeds(gravity: float) -> list[Reference]:
-    """Spins about skewed axes and about the axes of the sensor."""
+    """Return spins at three speeds about skewed axes and about the axes of the sensor."""
     pieces = []
     for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), *AXIS_DIRECTIONS):
         pieces += _spin(axis, (-200, -100, -50, 50, 100, 200))(gravity)
@@ -264,7 +277,7 @@ def _three_speeds(gravity: float) -> list[Reference]:
 
 
 def _centrifuge(gravity: float) -> list[Reference]:
-    """Fast spins about each axis, the sensor on an arm across it."""
+    """Return fast spins about each axis, the sensor on an arm perpendicular to it."""
     pieces = []
     for axis in np.eye(3):
         pieces += _spin(axis, (-300, 300), arm=0.3 * np.roll(axis, 1))(gravity)
@@ -284,10 +297,12 @@ AXIS_DIRECTIONS: tuple[Axis, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def _spins_about(axis: Axis, up: ArrayLike | None = None) -> Motion:
+    """Return the motion of spins about an axis of the sensor."""
     return Motion(f'spin_{"xyz"[axis.index(1)]}', _spin(axis, SPINS, up), axis)
 
 
 def _oscillates_about(axis: Axis, up: ArrayLike | None = None) -> Motion:
+    """Return the motion of an oscillation about an axis of the sensor."""
     return Motion(f'oscillate_{"xyz"[axis.index(1)]}', _oscillation(axis, up), axis)
 
 
@@ -303,17 +318,15 @@ MOTIONS = (
     Motion('warm_and_cool', _poses(FACES_UP, (20.0, 25.0, 30.0, 25.0, 20.0))),
     Motion('shake', _shaken),
 )
-"""Those of `effects.motions.SENSOR_MOTIONS`, in that order."""
+"""The motions of `effects.motions.SENSOR_MOTIONS`, in that order."""
 
 
 def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
     """
     Return the motions of a table that turns the sensor about one axis only.
 
-    None where that is no axis of the sensor.
-
-    Gravity has the same direction relative to the axis as on the table: for a vertical axis it is
-    constant in the sensor frame.
+    No motions where that is no axis of the sensor. Gravity has the same direction relative to the
+    axis as on the table: for a vertical axis it is constant in the sensor frame.
 
     Parameters
     ----------
@@ -321,17 +334,21 @@ def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
         Unit vectors of the axis and of the vertical, sensor frame, at any angle of the joint.
 
     """
-    along = [axis for axis in AXIS_DIRECTIONS if abs(float(np.dot(axis, axis_s))) > MIN_AXIS_COSINE]
-    if not along:
+    for axis in AXIS_DIRECTIONS:
+        cosine = np.dot(axis, axis_s)
+        if abs(float(cosine)) > MIN_AXIS_COSINE:
+            break
+    else:
         return ()
-    share = float(np.clip(np.dot(axis_s, up_s) * np.sign(np.dot(along[0], axis_s)), -1.0, 1.0))
-    up = share * np.array(along[0], float) + np.sqrt(1.0 - share**2) * np.roll(along[0], 1)
-    return _motions_about(along[0], tuple(up.tolist()))
+    # Component of the vertical along the axis; the remaining one is along the next axis.
+    along = float(np.clip(np.dot(axis_s, up_s) * np.sign(cosine), -1.0, 1.0))
+    up = along * np.array(axis, float) + np.sqrt(1.0 - along**2) * np.roll(axis, 1)
+    return _motions_about(axis, tuple(up.tolist()))
 
 
 @lru_cache(maxsize=16)
 def _motions_about(axis: Axis, up: tuple[float, ...]) -> tuple[Motion, ...]:
-    """Return the same motions for the same axis: what is known of them is found again."""
+    """Return the same objects for the same axis, as their columns are cached by motion."""
     return _spins_about(axis, up), _oscillates_about(axis, up)
 
 

@@ -138,7 +138,7 @@ class TableRecordings:
 
 @dataclass(frozen=True, eq=False)
 class RecordingReadOnce(TableRecordings):
-    """A recording of which later linearisations reduce the windows of the first pass."""
+    """A recording that is read once; later passes reduce its windows of the first pass again."""
 
     windows: StoredWindows | KeptWindows = field(default_factory=StoredWindows)
     """Its windows; empty before the first pass."""
@@ -148,8 +148,10 @@ class RecordingReadOnce(TableRecordings):
     def reduced(self, step: GatherStep) -> list[SessionData]:
         """Return the windows of the recording, reduced with the columns of a model."""
         if self.first_pass and self.windows.is_complete:
-            used = (reduce_window(window, step.model, step.table) for window in self.windows.used())
-            return [self.first_pass[0].with_windows(used, step.judged_from)]
+            reduced = (
+                reduce_window(window, step.model, step.table) for window in self.windows.used()
+            )
+            return [self.first_pass[0].with_windows(reduced, step.judged_from)]
         self.windows.clear()
         self.first_pass.clear()
         (source,) = self.sources
@@ -157,7 +159,7 @@ class RecordingReadOnce(TableRecordings):
         return [*self.first_pass]
 
     def checks(self, step: GatherStep) -> Preflight:
-        """Return the checks to which the recording is shown while it is read."""
+        """Return the checks that see the samples while the recording is read."""
         return Preflight(step.table.gravity_value, one_sensor=True)
 
 
@@ -166,7 +168,7 @@ class StoredRecording(RecordingReadOnce):
     """A recording that is read once, with all windows in a temporary file."""
 
     windows: StoredWindows = field(default_factory=StoredWindows)
-    """Its windows, unused ones too."""
+    """All its windows, unused ones too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,34 +176,35 @@ class KeptRecording(RecordingReadOnce):
     """A recording that is read once, unless it is long: then each pass reads it."""
 
     windows: KeptWindows = field(default_factory=KeptWindows)
-    """Its used windows."""
+    """Its windows without unused ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class WatchedRecording(KeptRecording):
-    """A recording that is shown to given checks when it is read for the first time."""
+    """A recording with given checks for the first pass; their findings are read by the caller."""
 
     preflight: Preflight = field(default_factory=Preflight)
     """The checks."""
 
     def checks(self, step: GatherStep) -> Preflight:
-        """Return the given checks, of the first pass only."""
-        return super().checks(step) if self.preflight.streams else self.preflight
+        """Return the given checks in the first pass, and new ones in later passes."""
+        was_used = bool(self.preflight.streams)
+        return super().checks(step) if was_used else self.preflight
 
 
 def solve_in_passes(
     source: WindowSource, model: SensorModel, options: CalibrationOptions
 ) -> SolvedWindows:
     """
-    Return the solution at a linearisation that is valid at it.
+    Return the solution of a model, with columns that are linearised close to it.
 
-    Each pass reduces all windows with the columns of a model. A drift that has settled is judged on
-    the last third, which is known after a pass only.
+    Each pass reduces all windows with the columns of a model. Where a drift has settled, the last
+    third of the recording is judged; its start follows from the solution of a pass.
     """
-    again = _at_time_constants(source, model, options)
+    next_model = _at_time_constants(source, model, options)
     judged_from = 0.0
     for _ in range(MAX_TABLE_PASSES):
-        model = again
+        model = next_model
         solved = source.solved_at(model, options, judged_from=judged_from)
         solution = solved.solution
         linearised = linearise_again(model, solution)
@@ -209,7 +212,7 @@ def solve_in_passes(
         last_third = judged_from_of(latest, end_of(solved.data.gathered.accumulator))
         if linearised is None and judged_from == last_third:
             break
-        again = linearised or model
+        next_model = linearised or model
         judged_from = last_third
     return solved
 
@@ -218,21 +221,21 @@ def _at_time_constants(
     source: WindowSource, model: SensorModel, options: CalibrationOptions
 ) -> SensorModel:
     """
-    Return the model with the columns of requested warm-ups.
+    Return the model with the columns of requested warm-ups at their best time constants.
 
-    The columns are at the time constant with the smallest residuals of window means.
-
-    The iteration from the prior does not converge to a time constant that is several times shorter.
+    Several time constants are tried, because the iteration from the prior does not converge to one
+    that is several times shorter; the best one has the smallest residuals of window means.
     """
     for effect in model.effects:
         if effect.time_constant and effect.name not in options.point:
             gathered = source.solved_at(model, options, judged_from=0.0).data.gathered
             trials = at_time_constants(model, effect, end_of(gathered.accumulator))
-            of_means = []
+            residuals_of_means = []
             for trial in trials:
                 solution = source.solved_at(trial, options, judged_from=0.0).solution
-                of_means.append(solution.residual_rms[effect.sensor][1])
-            model = trials[int(np.argmin(of_means))]
+                _, of_means = solution.residual_rms[effect.sensor]
+                residuals_of_means.append(of_means)
+            model = trials[int(np.argmin(residuals_of_means))]
     return model
 
 
@@ -253,14 +256,15 @@ def solve_gathered(
     gathered: SessionData, model: SensorModel, options: CalibrationOptions = CalibrationOptions()
 ) -> Solution:
     """
-    Return the Solution of gathered data with the columns of `model` for the requested effects.
+    Return the solution of gathered windows for the effects that options request.
 
-    The reduce step.
+    `model`: the model of their columns. The size effect of the accelerometer is removed where it
+    was not requested and is not determined; effects that were not requested are shrunk.
     """
     narrow = settle_model(model, options, gathered)
-    accumulator = (
-        gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
-    )
+    accumulator = gathered.accumulator
+    if narrow is not model:
+        accumulator = restrict(accumulator, model, narrow)
     solution = solve(accumulator, narrow, bias_processes=options.bias_processes)
     if options.accelerometer_model is None and _size_effect_unseen(solution):
         smaller = narrow.without_arms()
@@ -276,7 +280,7 @@ def calibration_of_saved(
     """
     Return the calibration of a saved live session (`LiveCalibration.saved`).
 
-    With the model of its columns and the added effects.
+    It has the model of the saved columns, with the effects that the session added.
 
     Raises
     ------
@@ -302,31 +306,30 @@ def calibration_of_saved(
 
 def _by_default(model: SensorModel, options: CalibrationOptions) -> list[slice]:
     """
-    Return the parameters of each effect that is in the model unasked.
+    Return the parameters of each effect that is in the model without a request.
 
-    Levelling, the Earth's rate, arms of the accelerometers.
+    These are arms of the accelerometers, levelling and the Earth's rate.
     """
-    arms = options.accelerometer_model is None
-    # A model with an error of table or clock that the recordings support is that of a request for
-    # it: levelling and the Earth's rate are estimated in both.
-    as_described = not any(sensor == 'reference' for sensor, _ in options.added)
-    found = []
+    has_default_arms = options.accelerometer_model is None
+    # An error of table or clock that the recordings support is estimated as if it were requested,
+    # and with it levelling and the Earth's rate.
+    is_as_described = not any(sensor == 'reference' for sensor, _ in options.added)
+    has_default_reference = options.reference_model is None and is_as_described
+    slices = []
     for effect in model.effects:
-        if (
-            effect.role is Role.ARMS
-            and arms
-            or effect.sensor == 'reference'
-            and effect.nuisance
-            and options.reference_model is None
-            and as_described
-        ):
-            found.append(model.slices[effect.key])
-    return found
+        is_default_arms = effect.role is Role.ARMS and has_default_arms
+        is_nuisance = effect.sensor == 'reference' and effect.nuisance
+        if is_default_arms or (is_nuisance and has_default_reference):
+            slices.append(model.slices[effect.key])
+    return slices
 
 
 def _size_effect_unseen(solution: Solution) -> bool:
-    arms, arm = (
-        solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM)
-    )
-    # An arm that is seen would bias the bias if left out.
-    return len(arms) > 0 and bool(arms.all() and arm.all())
+    """
+    Return whether no arm of the accelerometer is determined, neither single ones nor the common.
+
+    A determined arm is kept in the model: without it the bias would be wrong.
+    """
+    arms_held = solution.held[solution.model.part('accelerometer', Role.ARMS)]
+    arm_held = solution.held[solution.model.part('accelerometer', Role.ARM)]
+    return len(arms_held) > 0 and bool(arms_held.all() and arm_held.all())

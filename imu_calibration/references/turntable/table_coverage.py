@@ -24,7 +24,10 @@ must remove.
 
 
 GAUGE_SHOWN = 1e-7
-"""m; how exactly the origin is the mean of the sensitive points here."""
+"""
+Standard deviation of the origin about the mean of the sensitive points here, m. That of the
+estimate, `GAUGE_SD`, is too small for sums of squares in double precision.
+"""
 
 
 MAX_MOTION_SECONDS = 300.0
@@ -35,11 +38,10 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
     Return the Coverage of a calibration on a table.
 
-    Each cell is a rest of five seconds with that direction up.
-
-    The next step is the standard motion with the largest gain per second; `seconds` is the time of
-    it and of all later ones needed. If these do not suffice, or no motion determines what is
-    missing, it is what the solution proposes for the parameter with the largest sd in tolerances.
+    The worth of a direction is the gain of a rest of five seconds with it up. The next step is the
+    standard motion with the largest gain per second; `seconds` is the time of it and of all later
+    motions until the parameters are determined. If standard motions do not suffice, the next step
+    is the need of the parameter with the largest sd in tolerances.
 
     Parameters
     ----------
@@ -49,7 +51,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
     solution = result.solution
     requested = result.calibration.requested
-    # No motion determines a parameter with another remedy.
+    # Parameters that motions can determine: not the ones with another remedy.
     wanted = np.array(
         [
             name in requested and not _has_remedy(result, name)
@@ -57,99 +59,118 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
         ]
     )
     prior = make_prior(solution.model)
-    gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge  # as exact as sums of squares bear it
+    gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge
     base = solution.information + np.diag(1 / prior.sd**2) + gauge.T @ gauge
 
     def expected_sd(information: np.ndarray) -> np.ndarray:
+        """Return the standard deviations of the parameters from an information matrix."""
         return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
 
-    # unmodelled effects widen the standard deviations beyond those of the information matrix; the
-    # same factor is predicted
-    wider = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
+    # Unmodelled effects make the standard deviations larger than the information matrix predicts.
+    # The same factor is assumed after further motions.
+    factor = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
 
-    def left(information: np.ndarray) -> np.ndarray:
-        return sd_excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
+    def excess(information: np.ndarray) -> np.ndarray:
+        """Return the excess of the standard deviations over the tolerances (`sd_excess`)."""
+        return sd_excess((factor * expected_sd(information))[wanted], result.tolerances[wanted])
 
     added = MotionInformation(
         solution.model, solution.values, solution.noise, result.gravity
     ).added_by
-    after = np.array([left(base + added(rest)) for rest in REST_WITH_UP])
-    worth = share_gained(left(base), after)
+    after = np.array([excess(base + added(rest)) for rest in REST_WITH_UP])
+    worth = share_gained(excess(base), after)
     possible = possible_motions(cast(WindowObservations, result.data).table)
     motions = []
     for motion in MOTIONS if possible is None else possible:
         if motion.seconds < MAX_MOTION_SECONDS:
             motions.append(motion)
-    first, seconds = _foretold(base, left, added, motions)
+    first, seconds = _plan_ahead(base, excess, added, motions)
     step = _next_on_table(result) if first is None else _step(first.text)
     errors = result.window_errors()
     # Without an accelerometer no directions of gravity are shown.
     force = errors.true.get('accelerometer', np.zeros((len(errors.kind), 3)))
     force = force[(np.asarray(errors.kind) == 'static') & force.any(axis=1)]
     return Coverage(
-        worth, unit_rows(force), None, step, seconds, is_done(result), _arms(result), frame_id
+        worth=worth,
+        seen=unit_rows(force),
+        up=None,
+        next=step,
+        seconds=seconds,
+        done=is_done(result),
+        arms=_arms(result),
+        frame_id=frame_id,
     )
 
 
 def _has_remedy(result: TableResult, name: str) -> bool:
-    """Return whether a parameter needs something that is no motion."""
+    """Return whether the need of a parameter is a remedy other than a motion."""
     return name in result.needed and result.needed[name][0] in REMEDY_KEYS
 
 
-def _foretold(
+def _plan_ahead(
     information: np.ndarray,
-    left: Callable[[np.ndarray], np.ndarray],
+    excess: Callable[[np.ndarray], np.ndarray],
     added: Callable[[Motion], np.ndarray],
     motions: Sequence[Motion],
 ) -> tuple[Motion | None, float]:
     """
-    Return (first motion, seconds of all) of the motions that remove the excess.
+    Return (first motion, seconds of all motions) of a sequence that removes the excess.
 
-    (None, NaN) if these motions do not suffice.
+    Greedy: each motion has the largest reduction of the excess per second. (None, NaN) if the
+    motions do not suffice.
+
+    Parameters
+    ----------
+    information : array, shape (n_params, n_params)
+        Of the recording and the prior.
+    excess : callable
+        Excess of the standard deviations that an information matrix gives.
+    added : callable
+        Information of a motion.
+    motions : sequence of Motion
+
     """
     first = None
     seconds = 0.0
-    missing = left(information)
-    more = [added(motion) for motion in motions] if missing else []
+    current = excess(information)
+    added_by = [added(motion) for motion in motions] if current else []
     for _ in range(MAX_MOTIONS_AHEAD):
-        if not missing:
+        if not current:
             return first, seconds
-        remaining = [left(information + each) for each in more]
+        after = [excess(information + of_motion) for of_motion in added_by]
         best = max(
             range(len(motions)),
-            key=lambda k: (missing - remaining[k]) / motions[k].seconds,
+            key=lambda k: (current - after[k]) / motions[k].seconds,
             default=None,
         )
-        if best is None or missing - remaining[best] < MIN_MOTION_GAIN * missing:
+        if best is None or current - after[best] < MIN_MOTION_GAIN * current:
             break
         first = first or motions[best]
         seconds = seconds + motions[best].seconds
-        information = information + more[best]
-        missing = remaining[best]
+        information = information + added_by[best]
+        current = after[best]
     return None, float('nan')
 
 
 def _next_on_table(result: TableResult) -> Step:
-    """Return the motion that serves the parameter worst off."""
+    """Return the need of the undetermined parameter with the largest sd in tolerances."""
     requested = result.calibration.requested
     needed = {name: need for name, need in result.needed.items() if name in requested}
     if not needed:
         return Step('')
-    names = list(result.calibration.param_names)
-    worst = max(
-        needed,
-        key=lambda name: (
-            result.calibration.sd[names.index(name)] / result.tolerances[names.index(name)]
-        ),
-    )
-    return _step(needed[worst][0])
+    in_tolerances = result.calibration.sd / result.tolerances
+    sd_of = dict(zip(result.calibration.param_names, in_tolerances))
+    worst = max(needed, key=lambda name: sd_of[name])
+    text, _ = needed[worst]
+    return _step(text)
 
 
 def _step(text: str) -> Step:
-    motion = next((motion for motion in MOTIONS if motion.text == text), None)
-    return Step(
-        text, axis=None if motion is None or motion.axis is None else np.array(motion.axis, float)
-    )
+    """Return the step with a text, and with the axis of the standard motion of that text."""
+    for motion in MOTIONS:
+        if motion.text == text and motion.axis is not None:
+            return Step(text, axis=np.array(motion.axis, float))
+    return Step(text)
 
 
 def _arms(result: TableResult) -> np.ndarray | None:

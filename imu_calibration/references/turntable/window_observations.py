@@ -87,23 +87,28 @@ def error_budget(data: 'WindowObservations', solution: Solution) -> ErrorBudget:
     if table.gravity is not None and table.gravity_sd is None:
         gravity_sd = GRAVITY_SD
     errors = _errors_of_reference(data, solution, gravity_sd)
-    changes: list[Callable] = []
+    changes: list[ReferenceChange] = []
     for error in errors:
         changes += error.changes
     shifts = parameter_shifts(data, solution, changes)
 
+    # `shifts` has the changes of all errors, one after the other.
     causes = {'noise': solution.sd}
     texts = {'noise': 'noise and wander of the sensors, as this recording shows them'}
     start = 0
     for error in errors:
         moved = shifts[start : start + len(error.changes)]
         start += len(error.changes)
-        # Independent shifts of the windows add as squares, a common one as it is.
+        # Squares of independent shifts are summed over windows, common shifts before squaring.
         if not error.scattered:
             moved = moved.sum(axis=1, keepdims=True)
         causes[error.name] = np.sqrt((moved**2).sum(axis=(0, 1)))
         texts[error.name] = error.text
     return ErrorBudget(tuple(solution.param_names), causes, texts)
+
+
+ReferenceChange = Callable[[Table, JointMotion], tuple[Table, JointMotion]]
+"""Maps table and motion to those with an error of one standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +118,9 @@ class _ReferenceError:
     name: str
     """Cause."""
     text: str
-    """Its size for people."""
-    changes: tuple[Callable, ...]
-    """Each maps (table, motion) to values that differ by one standard deviation."""
+    """Description with its size."""
+    changes: tuple[ReferenceChange, ...]
+    """One for each independent direction of the error."""
     scattered: bool = False
     """Whether it is independent in every window, or common to all."""
 
@@ -124,10 +129,10 @@ def _errors_of_reference(
     data: 'WindowObservations', solution: Solution, gravity_sd: float
 ) -> list[_ReferenceError]:
     """Return the errors of the reference that the solution does not estimate."""
-    found = []
+    errors = []
     if solution.model.find('reference', Role.TILT) is None:
         tilts = LEVELLING_SD * np.eye(2)
-        found.append(
+        errors.append(
             _ReferenceError(
                 'levelling',
                 f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated',
@@ -136,7 +141,7 @@ def _errors_of_reference(
         )
     arcsec = JOINT_POSITION_SD / ARCMIN * 60
     turns = JOINT_POSITION_SD * np.eye(len(data.table.joints))
-    found.append(
+    errors.append(
         _ReferenceError(
             'joint position',
             f'joint positions {arcsec:.2g} arcsec, independent in every window',
@@ -144,66 +149,73 @@ def _errors_of_reference(
             scattered=True,
         )
     )
-    found.append(
+    errors.append(
         _ReferenceError(
             'table rate',
             f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows',
             (partial(_faster, 1 + TABLE_RATE_SD),),
         )
     )
-    found.append(
+    errors.append(
         _ReferenceError(
             'gravity',
             f'gravity known to {gravity_sd:.2g} m/s²',
             (partial(_heavier, gravity_sd),),
         )
     )
-    return found
+    return errors
 
 
 def _tilted(angles: np.ndarray, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    """Return the table tilted by two angles, rad, and the motion."""
     return tilt(table, angles), motion
 
 
 def _turned(angles: np.ndarray, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    """Return the table and the motion with the joints turned by angles, rad."""
     return table, replace(motion, position=motion.position + angles)
 
 
 def _faster(factor: float, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    """Return the table and the motion with a time that is shorter by a factor."""
     return table, replace(
         motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration
     )
 
 
 def _heavier(change: float, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
+    """Return the table with gravity larger by a change, m/s^2, and the motion."""
     return replace(table, gravity=table.gravity_value + change), motion
 
 
 def parameter_shifts(
-    data: 'WindowObservations', solution: Solution, changes: Sequence[Callable]
+    data: 'WindowObservations', solution: Solution, changes: Sequence[ReferenceChange]
 ) -> np.ndarray:
     """
-    Return how each window's share of each change moves the parameters.
+    Return the shift of the parameters by each change of the reference in each window.
 
-    Shape (n_changes, n_windows, n_params).
-
-    Summed over windows: the shift of the estimate when all windows err together. A shift is
-    estimate minus truth.
+    Shape (n_changes, n_windows, n_params). With the design A, the covariance V of the rows and the
+    change d of their outputs in one window, it is ``(A' V^-1 A)^-1 A' V^-1 d``: estimate minus
+    truth. The sum over windows is the shift when the change is common to all.
     """
     sources = list(_sources(data.gathered))
+    # Of each window: sensor -> columns and changes of the output.
     outputs = [_outputs(data.table, solution, source, changes=changes) for source in sources]
     kinds = [source.kind for source in sources]
     counts = np.array([source.samples for source in sources])
     times = np.array([source.time for source in sources])
     sessions = np.array([source.session for source in sources])
 
-    # Normal equations of the solver: A' V^-1 A, and A' V^-1 dA c of each window and change.
+    # Normal equations of the solver: A' V^-1 A, and A' V^-1 d of each window and change.
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(sources), len(solution.values)))
     for sensor, noise in noise_of_windows(solution).items():
         slope = coefficient_jacobian(solution.model, sensor, solution.values)
-        designs = [np.einsum('nq,qap->nap', own[sensor].columns, slope) for own in outputs]
+        # Of each window, shape (n_samples, 3, n_params).
+        designs = [
+            np.einsum('nq,qap->nap', of_window[sensor].columns, slope) for of_window in outputs
+        ]
 
         # The means of all windows, correlated through the bias.
         means = np.array([design.mean(axis=0) for design in designs])
@@ -220,8 +232,8 @@ def parameter_shifts(
         normal = normal + np.tensordot(weighted, means, ([0, 1], [0, 1]))
 
         # The samples about the mean of their window.
-        for k, (source, design, own) in enumerate(zip(sources, designs, outputs)):
-            moved = own[sensor].changes
+        for k, (source, design, of_window) in enumerate(zip(sources, designs, outputs)):
+            moved = of_window[sensor].changes
             centred = design - means[k]
             within = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
             normal += np.tensordot(within, centred, ([0, 1], [0, 1]))
@@ -234,39 +246,47 @@ def parameter_shifts(
 
 
 class _Source(NamedTuple):
-    """A window at rest, or a moving one that was kept; its samples are `stride` apart."""
+    """The motion of a window at rest, or of a moving window with kept samples."""
 
     kind: str
+    """'static', 'spin' or 'dynamic'."""
     time: float
+    """Middle of the window, s."""
     session: int
+    """Recording of the window."""
     samples: float
+    """Number of its samples."""
     stride: int
+    """Every how many samples are in `motion`."""
     motion: JointMotion
+    """Motion of the joints; one row at rest."""
     temperature_c: np.ndarray | None
+    """Temperature at the samples of `motion`, degrees Celsius; None: unknown."""
 
 
 def _sources(gathered: SessionData) -> Iterator[_Source]:
     """Yield the windows at rest, and the moving ones that were kept."""
-    rows = {}
+    counts = {}  # (recording, middle) -> samples of a window at rest
     for row in gathered.accumulator.rows:
         if row.kind == 'static':
-            rows[(row.session, row.time)] = row.count
-    typical = float(np.median(list(rows.values()))) if rows else 1.0
+            counts[(row.session, row.time)] = row.count
+    # A window that was joined with its neighbour has no row with its time.
+    typical = float(np.median(list(counts.values()))) if counts else 1.0
     for time, session, position in gathered.poses:
         motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
-        yield _Source('static', time, session, rows.get((session, time), typical), 1, motion, None)
+        count = counts.get((session, time), typical)
+        yield _Source('static', time, session, count, 1, motion, None)
     stride = max(1, int(np.ceil(sum(len(w) for w in gathered.kept) / MOVING_SAMPLES)))
     for window in gathered.kept:
-        some = slice(None, None, stride)
-        temperature = None if window.temperature_c is None else window.temperature_c[some]
+        used = slice(None, None, stride)
         yield _Source(
-            window.kind,
-            float(window.time.mean()),
-            0,
-            len(window),
-            stride,
-            window.motion.select(some),
-            temperature,
+            kind=window.kind,
+            time=float(window.time.mean()),
+            session=0,
+            samples=len(window),
+            stride=stride,
+            motion=window.motion.select(used),
+            temperature_c=None if window.temperature_c is None else window.temperature_c[used],
         )
 
 
@@ -280,26 +300,27 @@ class _Outputs(NamedTuple):
 
 
 def _outputs(
-    table: Table, solution: Solution, source: _Source, *, changes: Sequence[Callable]
+    table: Table, solution: Solution, source: _Source, *, changes: Sequence[ReferenceChange]
 ) -> dict[str, _Outputs]:
     """Return sensor -> its columns and changes of the output at the samples of a window."""
     model = solution.model
     temperature = source.temperature_c
     if model.needs_temperature and temperature is None:  # the mean at rest is not kept
         temperature = np.full(len(source.motion), model.temperature_ref_c)
+    # The reference itself, then with each change.
     references = [References(model, table, source.motion, temperature_c=temperature)]
     for change in changes:
         changed, motion = change(table, source.motion)
         references.append(References(model, changed, motion, temperature_c=temperature))
-    found = {}
+    outputs_of = {}
     for sensor in solution.noise:
-        outputs = [
-            sensor_output(model, sensor, solution.values, ref=each.at(sensor))
-            for each in references
-        ]
+        outputs = []
+        for reference in references:
+            ref = reference.at(sensor)
+            outputs.append(sensor_output(model, sensor, solution.values, ref=ref))
         moved = np.array(outputs[1:]).reshape(-1, *outputs[0].shape) - outputs[0]
-        found[sensor] = _Outputs(columns(references[0], sensor), moved)
-    return found
+        outputs_of[sensor] = _Outputs(columns(references[0], sensor), moved)
+    return outputs_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,6 +335,7 @@ class WindowObservations:
     """The model of the gathered columns; the solved one may have fewer effects."""
 
     unit: ClassVar[str] = 'windows'
+    """Name of an observation in the plural."""
     tested: ClassVar[tuple[str, ...]] = ()
 
     @property
@@ -371,6 +393,7 @@ class WindowObservations:
     def with_reference_errors(self, solution: Solution) -> Solution:
         """Return the solution with the uncertainty of gravity in its covariance."""
         table = self.table
+        # A relative error of gravity shifts the parameters along the common scale.
         scale = common_scale(solution.model, solution.values)
         moved = scale * table.gravity_sd_value / table.gravity_value
         terms = with_term(solution.terms, GRAVITY, np.outer(moved, moved))
@@ -388,7 +411,7 @@ class WindowObservations:
         return HeldOutWindows.of(windows, solution, self.uncorrected(solution).centre)
 
     def uncorrected(self, solution: Solution) -> Uncorrected:
-        """Return the errors that compensation leaves uncorrected."""
+        """Return the errors that compensation does not correct."""
         values = solution.values
         return uncorrected_on_table(
             solution.model.at(values),
@@ -416,19 +439,22 @@ class WindowObservations:
         Directions that the gauge fixes by convention are left out.
         """
         prior = make_prior(result.solution.model)
-        convention = prior.root[len(result.tolerances) :]
+        # The rows of the prior after one row for each parameter are those of the gauge, which are
+        # so precise that its directions have the largest singular values.
+        gauge = prior.root[len(result.tolerances) :]
         values = tolerance_scaled_singular_values(
-            result.solution.information + convention.T @ convention, result.tolerances
+            result.solution.information + gauge.T @ gauge, result.tolerances
         )
         return values[len(prior.gauge) :]
 
     def window_errors(self, result: TableResult) -> WindowErrors:
         """
-        Return the errors of window means before and after, against the table.
+        Return the errors of window means against the table, with two sets of parameters.
 
-        After: predicted without the fold of the window.
+        Before: nominal parameters. After: estimated without the fold of the window.
         """
-        solution, model = result.solution, result.solution.model
+        solution = result.solution
+        model = solution.model
         held_out = self.gathered.held_out
         if not held_out.n_windows:
             held_out = HeldOut([HeldOutBlock(self.gathered.accumulator)])
@@ -447,29 +473,34 @@ class WindowObservations:
         count = np.array([row.count for row in rows], float)
 
         errors = WindowErrors(
-            np.array([row.time for row in rows]),
-            np.array([row.kind for row in rows]),
-            *({} for _ in range(5)),
+            time=np.array([row.time for row in rows]),
+            kind=np.array([row.kind for row in rows]),
+            measured={},
+            true={},
+            before={},
+            after={},
+            floor={},
         )
         for sensor, noise in solution.noise.items():
             means = np.array([row.sensors[sensor].mean for row in rows])
             columns_of_means = means[:, :-3]
             output = means[:, -3:]
             nominal = coefficients(model, sensor, nominal_values(model))
+            # Of each row, shape (n, n_columns, 3).
             after = np.array([coefficients(model, sensor, values) for values in folds])[fold]
-            missed = output - np.einsum('ni,nij->nj', columns_of_means, after)
+            residual = output - np.einsum('ni,nij->nj', columns_of_means, after)
             matrix = result.calibration.of(sensor, Role.LINEAR)
             errors.measured[sensor] = output
             errors.true[sensor] = means[:, model.columns_of(sensor, Role.LINEAR)]
             errors.before[sensor] = output - columns_of_means @ nominal
-            errors.after[sensor] = missed @ np.linalg.inv(matrix).T
+            errors.after[sensor] = residual @ np.linalg.inv(matrix).T
             errors.floor[sensor] = np.sqrt(
                 noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance
             )
         return errors
 
     def residuals_of(self, result: TableResult, window: Window) -> dict[str, np.ndarray]:
-        """Return measured values minus those predicted from the motion of the table."""
+        """Return sensor -> measured minus predicted samples of a window, shape (n, 3)."""
         solution = result.solution
         return residuals([window], self.table, solution.model, values=solution.values)
 

@@ -36,21 +36,23 @@ def search_windows(
 
     """
     baseline = baseline_model(options, table, solved)
-    for windows in windows_to_ask(gathered):
-        found = inquire(windows, table, baseline, bias_processes=options.bias_processes)
-        found.unexplained_rests()
-        yield found
+    for windows in windows_to_search(gathered):
+        search = inquire(windows, table, baseline, bias_processes=options.bias_processes)
+        search.unexplained_rests()
+        yield search
 
 
-def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
+def windows_to_search(gathered: SessionData) -> list[list[Window]]:
     """
     Return the windows of each recording that suffice for a search of effects.
 
     The largest recording is first.
     """
-    return [
-        spread.windows for spread in gathered.spreads if len(spread.windows) >= MIN_FOLD_WINDOWS
-    ]
+    suitable = []
+    for spread in gathered.spreads:
+        if len(spread.windows) >= MIN_FOLD_WINDOWS:
+            suitable.append(spread.windows)
+    return suitable
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
@@ -80,12 +82,13 @@ def baseline_model(options: CalibrationOptions, table: Table, solved: SensorMode
     """
     model = choose_model(baseline_options(options), table)
     for effect in solved.effects:
-        # What the search may not test it cannot find: the residual would show it as unexplained.
+        # An effect that is no candidate would be reported as unexplained if it were removed.
         if effect.key not in model.slices and not model.catalogue.is_candidate(effect):
             model = model.with_effect(*effect.key)
     names = {effect.name for effect in model.effects}
+    point = {name: value for name, value in solved.point.items() if name in names}
     return replace(
         model,
-        point={name: value for name, value in solved.point.items() if name in names},
+        point=point,
         temperature_ref_c=solved.temperature_ref_c,
     )

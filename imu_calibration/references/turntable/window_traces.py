@@ -265,7 +265,7 @@ def _dead_reckoning(recording: _Recording) -> dict[str, float] | None:
     """
     spans = recording.spans
     stretches = []
-    stretch: list[int] = []  # numbers of its windows so far
+    stretch: list[int] = []  # numbers of its windows
     for number, (first, last) in enumerate(spans):
         if stretch:
             end_before = spans[stretch[-1]][1]
