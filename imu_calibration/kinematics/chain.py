@@ -6,6 +6,7 @@ Tilt, wrong axes, sag with load, wobble.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 def with_axis_places(table: Table, errors: np.ndarray) -> Table:
     """
-    Return the table with its turning axes, but the first, shifted sideways.
+    Return the table with its turning axes, except the first, shifted perpendicular to the axis.
 
     Parameters
     ----------
@@ -38,13 +39,13 @@ def with_axis_places(table: Table, errors: np.ndarray) -> Table:
         chain moves with it.
 
     """
-    of_axes = iter(np.reshape(errors, (-1, 2)))
+    displacements = iter(np.reshape(errors, (-1, 2)))
     joints = []
     is_first_turning = True
     for joint in table.joints:
         if joint.turns and not is_first_turning:
-            # Across the axis in the frame of the joint, then in the frame of the link before.
-            shift = next(of_axes) @ axis_error_directions(np.array(joint.axis))
+            # In the frame of the joint, then in the frame of the link before.
+            shift = next(displacements) @ axis_error_directions(np.array(joint.axis))
             xyz = np.array(joint.xyz) + joint.mat_before @ shift
             joint = replace(joint, xyz=tuple(xyz.tolist()))
         if joint.turns:
@@ -92,7 +93,7 @@ def tilt(table: Table, angles: np.ndarray) -> Table:
     if table.azimuth_deg is None:
         return tilted
 
-    # A table takes the level frame with the shortest rotation to `up`, which may have another
+    # The level frame of a table is that with the shortest rotation to `up`, which may have another
     # heading than that of mat_bn: north is expressed in the frame of the tilted table.
     azimuth = np.radians(table.azimuth_n_deg)  # type: ignore[arg-type]
     mat_nn = tilted.mat_nb @ mat_bn
@@ -104,25 +105,25 @@ def tilt(table: Table, angles: np.ndarray) -> Table:
 
 WOBBLES = (-1, 2)
 """
-Turns of the lean for one turn of the joint: once against it, twice with it.
+Turns of the lean for one turn of the joint: once in the opposite direction, twice in the same one.
 
-A component that rotates once with the joint is the direction of the next axis or the mount, a
-constant one that of this axis.
+A lean that rotates once with the joint is equal to an error of the next axis or the mount, and a
+constant one to an error of this axis.
 """
 
 
 def with_sag(table: Table, angles: np.ndarray) -> Table:
     """
-    Return the table whose turning axes, but the first, hang towards the ground.
+    Return the table with a sag of its turning axes, except the first, towards the ground.
 
-    The load of a joint rotates by the rotation vector ``angle (up x axis)``: by the full angle if
-    the axis is level.
+    The links after a joint rotate by the rotation vector ``angle (up x axis)``: by the full angle
+    if the axis is level.
 
     Parameters
     ----------
     table : Table
     angles : array, shape (n_turning - 1,)
-        rad, by name of the joints that are read.
+        One for each turning joint that is read, except the first, rad.
 
     """
     of_joint = dict(zip(table.joint_names.turning[1:], angles, strict=True))
@@ -136,9 +137,9 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
 
 def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
     """
-    Return the table whose axes lean as they turn.
+    Return the table with axes that wobble as they turn.
 
-    The load of a joint rotates by the rotation vector ``Re(z) u + Im(z) v`` with u, v its
+    The links after a joint rotate by the rotation vector ``Re(z) u + Im(z) v`` with u, v its
     `axis_error_directions` and ``z = sum over m of (c + i s) exp(i m q)`` at the joint angle q.
 
     Parameters
@@ -188,41 +189,50 @@ def wobble_at(
     return total
 
 
-_CHAIN_BLOCK_SAMPLES = 1024  # samples whose intermediates fit in the processor's cache
+_CHAIN_BLOCK_SAMPLES = 1024
+"""Samples per block, so that intermediate arrays fit in the processor's cache."""
 UP, RATE, ALPHA, FORCE = -4, -3, -2, -1
 """Columns of the recursion (`_base_columns`): direction up, rate, angular acceleration, force."""
 
 
 class _Link(NamedTuple):
-    """A joint with its constants as arrays."""
+    """A joint with its constants as arrays: its position is ``multiplier * reading + offset``."""
 
     joint: Joint
+    """The joint."""
     axis: np.ndarray
+    """Unit vector in the joint's frame, shape (3,)."""
     xyz: np.ndarray
+    """Origin of the joint's frame in the frame of the link before, m, shape (3,)."""
     mat_in: np.ndarray
     """From the frame of the link before to the joint's frame, shape (3, 3)."""
     column: int
-    """Column of the motion that drives it."""
+    """Column of the readings in the motion."""
     multiplier: float
-    plus: float
+    """1 unless the joint follows another one."""
+    offset: float
+    """rad or m; 0 unless the joint follows another one."""
     across: np.ndarray
     """`axis_error_directions`, shape (2, 3)."""
 
 
 class _Step(NamedTuple):
     """
-    One step of the outward transformation of vectors: an offset, a constant matrix, then the joint.
+    One step of the outward transformation: an offset, a constant rotation, then the moving joint.
     """
 
     offset: np.ndarray
+    """Displacement in the frame before the rotation, m, shape (3,)."""
     matrix: np.ndarray
+    """The rotation, shape (3, 3)."""
     link: _Link | None
     """The joint that moves, or None after the last one."""
     sense: float = 1.0
+    """+1 or -1: the joint turns about ``sense`` times the coordinate axis `third`."""
     third: int = 2
-    """Coordinate axis that the joint turns about, in this sense."""
+    """Index of the coordinate axis that the joint turns about, after the rotation."""
     across: np.ndarray | None = None
-    """Directions u, v of a lean in these coordinates, shape (2, 3)."""
+    """Directions u, v of a lean after the rotation, shape (2, 3)."""
 
 
 def reference_motion(
@@ -233,7 +243,7 @@ def reference_motion(
     attitude: bool = True,
 ) -> Reference:
     """
-    Return the readings of a perfect sensor at the reference point of the mount.
+    Return the readings of an ideal sensor at the reference point of the mount.
 
     From link to link, with C the inverse of the joint's turn, a its axis, r the step to its origin
     and q its angle::
@@ -255,9 +265,9 @@ def reference_motion(
     motion : JointMotion
         Joints at the instants wanted, columns in the order of ``table.joint_names``.
     temperature_c : array, shape (n,), optional
-        Passed on.
+        Temperature of the result, degrees Celsius.
     attitude : bool
-        Whether the attitude is wanted, a third of the time; without it `mat_sn` is NaN.
+        Whether the attitude is computed, a third of the time; without it `mat_sn` is NaN.
 
     Returns
     -------
@@ -273,9 +283,9 @@ def reference_motion(
     steps = _chain_steps(constants, motion)
     # Rate, angular acceleration and force are the last columns. Up, which a sag needs, is before
     # them: the last column of the attitude.
-    sags = any(link.joint.sag for link in constants.links)
-    needed = 6 if attitude else 3 + sags
-    base = constants.base[:, -needed:]
+    has_sag = any(link.joint.sag for link in constants.links)
+    n_columns = 6 if attitude else 3 + has_sag
+    base = constants.base[:, -n_columns:]
     for start in range(0, n_samples, _CHAIN_BLOCK_SAMPLES):
         part = slice(start, min(start + _CHAIN_BLOCK_SAMPLES, n_samples))
         columns = _run_chain(base, motion, steps, part)
@@ -299,11 +309,11 @@ def reference_motion(
     )
 
 
-def _chain_steps(constants, motion):
+def _chain_steps(constants: _Constants, motion: JointMotion) -> list[_Step]:
     """
-    Return the `_Step`s.
+    Return the steps from the base to the sensor, one for each moving joint, and the last one.
 
-    Joints at rest are merged into the constant matrix and the offset of the next one.
+    A joint at rest is part of the offset and the rotation of the next step.
     """
     steps = []
     # Since the last joint that moves: rotation, and offset in the frame before that rotation.
@@ -315,24 +325,25 @@ def _chain_steps(constants, motion):
 
         # A joint at rest is a constant rotation or offset.
         if not link.joint.leans and not _moves(motion, link.column):
-            position = link.plus
+            position = link.offset
             if len(motion.time):
-                position = link.plus + link.multiplier * motion.position[0, link.column]
+                position = link.offset + link.multiplier * motion.position[0, link.column]
             if link.joint.turns:
                 matrix = rotation(-position * link.axis) @ matrix
             else:
                 offset = offset + matrix.T @ (position * link.axis)
             continue
 
-        # Turns are computed about a coordinate axis; the way back begins the next step.
-        before = np.eye(3)
+        # Turns are computed about a coordinate axis; the next step begins with the inverse of the
+        # rotation to it.
+        to_coordinate_axis = np.eye(3)
         sense = 1.0
         third = 2
         if link.joint.turns:
-            before, sense, third = _to_coordinate_axis(link.axis)
-        across = link.across @ before.T
-        steps.append(_Step(offset, before @ matrix, link, sense, third, across))
-        matrix = before.T
+            to_coordinate_axis, sense, third = _to_coordinate_axis(link.axis)
+        across = link.across @ to_coordinate_axis.T
+        steps.append(_Step(offset, to_coordinate_axis @ matrix, link, sense, third, across))
+        matrix = to_coordinate_axis.T
         offset = np.zeros(3)
 
     # From the last joint to the sensor.
@@ -340,8 +351,8 @@ def _chain_steps(constants, motion):
     return [*steps, _Step(offset, constants.mat_sl @ matrix, None)]
 
 
-def _moves(motion, column):
-    """Return whether a joint has a motion."""
+def _moves(motion: JointMotion, column: int) -> bool:
+    """Return whether the joint of a column changes its position or has a rate."""
     position = motion.position[:, column]
     if len(position) == 0:
         return False
@@ -350,11 +361,11 @@ def _moves(motion, column):
     return bool(motion.rate[:, column].any() or motion.acceleration[:, column].any())
 
 
-def _to_coordinate_axis(axis):
+def _to_coordinate_axis(axis: np.ndarray) -> tuple[np.ndarray, float, int]:
     """
-    Return (matrix, sense, index) with ``matrix @ axis = sense * e_index``.
+    Return (rotation, sense, index) with ``rotation @ axis = sense * e_index``.
 
-    The identity where the axis is one already.
+    The rotation is the identity if the axis is a coordinate axis, otherwise that to z.
     """
     third = int(np.argmax(np.abs(axis)))
     if np.abs(axis[third]) == 1.0:
@@ -363,19 +374,23 @@ def _to_coordinate_axis(axis):
 
 
 class _Constants(NamedTuple):
-    """Interface of a table for the recursion."""
+    """Constants of a table for the recursion."""
 
     base: np.ndarray
     """`_base_columns`."""
-    links: tuple
+    links: tuple[_Link, ...]
+    """From the base outwards."""
     mount_xyz: np.ndarray
+    """Reference point in the frame of the last link, m, shape (3,)."""
     mat_sl: np.ndarray
+    """Frame of the last link to sensor frame, shape (3, 3)."""
     gravity: float
+    """m/s^2."""
 
 
 @lru_cache(maxsize=512)
-def _constants(table):
-    """Return the `_Constants`: thousands of short windows share one table."""
+def _constants(table: Table) -> _Constants:
+    """Return the constants of a table; they are cached for thousands of short windows."""
     columns = {name: column for column, name in enumerate(table.joint_names)}
     links = []
     for joint in table.joints:
@@ -383,34 +398,37 @@ def _constants(table):
         links.append(
             _Link(
                 joint,
-                np.array(joint.axis),
-                np.array(joint.xyz),
-                joint.mat_before.T,
-                columns[joint.source],
-                1.0 if mimic is None else mimic.multiplier,
-                0.0 if mimic is None else mimic.offset,
-                axis_error_directions(np.array(joint.axis)),
+                axis=np.array(joint.axis),
+                xyz=np.array(joint.xyz),
+                mat_in=joint.mat_before.T,
+                column=columns[joint.source],
+                multiplier=1.0 if mimic is None else mimic.multiplier,
+                offset=0.0 if mimic is None else mimic.offset,
+                across=axis_error_directions(np.array(joint.axis)),
             )
         )
     mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
     constants = _Constants(
-        _base_columns(table), tuple(links), mount_xyz, table.mat_sl, table.gravity_value
+        base=_base_columns(table),
+        links=tuple(links),
+        mount_xyz=mount_xyz,
+        mat_sl=table.mat_sl,
+        gravity=table.gravity_value,
     )
-    # The constants are shared by all motions of the table.
+    # The constants are shared by all motions of the table: no motion may change them.
     shared = [constants.base, constants.mount_xyz, constants.mat_sl]
     for link in links:
-        shared += [*link[1:4], link.across]
+        shared += [link.axis, link.xyz, link.mat_in, link.across]
     for array in shared:
         array.flags.writeable = False
     return constants
 
 
-def _base_columns(table):
+def _base_columns(table: Table) -> np.ndarray:
     """
-    Return the motion of the base in the base frame, shape (3, 6, 1).
+    Return attitude and motion of the base in the base frame, shape (3, 6, 1).
 
-    It consists of mat_bn (three columns), rate, angular acceleration and specific force of the
-    base.
+    Its columns are the three of mat_bn, rate, angular acceleration and specific force.
     """
     columns = np.zeros((3, 6, 1))
     mat_bn = table.mat_nb.T
@@ -422,11 +440,13 @@ def _base_columns(table):
     return columns
 
 
-def _run_chain(columns, motion, steps, part):
+def _run_chain(
+    columns: np.ndarray, motion: JointMotion, steps: Sequence[_Step], part: slice
+) -> np.ndarray:
     """
-    Return the columns of `_base_columns`, all or the last ones, at the sensor, in its frame.
+    Return the k columns of `_base_columns` at the sensor, in its frame, shape (3, k, n).
 
-    Shape (3, k, n).
+    `columns`: all of the base or the last ones, shape (3, k, 1); `part`: the n samples.
     """
     for step in steps:
         # force += alpha x r + omega x (omega x r), then the constant rotation, then the joint.
@@ -441,13 +461,13 @@ def _run_chain(columns, motion, steps, part):
     return np.broadcast_to(columns, (*columns.shape[:2], part.stop - part.start))
 
 
-def _move(columns, step, motion, part):
-    """Bring `columns` past a joint that moves."""
-    # About the coordinate axis of the step; the joint's own sense is that of `step.sense`.
+def _move(columns: np.ndarray, step: _Step, motion: JointMotion, part: slice) -> np.ndarray:
+    """Return `columns` in the frame of the link after a moving joint, with its motion added."""
+    # The motion about the coordinate axis of the step is `sense` times that of the joint.
     link = step.link
     factor = step.sense * link.multiplier
     position = factor * motion.position[part, link.column]
-    position += step.sense * link.plus
+    position += step.sense * link.offset
     rate = factor * motion.rate[part, link.column]
     acceleration = factor * motion.acceleration[part, link.column]
     if not link.joint.turns:
@@ -459,9 +479,15 @@ def _move(columns, step, motion, part):
     return _turn(columns, step.third, position, rate, acceleration)
 
 
-def _lean(columns, step, angle, rate, acceleration):
+def _lean(
+    columns: np.ndarray,
+    step: _Step,
+    angle: np.ndarray,
+    rate: np.ndarray,
+    acceleration: np.ndarray,
+) -> np.ndarray:
     """
-    Bring `columns` into the frame of a joint whose axis sags and wobbles.
+    Return `columns` in the frame of a joint with an axis that sags and wobbles.
 
     The lean is the small rotation vector v, across the axis a. With z of `with_wobble` at the
     angle of the joint, the direction up u in the frame of the link, and the link's rate omega::
@@ -495,14 +521,20 @@ def _lean(columns, step, angle, rate, acceleration):
     return columns
 
 
-def _arm_force(rate, alpha, arm):
+def _arm_force(rate: np.ndarray, alpha: np.ndarray, arm: np.ndarray) -> np.ndarray:
     """Return ``alpha x arm + rate x (rate x arm)``, all shape (3, n) or (3, 1)."""
     return cross(alpha, arm) + rate * (rate * arm).sum(axis=0) - arm * (rate * rate).sum(axis=0)
 
 
-def _slide(columns, axis, position, rate, acceleration):
+def _slide(
+    columns: np.ndarray,
+    axis: np.ndarray,
+    position: np.ndarray,
+    rate: np.ndarray,
+    acceleration: np.ndarray,
+) -> np.ndarray:
     """
-    Bring `columns` into the link that slides along `axis`, shape (3, 1).
+    Return `columns` in the link that slides along `axis`, shape (3, 1).
 
     The equation is that of `reference_motion`.
     """
@@ -516,9 +548,15 @@ def _slide(columns, axis, position, rate, acceleration):
     return slid
 
 
-def _turn(columns, third, angle, rate, acceleration):
+def _turn(
+    columns: np.ndarray,
+    third: int,
+    angle: np.ndarray,
+    rate: np.ndarray,
+    acceleration: np.ndarray,
+) -> np.ndarray:
     """
-    Bring `columns` into the link of a joint and add the joint's own motion.
+    Return `columns` in the link of a joint, with the motion of the joint added.
 
     The link turns about coordinate axis `third`, with the unit vector e. With C of the turn::
 

@@ -31,10 +31,15 @@ Largest number of a table (axis, place, angle, speed); products of larger number
 def table_number(
     low: float = -MAX_TABLE_NUMBER, high: float = MAX_TABLE_NUMBER, *, above: bool = False
 ) -> Requirement:
-    """Require a number as `schema.number` does, or its text: YAML 1.1 reads 1e-5 as text."""
+    """
+    Return the requirement of a number or its text, as YAML 1.1 reads 1e-5 as text.
+
+    Arguments as for `schema.number`.
+    """
     within = number(low, high, above=above)
 
     def check(value: Any, place: str) -> None:
+        """Convert a text to a number, if possible, and require the number."""
         if isinstance(value, str):
             try:
                 value = float(value)
@@ -81,12 +86,14 @@ def unit_vector(value: Any) -> tuple[float, float, float]:
 
 
 TYPES = ('revolute', 'prismatic')
+"""Joints that turn, and joints that slide."""
 _PLACE = {
     'axis': direction,
     'xyz': THREE_NUMBERS,
     'rpy_deg': THREE_NUMBERS,
     'type': text(*TYPES),
 }
+"""Field of a `Joint` for its motion and place -> requirement."""
 
 
 @dataclass(frozen=True)
@@ -108,10 +115,7 @@ class JointLimits:
     endless: bool = False
     """Whether the joint is declared to turn without end."""
     described: frozenset[str] = field(default=frozenset(), compare=False)
-    """
-    Names of the fields that come from a robot description (URDF); the remaining fields are from a
-    table file.
-    """
+    """Names of fields from a robot description (URDF); the remaining ones are from a table file."""
 
 
 @dataclass(frozen=True)
@@ -121,11 +125,11 @@ class Mimic:
     """
 
     joint: str
-    """Name of the other."""
+    """Name of the followed joint."""
     multiplier: float = 1.0
     """Motion per unit of the followed joint."""
     offset: float = 0.0
-    """Where it is when the other is at zero, rad or m."""
+    """Position when the followed joint is at zero, rad or m."""
 
 
 @dataclass(frozen=True)
@@ -153,13 +157,13 @@ class Joint:
     """Range, speed and acceleration."""
     sag: float = 0.0
     """
-    Angle by which it hangs towards the ground where its axis lies level, rad (`axis_sag`):
-    estimated, no description holds it.
+    Angle of the following links towards the ground where the axis is level, rad (`chain.with_sag`):
+    an estimate, which no description has.
     """
     wobble: tuple[tuple[int, complex], ...] = ()
     """
-    How it leans as it turns: (turns of the lean for one of the joint, amplitude, rad), an estimate
-    too.
+    Lean of the axis as the joint turns: (turns of the lean for one turn of the joint, amplitude in
+    rad) of each term (`chain.with_wobble`); an estimate too.
     """
 
     def __post_init__(self) -> None:
@@ -177,45 +181,42 @@ class Joint:
 
     @property
     def leans(self) -> bool:
-        """Whether its axis does not keep its direction."""
+        """Whether its axis changes its direction."""
         return bool(self.sag or self.wobble)
 
     @property
     def source(self) -> str:
-        """
-        Name of the joint whose readings give its position: its own, or that of the followed joint.
-        """
+        """Name of the joint that is read for its position: this one, or the followed one."""
         return self.name if self.mimic is None else self.mimic.joint
 
     @property
     def mat_before(self) -> np.ndarray:
-        """Joint's frame to the frame of the link before it, at joint zero, shape (3, 3)."""
+        """Joint's frame at joint zero to the frame of the link before, shape (3, 3)."""
         return rotation_from_rpy(np.radians(self.rpy_deg))
 
 
 @dataclass(frozen=True)
 class JointNames(Sequence):
     """
-    Names in the readings of a chain and in the parameters of its errors.
+    Names of the joints of a chain that are read, and of the parameters of its errors.
 
-    As a sequence: the joints with readings.
+    As a sequence it has the names of the joints that are read.
     """
 
     read: tuple[str, ...]
     """Joints that are read, in the order of the columns of a `JointMotion`."""
     turning: tuple[str, ...]
-    """The rotating joints of them."""
+    """Rotating joints that are read."""
     zeros: tuple[str, ...]
     """
-    Joints whose zero is a separate error: the zero of the first is the azimuth, that of the last
-    belongs to the mount.
+    Joints with a separate error of the zero. The zero of the first joint is collinear with the
+    azimuth, that of the last with the mount.
     """
     angles: tuple[str, ...]
-    """Angles between neighbouring axes."""
+    """Errors of angles between neighbouring axes."""
     places: tuple[str, ...] = ()
     """
-    Directions of the displacement of an axis from its nominal place; those of the first axis have
-    no effect.
+    Errors of the place of each axis except the first, in two directions perpendicular to the axis.
     """
     angle_sd: float | None = None
     """Standard deviation of zeros and angles, rad; None: not given."""
@@ -225,45 +226,48 @@ class JointNames(Sequence):
     @classmethod
     def of(cls, names: Sequence[str], errors: Mapping[str, Any] | None = None) -> 'JointNames':
         """
-        Return `names`, or if None the rotating joints without parallel neighbours.
+        Return the names for joints that are read.
 
-        The second only if `errors` is not given.
+        Parameters
+        ----------
+        names : sequence of str
+            The joints that are read; `JointNames` are returned unchanged.
+        errors : mapping, optional
+            The remaining fields. Default: all joints turn, and no neighbouring axes are parallel.
+
         """
         if isinstance(names, cls):
             return names
         names = tuple(names)
         if errors is not None:
-            known: dict[str, Any] = {
-                key: tuple(value) if isinstance(value, list) else value
-                for key, value in errors.items()
-            }
-            return cls(names, **known)
+            values: dict[str, Any] = {}
+            for key, value in errors.items():
+                values[key] = tuple(value) if isinstance(value, list) else value
+            return cls(names, **values)
+        pairs = zip(names, names[1:], strict=False)
         return cls(
-            names,
-            names,
-            names[1:-1],
-            tuple(f'{a}_{b}' for a, b in zip(names, names[1:], strict=False)),
-            place_names(names),
+            read=names,
+            turning=names,
+            zeros=names[1:-1],
+            angles=tuple(f'{first}_{second}' for first, second in pairs),
+            places=place_names(names),
         )
 
     @property
     def errors(self) -> dict[str, Any] | None:
-        """
-        Return the arguments that `of` needs in addition to the names with readings.
-
-        Or None if these suffice.
-        """
+        """Return the argument `errors` that `of` needs for these names; None: it needs none."""
         if self == self.of(self.read):
             return None
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'read'}
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in values.items()
-        }
+        errors = {}
+        for item in fields(self):
+            if item.name != 'read':
+                value = getattr(self, item.name)
+                errors[item.name] = list(value) if isinstance(value, tuple) else value
+        return errors
 
     @property
     def taken_as_described(self) -> tuple[str, ...]:
-        """Joints whose zero is collinear with the azimuth or with the mount."""
+        """Turning joints without a separate error of the zero (`zeros`)."""
         return tuple(name for name in self.turning if name not in self.zeros)
 
     def __getitem__(self, index: int | slice) -> Any:
@@ -274,7 +278,7 @@ class JointNames(Sequence):
 
 
 def place_names(turning: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the places of all axes but the first: two directions across each."""
+    """Return names of two directions, u and v, for each turning axis except the first."""
     return tuple(f'{name}_{letter}' for name, letter in product(turning[1:], 'uv'))
 
 
@@ -332,23 +336,25 @@ def limits_from_mapping(item: Mapping[str, Any], kind: str) -> JointLimits:
     range_key, speed_key, acceleration_key = list(LIMITS[kind])[:3]
 
     def in_si(value: Any) -> float | None:
+        """Return a number in rad or m and s, or None."""
         return None if value is None else unit * float(value)
 
     lower, upper = item.get(range_key) or (None, None)
     return JointLimits(
-        in_si(lower),
-        in_si(upper),
-        in_si(item.get(speed_key)),
-        in_si(item.get(acceleration_key)),
+        lower=in_si(lower),
+        upper=in_si(upper),
+        speed=in_si(item.get(speed_key)),
+        acceleration=in_si(item.get(acceleration_key)),
         endless=bool(item.get('endless')),
     )
 
 
 def _require_limits(limits: JointLimits, what: str) -> None:
-    lower, upper = limits.lower, limits.upper
-    if (lower is None) != (upper is None) or (
-        lower is not None and upper is not None and lower > upper
-    ):
+    """Raise an InputError unless the limits of a joint are possible; `what`: the joint."""
+    lower = limits.lower
+    upper = limits.upper
+    has_one_end = (lower is None) != (upper is None)
+    if has_one_end or (lower is not None and upper is not None and lower > upper):
         raise InputError(
             f'table: the range of {what} must be a smaller and a larger number, got [{lower},'
             f' {upper}]; correct it'
@@ -369,9 +375,9 @@ def _require_limits(limits: JointLimits, what: str) -> None:
 
 def joint_to_mapping(joint: Joint) -> dict[str, Any]:
     """
-    Return the entry that `joint_from_mapping` turns into an equal joint.
+    Return the entry of a joint in a table description, from which `joint_from_mapping` makes it.
 
-    Values at their default are omitted, except the place.
+    Values at their default are omitted, except `xyz`.
     """
     item: dict[str, Any] = {'name': joint.name, 'axis': list(joint.axis), 'xyz': list(joint.xyz)}
     if any(joint.rpy_deg):

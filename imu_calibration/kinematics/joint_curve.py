@@ -13,6 +13,7 @@ from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
 from imu_calibration.kinematics.smoothing import (
     Knots,
     PenalisedSpline,
+    Smooth,
     design_matrix,
     design_values,
     evaluate_pieces,
@@ -32,11 +33,34 @@ Largest lag of used velocities behind the positions, s; late ones imitate a time
 """
 
 
-def _with_velocity(spline, fit, position, velocity, *, knots, time, trend):
+def _with_velocity(
+    spline: PenalisedSpline,
+    fit: Smooth,
+    position: np.ndarray,
+    velocity: np.ndarray,
+    *,
+    knots: Knots,
+    time: np.ndarray,
+    trend: 'Trend',
+) -> Smooth:
     """
-    Return the fit to positions and velocities.
+    Return the fit to positions and velocities of one joint.
 
-    `fit`, that to the positions, if the velocities disagree or are much noisier.
+    If the velocities disagree with the positions or are much noisier, `fit` is returned.
+
+    Parameters
+    ----------
+    spline : PenalisedSpline
+        Of the positions.
+    fit : Smooth
+        To the positions.
+    position, velocity : array, shape (n,)
+        rad, rad/s; NaN where there is no velocity.
+    knots : Knots
+    time : array, shape (n,)
+    trend : Trend
+        Of the joint, subtracted from the positions before the fit.
+
     """
     from scipy.sparse import vstack  # here, because its import is slow
 
@@ -48,23 +72,28 @@ def _with_velocity(spline, fit, position, velocity, *, knots, time, trend):
     if not trusted or fit.noise_sd * fit.bandwidth / knots.step < 0.3 * velocity_sd:
         return fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
-    rest = (
-        position - trend.at(time)[:, 0],
-        weight * (np.nan_to_num(velocity) - trend.at(time, 1)[:, 0]),
-    )
+    # The rows of the positions, then of the velocities, in units of the position noise.
+    position_rows = position - trend.at(time)[:, 0]
+    velocity_rows = weight * (np.nan_to_num(velocity) - trend.at(time, 1)[:, 0])
     interval, values = design_values(knots, time, 1)
     both = PenalisedSpline(
         vstack([spline.design, design_matrix(knots, interval, values * weight)], format='csr'),
         spline.bands + normal_bands(knots, interval, values * weight),
         n_kinds=2,
     )
-    (better,) = smooth(both, np.concatenate(rest)[:, None], [fit.noise_sd])
-    return better
+    rows = np.concatenate([position_rows, velocity_rows])
+    (joint_fit,) = smooth(both, rows[:, None], [fit.noise_sd])
+    return joint_fit
 
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Parabolas, which the penalty does not constrain; removed first to reduce rounding."""
+    """
+    Parabola of each joint, ``f_0 + f_1 t + f_2 t^2``, with t relative to a centre.
+
+    It is subtracted from the positions before the fit, to reduce rounding; the penalty does not
+    constrain it.
+    """
 
     centre: float
     """Origin of their time, s."""
@@ -74,9 +103,9 @@ class Trend:
     @classmethod
     def through(cls, time: np.ndarray, position: np.ndarray, still: np.ndarray) -> 'Trend':
         """
-        Return the parabolas of least squares (of lower degree for few stamps).
+        Return the parabolas of least squares, of lower degree for one or two stamps.
 
-        Constants for joints that are `still`.
+        `still`: True for joints at rest, which have a constant, shape (n_joints,).
         """
         centre = 0.5 * (time[0] + time[-1])
         degree = min(2, len(np.unique(time)) - 1)
@@ -94,7 +123,7 @@ class Trend:
         return Trend(self.centre, self.factors[:, joint : joint + 1])
 
     def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """Return values or rates, shape (n, n_joints)."""
+        """Return values (`derivative` 0) or rates (1) at instants, shape (n, n_joints)."""
         time = (time - self.centre)[:, None]
         if derivative:
             return self.factors[1] + 2 * time * self.factors[2]
@@ -123,7 +152,7 @@ def check_velocity(
     rate, acceleration : array, shape (n,)
         Derivatives of the smooth curve through the positions at the same stamps.
     dof : float
-        Effective number of parameters of that curve: so many of its values are independent.
+        Effective number of parameters of that curve, and so of its independent values.
 
     Returns
     -------
@@ -145,12 +174,17 @@ def check_velocity(
     noise_sd = np.sqrt(np.mean((velocity[good] - columns @ estimate) ** 2))
     error = noise_sd * np.sqrt(np.diag(normal) * good.sum() / max(dof, 4.0)) / size
     limit = np.array([VELOCITY_SCALE * size[1], VELOCITY_SCALE, VELOCITY_LAG])
-    return bool(np.all(np.abs(estimate - [0.0, 1.0, 0.0]) + 2 * error < limit)), float(noise_sd)
+    # Offset, scale and lag differ from 0, 1 and 0 by less than the limits, at two sds too.
+    trusted = bool(np.all(np.abs(estimate - [0.0, 1.0, 0.0]) + 2 * error < limit))
+    return trusted, float(noise_sd)
 
 
-_MINIMUM_SAMPLES = 8  # fewer stamps are fitted with a parabola
-_MARGIN = 3  # knots beyond the readings
-_LONGEST_HOLE = 300  # periods; a longer one cannot be bridged by anything sensible
+_MINIMUM_SAMPLES = 8
+"""Least number of stamps for a spline; fewer are fitted with a parabola."""
+_MARGIN = 3
+"""Knots before the first and after the last reading."""
+_LONGEST_HOLE = 300
+"""Longest hole in the readings that is interpolated, periods."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,18 +209,16 @@ class JointCurve:
         """
         Return the `JointMotion` at `time`, shape (n,).
 
-        NaN outside the readings by more than three of their periods.
-
-        Derivatives above `derivatives` are left out as zero.
+        NaN more than three periods before the first or after the last reading. Derivatives of
+        higher order than `derivatives` are zero.
         """
         time = np.asarray(time, float)
         values = np.zeros((4, len(time), self.pieces.shape[2]))
         values[: derivatives + 1] = evaluate_pieces(
             self.knots, self.pieces, time, derivatives=derivatives
         )
-        outside = (time < self.knots.start) | (
-            time > self.knots.start + self.knots.step * self.knots.n_intervals
-        )
+        end = self.knots.start + self.knots.step * self.knots.n_intervals
+        outside = (time < self.knots.start) | (time > end)
         if outside.any():
             values[:, outside] = np.nan
         return JointMotion(time, *values)
@@ -203,8 +235,8 @@ def fit_joint_curve(
     Return the smooth curve through readings of the joints.
 
     A penalised quintic spline per joint, one knot per reading; the penalty follows from the data
-    (`smoothing.smooth`), so that readings without noise are interpolated and those of a coarse
-    encoder give sane accelerations. Velocities that agree with the positions in scale and lag are
+    (`smoothing.smooth`), so that readings without noise are interpolated, and a coarse encoder does
+    not cause large accelerations. Velocities that agree with the positions in scale and lag are
     used.
 
     Parameters
@@ -232,13 +264,10 @@ def fit_joint_curve(
     time = np.asarray(time, float)
     position = np.asarray(position, float)
     _check(time, position)
-    position = (
-        np.unwrap(position, axis=0)
-        if np.any(np.abs(np.diff(position, axis=0)) > np.pi)
-        else position
-    )
+    if np.any(np.abs(np.diff(position, axis=0)) > np.pi):
+        position = np.unwrap(position, axis=0)
 
-    # A knot per time; joints at rest need no curve.
+    # Repeated stamps have one knot. Joints at rest need no spline, only their constant.
     stamps = time[np.concatenate([[True], np.diff(time) > 0])]
     knots = _place_knots(stamps)
     still = np.all(position == position[0], axis=0)
@@ -266,16 +295,15 @@ def fit_joint_curve(
                     time=time,
                     trend=trend.column(joint),
                 )
-            coefficients[:, joint], bandwidth[joint] = (
-                fit.coefficients,
-                fit.bandwidth / (2 * np.pi * knots.step),
-            )
+            coefficients[:, joint] = fit.coefficients
+            bandwidth[joint] = fit.bandwidth / (2 * np.pi * knots.step)
     pieces = piece_coefficients(coefficients)
     trend.add_to(pieces, knots)
     return JointCurve(knots, pieces, noise, bandwidth)
 
 
-def _check(time, position):
+def _check(time: np.ndarray, position: np.ndarray) -> None:
+    """Raise an InputError unless positions are finite and stamps do not decrease."""
     if not len(time) or not np.isfinite(position).all():
         raise InputError(
             f'joint positions must be finite, got {len(time)} readings with gaps or none; remove'
@@ -290,9 +318,11 @@ def _check(time, position):
         )
 
 
-def _place_knots(time):
+def _place_knots(time: np.ndarray) -> Knots:
     """
-    Return knots at the usual distance of the stamps (increasing), with a margin on both sides.
+    Return knots at the usual distance of increasing stamps, with a margin on both sides.
+
+    The usual distance is the median over spans of eight stamps, which jitter affects less.
     """
     stride = min(8, len(time) - 1)
     step = float(np.median(time[stride:] - time[:-stride]) / stride) if stride else 1e-6
@@ -304,22 +334,20 @@ def _place_knots(time):
             code='gap',
         )
     return Knots(
-        float(time[0] - _MARGIN * step),
-        step,
-        int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN,
+        start=float(time[0] - _MARGIN * step),
+        step=step,
+        n_intervals=int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN,
     )
 
 
-def _noise_floor(position, noise_sd):
+def _noise_floor(position: np.ndarray, noise_sd: np.ndarray | float | None) -> np.ndarray:
     """
-    Return the lower limit of the noise of the readings: the given value, rounding, coarse steps.
+    Return the least noise of the readings, rad, shape (n_joints,).
+
+    The largest of the given noise, the rounding of floating-point numbers and the quantisation by
+    encoder steps, ``step / sqrt(12)``.
     """
-    floor = 4 * np.finfo(float).eps * np.abs(position).max(axis=0)
+    rounding = 4 * np.finfo(float).eps * np.abs(position).max(axis=0)
     steps = np.array([encoder_step(column) for column in position.T])
-    return np.maximum.reduce(
-        [
-            floor,
-            steps / np.sqrt(12),
-            np.broadcast_to(0.0 if noise_sd is None else noise_sd, floor.shape),
-        ]
-    )
+    given = np.broadcast_to(0.0 if noise_sd is None else noise_sd, rounding.shape)
+    return np.maximum.reduce([rounding, steps / np.sqrt(12), given])

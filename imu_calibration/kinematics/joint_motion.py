@@ -102,26 +102,25 @@ def with_encoder_harmonics(
 
 def encoder_step(position: np.ndarray) -> float:
     """
-    Return the resolution of an encoder that shows in its readings, or 0.
+    Return the step of an encoder that is seen in its readings, rad, or 0.
 
-    Looks at isolated jumps, those between readings that repeat; they are one step high. Readings
-    that move by many steps from sample to sample have none; their quantisation is white and needs
-    no notice.
+    It is the size of isolated jumps: changes with equal readings before and after them. Most of the
+    jumps must have that size. Readings that change by many steps from sample to sample have no
+    isolated jumps; their quantisation is white noise.
     """
     change = np.diff(position)
     moved = change != 0
-    isolated = np.abs(change[1:-1][moved[1:-1] & ~moved[:-2] & ~moved[2:]])
-    if not len(isolated):
+    is_isolated = moved[1:-1] & ~moved[:-2] & ~moved[2:]
+    jumps = np.abs(change[1:-1][is_isolated])
+    if not len(jumps):
         return 0.0
-    step = np.median(isolated)
-    return float(step) if np.mean(np.abs(isolated / step - 1) < 0.15) > 0.8 else 0.0
+    step = np.median(jumps)
+    share_of_step = np.mean(np.abs(jumps / step - 1) < 0.15)
+    return float(step) if share_of_step > 0.8 else 0.0
 
 
 LINKED = 0.1
-"""
-Largest distance of stamps for interpolation, s; stamps further apart belong to different windows or
-rests.
-"""
+"""Largest distance of stamps for interpolation, s; with more, a new window or rest begins."""
 
 DERIVATIVE_BLOCK_ROWS = 4096
 """Rows per block, so that they fit in the processor's cache."""
@@ -131,12 +130,11 @@ def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
     """
     Return the motion at ``time - delay``, with unchanged `time`.
 
-    The motion of the IMU if its stamps are `delay` late.
-
-    Between two stamps the polynomial of degree seven that meets position, rate, acceleration and
-    jerk at both (Hermite), so that the error does not grow with the delay: 1e-4 of the acceleration
-    at a quarter of the stamps' frequency. Before the first of a run of stamps and after the last,
-    the Taylor series from there, with the jerk as the last derivative.
+    It is the motion of an IMU with stamps that are `delay` late. Between two stamps the polynomial
+    of degree seven that meets position, rate, acceleration and jerk at both (Hermite), so that the
+    error does not grow with the delay: 1e-4 of the acceleration at a quarter of the stamps'
+    frequency. Before the first of a run of stamps and after the last, the Taylor series from there,
+    with the jerk as the last derivative.
 
     Parameters
     ----------
@@ -168,10 +166,32 @@ def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
     )
 
 
-def _interpolated(time, step, derivatives, target, backwards):
-    right = np.clip(np.searchsorted(time, target, side='right'), 1, len(time) - 1)
-    inside = (step[right - 1] <= LINKED) & (target >= time[right - 1]) & (target <= time[right])
-    start = right[inside] - 1
+def _interpolated(
+    time: np.ndarray,
+    step: np.ndarray,
+    derivatives: np.ndarray,
+    target: np.ndarray,
+    is_late: np.ndarray,
+) -> np.ndarray:
+    """
+    Return position and its first three derivatives at m instants, shape (4, n_joints, m).
+
+    Parameters
+    ----------
+    time, step : array, shapes (n,) and (n - 1,)
+        Stamps and their differences, s.
+    derivatives : array, shape (4, n_joints, n)
+        Position and its first three derivatives at the stamps.
+    target : array, shape (m,)
+        Instants, s.
+    is_late : array, shape (m,)
+        True where the instant is before its stamp.
+
+    """
+    after = np.clip(np.searchsorted(time, target, side='right'), 1, len(time) - 1)
+    is_between = (target >= time[after - 1]) & (target <= time[after])
+    inside = (step[after - 1] <= LINKED) & is_between
+    start = after[inside] - 1
     left = derivatives.take(start, axis=2)
     right = derivatives.take(start + 1, axis=2)
     between = _hermite(left, right, step[start], target[inside] - time[start])
@@ -179,16 +199,22 @@ def _interpolated(time, step, derivatives, target, backwards):
         return between
     moved = np.empty((*derivatives.shape[:2], len(target)))
     moved[:, :, inside] = between
-    beyond = np.flatnonzero(~inside)
-    # The end of the run that contains the stamp: an isolated stamp, of a rest, is its own run.
-    before, after = (np.searchsorted(time, target[beyond], side=side) for side in ('left', 'right'))
-    base = np.clip(np.where(backwards[beyond], before, after - 1), 0, len(time) - 1)
-    moved[:, :, beyond] = _taylor(derivatives[:, :, base], target[beyond] - time[base])
+    # Outside a run of stamps, the Taylor series from its end: an instant before its stamp is before
+    # the first stamp of the run, an instant after it follows the last. An isolated stamp is a run.
+    outside = np.flatnonzero(~inside)
+    next_stamp = np.searchsorted(time, target[outside], side='left')
+    last_stamp = np.searchsorted(time, target[outside], side='right') - 1
+    base = np.clip(np.where(is_late[outside], next_stamp, last_stamp), 0, len(time) - 1)
+    moved[:, :, outside] = _taylor(derivatives[:, :, base], target[outside] - time[base])
     return moved
 
 
-def _taylor(derivatives, by):
-    """Return value and first three derivatives at a distance `by`."""
+def _taylor(derivatives: np.ndarray, by: np.ndarray | float) -> np.ndarray:
+    """
+    Return value and first three derivatives at a distance `by`, shape (4, n_joints, n).
+
+    `derivatives`: the same at distance zero; the third derivative is constant.
+    """
     position, rate, acceleration, jerk = derivatives
     return np.stack(
         [
@@ -211,31 +237,45 @@ _POWERS = np.array(
 )
 """Derivatives of order 0 ... 3 of u^4 ... u^7 at u = 1, shape (4, 4)."""
 _FROM_ENDS = np.linalg.inv(_POWERS)
+"""Derivatives at u = 1 to coefficients of u^4 ... u^7, shape (4, 4)."""
 
 
-def _hermite(left, right, step, by):
+def _hermite(left: np.ndarray, right: np.ndarray, step: np.ndarray, by: np.ndarray) -> np.ndarray:
     """
-    Return value and first three derivatives.
+    Return value and first three derivatives of Hermite polynomials of degree seven.
 
-    Shape (4, n_joints, m), at `by` from the left end of intervals of length `step`, (m,).
+    With ``u = by / step`` the polynomial is ``sum_k c_k u^k``.
+
+    Parameters
+    ----------
+    left, right : array, shape (4, n_joints, m)
+        Value and first three derivatives at both ends of m intervals.
+    step, by : array, shape (m,)
+        Length of the intervals, and distance of the instant from the left end, s.
+
+    Returns
+    -------
+    array, shape (4, n_joints, m)
+
     """
+    # Derivatives by u in place of the time.
     scale = np.stack([step**0, step, step**2, step**3])[:, None]
     left = scale * left
     # The powers four to seven correct the error of the left-end cubic at the right end.
     upper = np.tensordot(_FROM_ENDS, scale * right - _taylor(left, 1.0), 1)
     coefficients = [left[0], left[1], left[2] / 2, left[3] / 6, *upper]
     u = by / step
-    found = np.empty_like(left)
+    derivatives = np.empty_like(left)
     for order in range(4):
-        total = found[order]
+        # Horner's rule; the derivative of this order is sum_k coefficients[k] u^(k - order).
+        total = derivatives[order]
         total[:] = coefficients[7]
         for power in range(6, order - 1, -1):
             total *= u
             total += coefficients[power]
-        coefficients = [coefficients[0]] * (order + 1) + [
-            (power - order) * coefficients[power] for power in range(order + 1, 8)
-        ]
-    return found / scale
+        for power in range(order + 1, 8):
+            coefficients[power] = (power - order) * coefficients[power]
+    return derivatives / scale
 
 
 def rest_at(position: np.ndarray) -> JointMotion:

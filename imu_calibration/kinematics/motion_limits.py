@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, eq=False)
 class TrajectoryPoints:
     """
-    Content of a JointTrajectory. Without points it commands the joints to stop.
+    Content of a JointTrajectory message. Without points it commands the joints to stop.
 
     Raises
     ------
@@ -91,13 +91,13 @@ class TrajectoryPoints:
         return float(self.time[-1]) if len(self.time) else 0.0
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return the quantities of the points, by name."""
+        """Return the given quantities of the points: name -> values, shape (n, n_joints)."""
         given = {'position': self.position, 'rate': self.rate, 'acceleration': self.acceleration}
         return {name: values for name, values in given.items() if values is not None}
 
     def ordered(self, joint_names: Sequence[str]) -> TrajectoryPoints:
         """
-        Return the same with the joints in another order.
+        Return the trajectory with the joints in another order.
 
         Raises
         ------
@@ -105,45 +105,54 @@ class TrajectoryPoints:
             When the trajectory names other joints than these, or not all of them.
 
         """
-        own = list(self.joint_names)
+        present = list(self.joint_names)
         wanted = list(joint_names)
-        if sorted(own) != sorted(wanted):
+        if sorted(present) != sorted(wanted):
             raise InputError(
                 f'a trajectory must name exactly the joints {", ".join(wanted)}, got'
-                f' {", ".join(own) or "none"}; name every joint once',
+                f' {", ".join(present) or "none"}; name every joint once',
                 code='joint_names',
             )
-        order = [own.index(name) for name in wanted]
-        columns: dict[str, Any] = {
-            name: values[:, order] for name, values in self.columns().items()
-        }
+        order = [present.index(name) for name in wanted]
+        columns: dict[str, Any] = {}
+        for name, values in self.columns().items():
+            columns[name] = values[:, order]
         return replace(self, joint_names=tuple(wanted), **columns)
 
     def slowed(self, factor: float) -> TrajectoryPoints:
-        """Return the same path at `factor` of its speed, 0 < factor <= 1."""
-        slower: dict[str, Any] = {
-            name: values * factor**order
-            for order, (name, values) in enumerate(self.columns().items())
-        }
-        return replace(self, time=self.time / factor, **slower)
+        """
+        Return the same path at `factor` of its speed, 0 < factor <= 1.
+
+        Derivatives of order k, position being order 0, are multiplied by ``factor^k``.
+        """
+        columns: dict[str, Any] = {}
+        for order, (name, values) in enumerate(self.columns().items()):
+            columns[name] = values * factor**order
+        return replace(self, time=self.time / factor, **columns)
 
 
 _WORDS = {'position': 'positions', 'rate': 'velocities', 'acceleration': 'accelerations'}
 
 
 USUAL = {True: (150.0 * DEG, 300.0 * DEG), False: (0.25, 0.5)}
-"""Default speed and acceleration of rotating and of sliding joints: rad/s, rad/s^2; m/s, m/s^2."""
+"""
+Whether a joint turns -> default speed and acceleration: rad/s and rad/s^2, or m/s and m/s^2.
+"""
 NOT_CHECKED = (
     'only the limits of the joints are checked, not collisions of the robot with itself, its'
     ' surroundings or its cables'
 )
 """Stated wherever a plan is printed, saved or driven."""
-DEFAULT_ORIGIN, ROBOT_ORIGIN, TABLE_ORIGIN = 'default', 'robot description', 'table file'
-"""Origins of limits; default: no description gives it."""
+DEFAULT_ORIGIN = 'default'
+"""Origin of a limit that no description gives."""
+ROBOT_ORIGIN = 'robot description'
+"""Origin of a limit in a URDF."""
+TABLE_ORIGIN = 'table file'
+"""Origin of a limit in a table file."""
 RADIANS = 2 * np.pi
-"""A range in degrees with smaller ends is probably in radians."""
+"""Ends of a range in degrees up to this number are probably in radians."""
 MAX_RADIAN_RANGE = 20 * np.pi
-"""A range of ten turns in a robot description is probably in degrees, rad."""
+"""A range above this in a robot description, rad, is probably in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,20 +181,18 @@ class MotionLimits:
 
     @property
     def endless(self) -> np.ndarray:
-        """True for joints that may turn on and on."""
+        """True for joints that may turn without end, shape (n_joints,)."""
         return self.turns & ~np.isfinite(self.lower)
 
     def wound(self, position: np.ndarray, turns: float) -> 'MotionLimits':
         """
         Return the limits with endless joints restricted to a number of turns.
 
-        They may turn so many turns to either side of a position. Zero turns means unrestricted.
+        To either side of a position, rad and m, shape (n_joints,); zero turns: unrestricted.
         """
-        return (
-            self.around(position, np.where(self.endless, 2 * np.pi * turns, np.inf))
-            if turns
-            else self
-        )
+        if not turns:
+            return self
+        return self.around(position, np.where(self.endless, 2 * np.pi * turns, np.inf))
 
     def around(self, position: np.ndarray, reach: np.ndarray) -> 'MotionLimits':
         """
@@ -213,32 +220,32 @@ class MotionLimits:
 
     def reached(self, position: np.ndarray, reach_deg: float) -> 'MotionLimits':
         """
-        Return the limits with rotating joints restricted to `reach_deg`.
+        Return the limits with rotating joints restricted to a distance from a position.
 
-        The restriction is on either side of a position. Sliding joints do not change.
+        `reach_deg`: the distance to either side. Sliding joints are held at the position.
         """
         return self.around(position, np.where(self.turns, reach_deg * DEG, 0.0))
 
 
 def free_limits(n_joints: int) -> MotionLimits:
     """Return the limits of joints that turn without end at the usual speed."""
-    whole, (speed, acceleration) = np.full(n_joints, np.inf), USUAL[True]
+    speed, acceleration = USUAL[True]
     return MotionLimits(
-        -whole,
-        whole,
-        np.full(n_joints, speed),
-        np.full(n_joints, acceleration),
-        np.ones(n_joints, bool),
+        lower=np.full(n_joints, -np.inf),
+        upper=np.full(n_joints, np.inf),
+        speed=np.full(n_joints, speed),
+        acceleration=np.full(n_joints, acceleration),
+        turns=np.ones(n_joints, bool),
     )
 
 
 def limits_of(table: Table) -> MotionLimits:
     """
-    Return the limits of a table's joints.
+    Return the limits of the joints of a table that are read.
 
-    A joint that other joints mimic keeps their limits as well. Defaults: `USUAL` speed and
-    acceleration, no end for a joint that turns, no motion for a joint that slides; `missing_ranges`
-    lists the joints without a range.
+    The limits of joints that follow another one restrict that one as well. Defaults: `USUAL` speed
+    and acceleration, no end for a joint that turns, no motion for a joint that slides;
+    `missing_ranges` lists the joints without a range.
     """
     names = table.joint_names
     turns = np.ones(len(names), bool)
@@ -289,29 +296,32 @@ def limits_of(table: Table) -> MotionLimits:
 
 
 def _origin(joint: Joint, name: str) -> str:
-    where = ROBOT_ORIGIN if name in joint.limits.described else TABLE_ORIGIN
-    return where if joint.mimic is None else f'{where}, joint {joint.name}'
+    """Return the origin of a limit of a joint (`name`: its field), with the name of a follower."""
+    origin = ROBOT_ORIGIN if name in joint.limits.described else TABLE_ORIGIN
+    return origin if joint.mimic is None else f'{origin}, joint {joint.name}'
 
 
 def missing_ranges(table: Table) -> tuple[str, ...]:
     """
-    Return the joints whose range is unknown or implausibly wide.
+    Return the joints without a plausible range that are not declared endless.
 
-    Neither a plausible range nor declared endless.
+    A range is implausible if a robot description gives it and it is wider than ten turns.
     """
     limits = limits_of(table)
-    wide = (
-        limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > MAX_RADIAN_RANGE)
-    )
-    return tuple(
-        name
-        for name, origin, is_wide in zip(table.joint_names, limits.origins, wide, strict=True)
-        if origin[0] == DEFAULT_ORIGIN or (is_wide and origin[0].startswith(ROBOT_ORIGIN))
-    )
+    is_wide = limits.upper - limits.lower > MAX_RADIAN_RANGE
+    is_wide &= limits.turns & np.isfinite(limits.lower)
+    missing = []
+    for index, name in enumerate(table.joint_names):
+        range_origin, _, _ = limits.origins[index]
+        if range_origin == DEFAULT_ORIGIN:
+            missing.append(name)
+        elif is_wide[index] and range_origin.startswith(ROBOT_ORIGIN):
+            missing.append(name)
+    return tuple(missing)
 
 
 def range_warnings(table: Table) -> list[str]:
-    """Return one line on joints without a range, and one per range whose unit is doubtful."""
+    """Return one line on joints without a range, and one for each range with a doubtful unit."""
     lines = []
     missing = missing_ranges(table)
     if missing:
@@ -321,48 +331,42 @@ def range_warnings(table: Table) -> list[str]:
             ' file'
         )
     for joint in table.joints:
-        lower, upper = joint.limits.lower, joint.limits.upper
-        if (
-            joint.turns
-            and lower is not None
-            and upper is not None
-            and 'lower' not in joint.limits.described
-        ):
-            ends = np.degrees((lower, upper))
-            if 0 < np.max(np.abs(ends)) <= RADIANS:
-                lines.append(
-                    f"range_deg of joint '{joint.name}' must be in degrees, [{ends[0]:g},"
-                    f' {ends[1]:g}] looks like radians; write [{np.degrees(ends[0]):.1f},'
-                    f' {np.degrees(ends[1]):.1f}] if it is'
-                )
+        lower = joint.limits.lower
+        upper = joint.limits.upper
+        # Only ranges in degrees, which a table file gives for rotating joints.
+        if not joint.turns or lower is None or upper is None or 'lower' in joint.limits.described:
+            continue
+        ends = np.degrees((lower, upper))
+        if 0 < np.max(np.abs(ends)) <= RADIANS:
+            lines.append(
+                f"range_deg of joint '{joint.name}' must be in degrees, [{ends[0]:g},"
+                f' {ends[1]:g}] looks like radians; write [{np.degrees(ends[0]):.1f},'
+                f' {np.degrees(ends[1]):.1f}] if it is'
+            )
     return lines
 
 
 def limit_words(table: Table, limits: MotionLimits) -> list[str]:
     """
-    Return range, speed and acceleration of each joint, a line per joint.
+    Return one line for each joint: range, speed and acceleration with their origins.
 
-    Each line includes the origin of each limit.
+    `limits` may be narrower than those of the table.
     """
     lines = []
-    described = limits_of(table)
-    for k, (name, (of_range, of_speed, of_acceleration)) in enumerate(
-        zip(table.joint_names, limits.origins, strict=True)
-    ):
+    is_endless = limits_of(table).endless  # as declared
+    for k, (name, origins) in enumerate(zip(table.joint_names, limits.origins, strict=True)):
+        range_origin, speed_origin, acceleration_origin = origins
         factor, unit = (180 / np.pi, 'deg') if limits.turns[k] else (1.0, 'm')
-        declared = 'endless' if described.endless[k] else ''
-        ends = (
-            f'{factor * limits.lower[k]:.4g} to {factor * limits.upper[k]:.4g} {unit}'
-            if np.isfinite(limits.lower[k])
-            else ''
-        )
-        text = (
-            'no range'
-            if of_range == DEFAULT_ORIGIN
-            else f'{", here ".join(filter(None, (declared, ends)))} ({of_range})'
-        )
+        parts = []
+        if is_endless[k]:
+            parts.append('endless')
+        if np.isfinite(limits.lower[k]):
+            parts.append(f'{factor * limits.lower[k]:.4g} to {factor * limits.upper[k]:.4g} {unit}')
+        text = f'{", here ".join(parts)} ({range_origin})'
+        if range_origin == DEFAULT_ORIGIN:
+            text = 'no range'
         lines.append(
-            f'{name}: {text}, {factor * limits.speed[k]:.4g} {unit}/s ({of_speed}), '
-            f'{factor * limits.acceleration[k]:.4g} {unit}/s^2 ({of_acceleration})'
+            f'{name}: {text}, {factor * limits.speed[k]:.4g} {unit}/s ({speed_origin}), '
+            f'{factor * limits.acceleration[k]:.4g} {unit}/s^2 ({acceleration_origin})'
         )
     return lines

@@ -73,7 +73,8 @@ class Reference(AlignedArrays):
         return self._joints.rate
 
     @property
-    def _joints(self):
+    def _joints(self) -> Any:
+        """The `JointMotion` of the joints; raises an InputError without one."""
         if self.motion is None:
             raise InputError(
                 'an effect that depends on joints needs a table or an arm, there is none; omit the'
@@ -99,9 +100,10 @@ def unit_rows(vectors: np.ndarray) -> np.ndarray:
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """
-    Return the rotation closest to a matrix.
+    Return the rotation closest to a matrix, shape (3, 3).
 
-    Of ``vectors_a.T @ vectors_b`` that of ``vectors_a = mat_ab @ vectors_b`` (Kabsch).
+    For pairs of vectors as rows, that of ``vectors_a.T @ vectors_b`` is the mat_ab of least squares
+    with ``vector_a = mat_ab @ vector_b`` (Kabsch).
     """
     left, _, right = np.linalg.svd(matrix)
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
@@ -113,7 +115,10 @@ def cross(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
     Shapes (..., 3, n) and (3, n) or (3, 1).
     """
-    (x, y, z), a, b, c = right, left[..., 0, :], left[..., 1, :], left[..., 2, :]
+    a = left[..., 0, :]
+    b = left[..., 1, :]
+    c = left[..., 2, :]
+    x, y, z = right
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-2)
 
 
@@ -131,8 +136,8 @@ def quaternions_from_vectors(vectors: np.ndarray) -> np.ndarray:
     """
     Return the unit quaternions (x, y, z, w) of rotation vectors, rad, shape (..., 3) to (..., 4).
 
-    ``(v sin(a / 2) / a, cos(a / 2))`` with the angle ``a = |v|``. These three functions are not
-    those of SciPy, as its import needs more time than a short recording.
+    ``(v sin(a / 2) / a, cos(a / 2))`` with the angle ``a = |v|``. SciPy has the same function, but
+    its import needs more time than a short recording.
     """
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     # np.sinc(x) is sin(pi x) / (pi x), and 1 at zero.
@@ -188,15 +193,10 @@ def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
     sin = np.sin(roll)
     cos = np.cos(roll)
-    return np.array(
-        [
-            roll,
-            pitch,
-            np.arctan2(
-                sin * matrix[0, 2] - cos * matrix[0, 1], cos * matrix[1, 1] - sin * matrix[1, 2]
-            ),
-        ]
+    yaw = np.arctan2(
+        sin * matrix[0, 2] - cos * matrix[0, 1], cos * matrix[1, 1] - sin * matrix[1, 2]
     )
+    return np.array([roll, pitch, yaw])
 
 
 def align(direction: np.ndarray) -> np.ndarray:
@@ -233,9 +233,9 @@ _ROTATION_RATIO = 0.00344978650684  # m = omega^2 a^2 b / GM
 
 def attitudes_with_vertical(up_s: np.ndarray) -> np.ndarray:
     """
-    Return attitudes whose third column is the vertical, shape (n, 3, 3).
+    Return attitudes mat_sn with a given vertical as third column, shape (n, 3, 3).
 
-    The heading is arbitrary.
+    The heading is arbitrary. `up_s`: unit vectors in the sensor frame, shape (n, 3).
     """
     other = np.eye(3)[np.argmin(np.abs(up_s), axis=1)]
     first = np.cross(other, up_s)
@@ -274,14 +274,14 @@ def local_gravity(
     gravity: float | None, latitude_deg: float | None = None, height: float | None = None
 ) -> tuple[float | None, float]:
     """
-    Return (gravity, its standard deviation), m/s^2: as given, else the normal gravity of the place.
+    Return (gravity, its standard deviation), m/s^2, as given or of a place.
 
-    (None, 0.0) without either.
+    The normal gravity of the place; (None, 0.0) without gravity and latitude.
 
     Parameters
     ----------
     gravity : float or None
-        Measured gravity, m/s^2; its standard deviation is taken as zero.
+        Measured gravity, m/s^2, with a standard deviation of zero.
     latitude_deg : float or None
         Geodetic latitude, degrees.
     height : float or None
@@ -336,8 +336,8 @@ def gravity_of_settings(gravity: float, latitude_deg: float, height: float) -> t
 
     """
     place = () if gravity or latitude_deg > 90 else (latitude_deg, height)
-    value, spread = local_gravity(gravity or None, *place)
-    return value or 0.0, spread
+    value, sd = local_gravity(gravity or None, *place)
+    return value or 0.0, sd
 
 
 def earth_rate_n(latitude_deg: float, azimuth_deg: float) -> np.ndarray:

@@ -6,6 +6,7 @@ vibration.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +17,9 @@ Frequency of a triple high pass, whose output is vibration, Hz: gravity rotating
 contributes 0.02 m/s^2, slow oscillation of joints zero.
 """
 MEAN_SQUARE_SECONDS = 0.5
-"""Time constant of the running mean of its square, s: as long as a table settles."""
+"""Time constant of the running mean of the squared vibration, s: as long as a table settles."""
 _STAGES = 3
+"""Number of high-pass stages."""
 
 
 class BandVariance:
@@ -32,9 +34,12 @@ class BandVariance:
 
     def __init__(self) -> None:
         self._inputs: list[list[float]] = []
-        """Last input of each stage, then the last output of the last one, each three axes."""
+        """
+        Last input of each stage, and last output of the last stage, each for three axes; the input
+        of a stage is the output of the one before. Empty before the first sample.
+        """
         self.now: tuple[float, ...] = (0.0, 0.0, 0.0)
-        """At the last sample, (m/s^2)^2."""
+        """Variance of each axis at the last sample, (m/s^2)^2."""
 
     def push(self, period: float, force: tuple[float, float, float]) -> tuple[float, ...]:
         """
@@ -48,7 +53,8 @@ class BandVariance:
         variance = []
         for axis, value in enumerate(force):
             for stage in range(_STAGES):
-                before, inputs[stage][axis] = inputs[stage][axis], value
+                before = inputs[stage][axis]
+                inputs[stage][axis] = value
                 value = keep * inputs[stage + 1][axis] + gain * (value - before)
             inputs[_STAGES][axis] = value
             variance.append(forget * self.now[axis] + (1.0 - forget) * value * value)
@@ -56,11 +62,7 @@ class BandVariance:
         return self.now
 
     def of(self, period: float, force_s: np.ndarray) -> np.ndarray:
-        """
-        Return the variances after each of the next samples, shape (n, 3).
-
-        The same as `push` one by one.
-        """
+        """Process the next n samples as `push` does, and return the variances, shape (n, 3)."""
         if not len(force_s):
             return np.zeros((0, 3))
         if not self._inputs:
@@ -77,7 +79,8 @@ class BandVariance:
         self.now = tuple(variance[-1].tolist())
         return variance
 
-    def _begin(self, force):
+    def _begin(self, force: Sequence[float]) -> None:
+        """Set the state after a constant force since long before the first sample."""
         self._inputs = [list(force)] + [[0.0, 0.0, 0.0] for _ in range(_STAGES)]
 
 
@@ -90,12 +93,14 @@ def autoregressive(drive: np.ndarray, decay: float, before: ArrayLike) -> np.nda
     """
     from scipy.linalg.blas import dtbsv
 
-    drive, band = np.array(drive, float), np.tile([[1.0], [-decay]], (1, len(drive)))
+    drive = np.array(drive, float)
+    band = np.tile([[1.0], [-decay]], (1, len(drive)))
     drive[:1] += decay * np.asarray(before)
     return np.stack([dtbsv(1, band, column, lower=1, diag=1) for column in drive.T], axis=1)
 
 
-def _decays(period):
+def _decays(period: float) -> tuple[float, float]:
+    """Return the decay per sample of a high-pass stage, a, and of the running mean, b."""
     return math.exp(-2.0 * math.pi * CORNER * period), math.exp(-period / MEAN_SQUARE_SECONDS)
 
 
@@ -119,6 +124,7 @@ class ThermalBranch:
 
     def __init__(self) -> None:
         self._middle: float | None = None
+        """The middle p, degrees Celsius; None before the first reading."""
         self.now = 0.0
         """The branch at the last reading, in [-1, 1]."""
 
@@ -137,7 +143,7 @@ class ThermalBranch:
 SLOPE_SECONDS = 5.0
 """
 Time constant of the slope of the temperature, s: readings of a thermometer each second, with noise
-of 0.02 K, give it to 4 mK/s; a slope that changes within a minute is hardly late.
+of 0.02 K, give it to 4 mK/s; a slope that changes within a minute has little delay.
 """
 
 
@@ -157,7 +163,11 @@ class TemperatureSlope:
 
     def __init__(self) -> None:
         self._before: tuple[int, float] | None = None
-        self._rise = self._span = 0.0
+        """(stamp in ns, temperature in degrees Celsius) of the last reading."""
+        self._rise = 0.0
+        """Decaying sum of temperature changes, K."""
+        self._span = 0.0
+        """Decaying sum of time steps, s."""
 
     def of(self, stamp_ns: np.ndarray, temperature_c: np.ndarray) -> np.ndarray:
         """Return the slope at each of the next readings, K/s, shape (n,)."""

@@ -1,10 +1,10 @@
 """
 Quintic splines on uniform knots with a third-difference penalty.
 
-The penalty that suits the noise and the resolution of encoders is included.
+The penalty is chosen from the data, for the noise and the resolution of encoders.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb, factorial
@@ -17,14 +17,16 @@ from imu_calibration.core.samples import runs_of
 
 DEGREE = 5
 SPLINE_ORDER = DEGREE + 1
-_SPLINE_BLOCK_SAMPLES = 8192  # instants whose intermediates fit in the processor's cache
+_SPLINE_BLOCK_SAMPLES = 8192
+"""Instants per block, so that intermediate arrays fit in the processor's cache."""
 
 
-def _piece_matrix():
+def _piece_matrix() -> np.ndarray:
     """
-    Return M with ``basis a on its interval = sum_k M[k, a] u^k``.
+    Return the polynomials of the six basis functions on an interval, shape (6 powers, 6 bases).
 
-    Basis a belongs to coefficient ``interval + a``.
+    ``basis_a(u) = sum_k M[k, a] u^k`` with u from 0 to 1 in the interval; basis a has the
+    coefficient with number ``interval + a``.
     """
     matrix = np.zeros((SPLINE_ORDER, SPLINE_ORDER))
     for basis in range(SPLINE_ORDER):
@@ -39,6 +41,7 @@ def _piece_matrix():
 
 
 PIECES = _piece_matrix()
+"""`_piece_matrix`."""
 _THIRD_DIFFERENCE = (-1.0, 3.0, -3.0, 1.0)
 
 
@@ -59,7 +62,11 @@ class Knots:
         return self.n_intervals + DEGREE
 
     def locate(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the interval of each instant (ends extended) and the place inside it, in steps."""
+        """
+        Return the number of the interval of each instant, and the place in it in steps.
+
+        The first and the last interval are extended, with places below 0 and above 1.
+        """
         scaled = (time - self.start) / self.step
         interval = np.clip(scaled.astype(np.intp), 0, self.n_intervals - 1)
         return interval, scaled - interval
@@ -69,14 +76,16 @@ def design_values(
     knots: Knots, time: np.ndarray, derivative: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (interval, values).
+    Return the interval of each instant, shape (n,), and the basis functions there, shape (6, n).
 
-    The six basis functions that are not zero at each instant, shape (6, n), or their derivative.
+    The six that are not zero, or their derivative of an order, 1/s^order.
     """
     interval, place = knots.locate(time)
     matrix = PIECES
     for _ in range(derivative):
+        # The derivative of u^k is k u^(k-1).
         matrix = np.arange(1, len(matrix))[:, None] * matrix[1:] / knots.step
+    # Horner's rule.
     values = np.broadcast_to(matrix[-1][:, None], (SPLINE_ORDER, len(time)))
     for row in matrix[-2::-1]:
         values = values * place + row[:, None]
@@ -131,7 +140,10 @@ def penalty_bands(weights: np.ndarray) -> np.ndarray:
 
 def piece_coefficients(coefficients: np.ndarray) -> np.ndarray:
     """
-    Return the polynomial of each interval in its place u, shape (6 powers, n_intervals, n_joints).
+    Return the polynomial of each interval, shape (6 powers, n_intervals, n_joints).
+
+    ``sum_k pieces[k] u^k`` with the place u in the interval, in steps; `coefficients`: of the
+    spline, shape (n_coefficients, n_joints).
     """
     windows = np.lib.stride_tricks.sliding_window_view(coefficients, SPLINE_ORDER, axis=0)
     return np.ascontiguousarray(np.moveaxis(windows @ PIECES.T, -1, 0))
@@ -156,11 +168,22 @@ def evaluate_pieces(
     return result
 
 
-def _horner(pieces, interval, place, taylor):
+def _horner(
+    pieces: np.ndarray, interval: np.ndarray, place: np.ndarray, taylor: np.ndarray
+) -> None:
     """
-    Fill `taylor`, zeros.
+    Write the Taylor coefficients of polynomials by repeated synthetic division.
 
-    With the Taylor coefficients of the polynomials at `place` (repeated synthetic division).
+    Parameters
+    ----------
+    pieces : array, shape (6 powers, n_intervals, n_joints)
+    interval : array, shape (n,)
+        Interval of each instant.
+    place : array, shape (n, n_joints)
+        Place in the interval, in steps, for each joint.
+    taylor : array, shape (n_orders, n, n_joints)
+        Zeros; receives the derivatives over the factorial of their order.
+
     """
     for power in range(DEGREE, -1, -1):
         for order in range(min(DEGREE - power, len(taylor) - 1), 0, -1):
@@ -170,17 +193,22 @@ def _horner(pieces, interval, place, taylor):
         taylor[0] += pieces[power].take(interval, axis=0)
 
 
-# Decades of the penalty relative to the rows per knot: from interpolation to a bandwidth of 1/100
-# of Nyquist's.
-_COARSE = (-6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
+_COARSE_DECADES = (-6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
+"""
+Decades of the penalty, relative to the rows per knot, that are tried first: from interpolation to a
+bandwidth of 1/100 of Nyquist's.
+"""
 ROBUSTNESS = 0.7
 """
 Parameter gamma of the robust criterion: 1 for plain cross-validation, less for fits that round
 sharp ramps more.
 """
-_PILOT = -2.0  # rough, but tame where readings lie close together
-_TAPER = 0.2  # share of a record in which the weight of the ends rises
-_LONG = 1000  # rows from which on the spectrum gives the residuals
+_PILOT_DECADE = -2.0
+"""Decade of the penalty of a rough fit, which has no large derivatives between close readings."""
+_TAPER_SHARE = 0.2
+"""Share of a record, half of it at each end, in which a weight rises from 0 to 1."""
+_MIN_ROWS_FOR_SPECTRUM = 1000
+"""Rows from which the residuals for all penalties are computed from the spectrum of one fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,13 +227,11 @@ class Smooth:
 
 class PenalisedSpline:
     """
-    Least squares on rows ``design @ coefficients = values`` with a penalty.
+    Least squares with a penalty, ``|values - design @ c|^2 + lambda |D c|^2``.
 
-    The penalty is ``lambda |third differences|^2``.
-
-    Eilers and Marx 1996. Degrees of freedom come from the mean bands of the normal matrix, as for a
-    long uniform record: the gain of the fit at the frequency theta is ``N / (N + lambda p)`` with
-    ``p = (2 - 2 cos theta)^3``.
+    D c are the third differences of the coefficients c (Eilers and Marx 1996). Degrees of freedom
+    come from the mean bands of the normal matrix, as for a long uniform record: the gain of the fit
+    at the frequency theta is ``N / (N + lambda p)`` with ``p = (2 - 2 cos theta)^3``.
 
     Parameters
     ----------
@@ -223,25 +249,30 @@ class PenalisedSpline:
         self.design = design
         self.bands = bands
         self.penalty = penalty_bands(np.ones(design.shape[1] - 3))
+        """Lower bands of D' D, shape (6, n_coefficients)."""
         self.n_rows, self.n_coefficients = design.shape
-        # Splines are worst at the ends, which callers keep out: the ends have weight zero in the
-        # noise and the penalty.
+        # Splines have the largest errors at the ends, which have weight zero in the noise and in
+        # the choice of the penalty.
         interior = np.tile(_taper(self.n_rows // n_kinds) ** 2, n_kinds)
         self._interior = interior / interior.sum()
+        """Weight of each row in the mean squared residual, shape (n_rows,)."""
         self.density = self.n_rows / self.n_coefficients
-        self._mean_bands = (
-            bands.sum(axis=1)
-            / self.n_coefficients
-            * np.where(np.arange(SPLINE_ORDER) == 0, 1.0, 2.0)
-        )
-        # The smallest penalty for which the factor exists: holes of m knots give it eigenvalues of
-        # about (pi / m)^6.
+        """Rows per knot."""
+        is_diagonal = np.arange(SPLINE_ORDER) == 0
+        self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(is_diagonal, 1.0, 2.0)
+        """Mean of each band of the normal matrix, on both sides of the diagonal, shape (6,)."""
+        # Without a penalty the normal matrix is singular where there are no readings: a hole of m
+        # knots has eigenvalues of about (pi / m)^6 times the penalty.
         empty = self.bands[0] < 1e-9 * self.density
         hole = np.max(np.diff(runs_of(empty)), initial=0) + SPLINE_ORDER
-        self.least_decade = max(_COARSE[0], 6 * np.log10(hole / np.pi) - 13)
-        self._gains = {}
+        self.least_decade = max(_COARSE_DECADES[0], 6 * np.log10(hole / np.pi) - 13)
+        """Decade of the smallest penalty for which the normal matrix can be factorised."""
+        self._gains: dict[float, tuple[float, float]] = {}
+        """Penalty -> `gains`."""
         self._theta = (np.arange(512) + 0.5) * np.pi / 512
+        """Frequencies up to Nyquist's, rad per knot."""
         self._symbols = self.symbols(self._theta)
+        """N and p at these frequencies."""
 
     def symbols(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -254,13 +285,14 @@ class PenalisedSpline:
         self, values: np.ndarray, penalty: float, with_ends: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the coefficients for columns of `values`, and mean squared residuals.
+        Return the coefficients for columns of `values`, and their mean squared residuals.
 
-        The mean squared residuals are away from the ends.
+        The residuals near the ends have small weights. `with_ends`: the penalty falls towards the
+        ends (`_end_weights`).
         """
-        unit = penalty_bands(self._end_weights(penalty)) if with_ends else self.penalty
+        unit_penalty = penalty_bands(self._end_weights(penalty)) if with_ends else self.penalty
         coefficients = solveh_banded(
-            self.bands + penalty * unit,
+            self.bands + penalty * unit_penalty,
             self.design.T @ values,
             lower=True,
             overwrite_ab=True,
@@ -270,7 +302,7 @@ class PenalisedSpline:
         residual = values - self.design @ coefficients
         return coefficients, np.einsum('i,ij,ij->j', self._interior, residual, residual)
 
-    def _end_weights(self, penalty):
+    def _end_weights(self, penalty: float) -> np.ndarray:
         """
         Return weights of the penalty that fall towards both ends, shape (n_coefficients - 3,).
 
@@ -279,17 +311,16 @@ class PenalisedSpline:
         some more noise: the error of the acceleration in the last hundredths of a second falls to a
         third and less.
         """
-        distance = (
-            np.minimum(np.arange(self.n_coefficients - 3), np.arange(self.n_coefficients - 3)[::-1])
-            - 2
-        )
+        number = np.arange(self.n_coefficients - 3)
+        distance = np.minimum(number, number[::-1]) - 2  # from the closer end, in knots
         return np.clip(distance * self.bandwidth(penalty) / 6, 0.1, 1.0) ** 3
 
     def gains(self, penalty: float) -> tuple[float, float]:
         """
-        Return the mean gain of the fit over all frequencies, and of its square.
+        Return the means of the gain of the fit and of its square over all frequencies.
 
-        The mean gain is the degrees of freedom per row.
+        The mean gain is the number of degrees of freedom per row, at least 3 of all rows: the
+        penalty does not constrain a parabola.
         """
         if penalty not in self._gains:
             normal, damping = self._symbols
@@ -311,11 +342,11 @@ def smooth(
     spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[float] | np.ndarray
 ) -> list[Smooth]:
     """
-    Return a `Smooth` per column of `values`, with the penalty that predicts best.
+    Return the fit of each column of `values` with the penalty that predicts best.
 
-    The larger one of two penalties: that of robust generalised cross-validation (Lukas 2006), which
-    needs no noise, and that of Mallows' Cp for `noise_floor`, which holds where the noise is not
-    white (coarse encoders).
+    The penalty is the larger one of two: that of robust generalised cross-validation (Lukas 2006),
+    which needs no noise, and that of Mallows' Cp for `noise_floor`, which holds where the noise is
+    not white (coarse encoders).
 
     Parameters
     ----------
@@ -327,16 +358,16 @@ def smooth(
         Standard deviation that the noise has at least.
 
     """
-    squares = (_squares_by_spectrum if spline.n_rows >= _LONG else _squares_by_fits)(spline, values)
-    decades = [
-        _best_decade(
-            (
-                lambda decade, c=column: _cross_validation(spline, decade, squares(decade)[c]),
-                lambda decade, c=column, f=floor: _mallows(spline, decade, squares(decade)[c], f),
-            )
-        )
-        for column, floor in enumerate(noise_floor)
-    ]
+    if spline.n_rows >= _MIN_ROWS_FOR_SPECTRUM:
+        squares = _squares_by_spectrum(spline, values)
+    else:
+        squares = _squares_by_fits(spline, values)
+    decades = []
+    for column, floor in enumerate(noise_floor):
+        criteria = _Criteria(spline, squares, column, floor)
+        decades.append(_best_decade((criteria.cross_validation, criteria.mallows)))
+
+    # Columns with the same penalty are solved together.
     results = {}
     for decade in set(decades):
         columns = np.flatnonzero(np.array(decades) == decade)
@@ -346,88 +377,124 @@ def smooth(
         noise = np.sqrt(residual / (1 - gain))
         for place, column in enumerate(columns.tolist()):
             results[column] = Smooth(
-                coefficients[:, place],
-                gain * spline.n_rows,
-                spline.bandwidth(penalty),
-                float(noise[place]),
+                coefficients=coefficients[:, place],
+                dof=gain * spline.n_rows,
+                bandwidth=spline.bandwidth(penalty),
+                noise_sd=float(noise[place]),
             )
     return [results[column] for column in range(len(decades))]
 
 
-def _squares_by_fits(spline, values):
-    return lru_cache(None)(lambda decade: spline.fit(values, _penalty(spline, decade))[1])
+SquaresOfDecade = Callable[[float], np.ndarray]
+"""Maps the decade of a penalty to the mean squared residuals of each column."""
 
 
-def _squares_by_spectrum(spline, values):
+def _squares_by_fits(spline: PenalisedSpline, values: np.ndarray) -> SquaresOfDecade:
+    """Return the mean squared residuals as a function that fits with each penalty once."""
+
+    @lru_cache(None)
+    def squares(decade: float) -> np.ndarray:
+        """Return the mean squared residuals of each column."""
+        _, residual = spline.fit(values, _penalty(spline, decade))
+        return residual
+
+    return squares
+
+
+def _squares_by_spectrum(spline: PenalisedSpline, values: np.ndarray) -> SquaresOfDecade:
     """
-    Return the function decade -> mean squared residuals, from one rough fit.
+    Return the mean squared residuals as a function, from the spectrum of one rough fit.
 
-    With d the third differences of the unpenalised coefficients, the residuals have the power
-    ``N lambda^2 p / (N + lambda p)^2 |d|^2``; the error of approximation by splines with these
-    knots is added.
+    With d the spectrum of the third differences of the unpenalised coefficients, the residuals have
+    the power ``N lambda^2 p / (N + lambda p)^2 |d|^2``. The residual of the rough fit beyond that,
+    the error of approximation by splines with these knots, is added for every penalty.
     """
-    pilot = _penalty(spline, _PILOT)
-    coefficients, floor = spline.fit(values, pilot)
+    pilot = _penalty(spline, _PILOT_DECADE)
+    coefficients, pilot_squares = spline.fit(values, pilot)
     taper = _taper(len(coefficients) - 3)[:, None]
     power = np.abs(np.fft.rfft(taper * np.diff(coefficients, 3, axis=0), axis=0)) ** 2 / np.sum(
         taper**2
     )
     theta = np.arange(len(power)) * 2 * np.pi / len(taper)
     normal, damping = spline.symbols(theta)
-    # Third differences of the rough fit lack the part removed by its own penalty.
+    # Third differences of the rough fit lack the part removed by its penalty.
     power *= ((1 + pilot * damping / normal) ** 2 * normal * damping)[:, None]
-    power[1:] *= (
-        2.0
-        if len(taper) % 2
-        else np.where(np.arange(1, len(power)) == len(power) - 1, 1.0, 2.0)[:, None]
-    )
+    # In a one-sided spectrum all frequencies count twice, except zero and that of Nyquist.
+    power[1:] *= 2.0
+    if len(taper) % 2 == 0:
+        power[-1] /= 2.0
     power /= len(taper) * spline.density
 
     @lru_cache(None)
-    def squares(decade):
+    def squares(decade: float) -> np.ndarray:
+        """Return the mean squared residuals of each column without the error of approximation."""
         penalty = _penalty(spline, decade)
         return (penalty / (normal + penalty * damping)) ** 2 @ power
 
-    beyond = np.maximum(floor - squares(_PILOT), 0.0)
-    return lambda decade: squares(decade) + beyond
+    approximation = np.maximum(pilot_squares - squares(_PILOT_DECADE), 0.0)
+    return lambda decade: squares(decade) + approximation
 
 
-def _taper(size):
+def _taper(size: int) -> np.ndarray:
     """Return a window with raised-cosine edges (Tukey's; the import of scipy.signal is slow)."""
-    inside = np.minimum(np.arange(size), np.arange(size)[::-1]) / max(
-        0.5 * _TAPER * (size - 1), 1.0
-    )
+    number = np.arange(size)
+    edge = max(0.5 * _TAPER_SHARE * (size - 1), 1.0)
+    inside = np.minimum(number, number[::-1]) / edge
     return 0.5 - 0.5 * np.cos(np.pi * np.minimum(inside, 1.0))
 
 
-def _penalty(spline, decade):
+def _penalty(spline: PenalisedSpline, decade: float) -> float:
+    """Return the penalty lambda of a decade relative to the rows per knot."""
     return spline.density * 10.0 ** max(decade, spline.least_decade)
 
 
-def _cross_validation(spline, decade, squares):
-    gain, square = spline.gains(_penalty(spline, decade))
-    return squares / (1 - gain) ** 2 * (ROBUSTNESS + (1 - ROBUSTNESS) * square)
+@dataclass(frozen=True, eq=False)
+class _Criteria:
+    """Criteria of the penalty of one column; the best penalty has the smallest value."""
+
+    spline: PenalisedSpline
+    """Rows and penalty."""
+    squares: SquaresOfDecade
+    """Mean squared residuals of all columns."""
+    column: int
+    """The column."""
+    noise_floor: float
+    """Standard deviation that the noise has at least."""
+
+    def cross_validation(self, decade: float) -> float:
+        """Return the robust generalised cross-validation, which needs no noise."""
+        gain, square = self.spline.gains(_penalty(self.spline, decade))
+        squares = self.squares(decade)[self.column]
+        return squares / (1 - gain) ** 2 * (ROBUSTNESS + (1 - ROBUSTNESS) * square)
+
+    def mallows(self, decade: float) -> float:
+        """Return Mallows' Cp for the least noise."""
+        gain, _ = self.spline.gains(_penalty(self.spline, decade))
+        squares = self.squares(decade)[self.column]
+        # The factor of the robust criterion, to first order in the gain.
+        return squares + (1 + 1 / ROBUSTNESS) * self.noise_floor**2 * gain
 
 
-def _mallows(spline, decade, squares, noise_sd):
-    gain, _ = spline.gains(_penalty(spline, decade))
-    # The guard of the robust criterion, to first order in the gain.
-    return squares + (1 + 1 / ROBUSTNESS) * noise_sd**2 * gain
+Criterion = Callable[[float], float]
+"""Maps the decade of a penalty to its value."""
 
 
-def _best_decade(scores):
+def _best_decade(criteria: Sequence[Criterion]) -> float:
     """
-    Return the largest of the scores' minima: in coarse steps, then one decade, then half a one.
+    Return the largest of the decades that minimise each criterion.
+
+    Only the criteria with the largest coarse minimum are refined.
     """
-    coarse = [min(_COARSE, key=score) for score in scores]
-    return max(
-        _refine(score, start)
-        for score, start in zip(scores, coarse, strict=True)
-        if start == max(coarse)
-    )
+    coarse = [min(_COARSE_DECADES, key=criterion) for criterion in criteria]
+    refined = []
+    for criterion, start in zip(criteria, coarse, strict=True):
+        if start == max(coarse):
+            refined.append(_refine(criterion, start))
+    return max(refined)
 
 
-def _refine(score, decade):
+def _refine(score: Criterion, decade: float) -> float:
+    """Return the minimum of a criterion near a decade, in steps of one, then of a half."""
     for step in (1.0, 0.5):
         decade = min((decade, decade - step, decade + step), key=score)
     return decade

@@ -34,11 +34,14 @@ class Turn:
 
     mat_ji: np.ndarray
     """
-    Vector coordinates in the sensor at the first sample (i) to those at the last one (j), shape (3,
-    3).
+    Turns vectors from the sensor frame at the first sample (i) into that at the last one (j), shape
+    (3, 3).
     """
     by_bias: np.ndarray
-    """Derivative of psi by the bias, ``delta mat_ji = -[psi x] mat_ji``, shape (3, 3), s."""
+    """
+    Derivative by the bias of the small rotation psi, ``delta mat_ji = -[psi x] mat_ji``, shape (3,
+    3), s.
+    """
     by_matrix: np.ndarray
     """Derivative of psi by the entries [row, column] of the forward matrix, shape (3, 3, 3)."""
     by_further: np.ndarray
@@ -85,50 +88,55 @@ def integrate_turn(
 
     """
     inverse = np.linalg.inv(matrix)
-    centred = (
-        rate_measured - bias if further is None else rate_measured - bias - further[0]
-    ).T.copy()
+    corrected = rate_measured - bias
+    if further is not None:
+        corrected = corrected - further[0]
+    centred = corrected.T.copy()
     rate = inverse @ centred
     step = np.diff(time)
     slopes = _slope_weights(time)
     vectors = _rotation_vectors(rate, step, slopes)
+    # From the end of each step k to the first sample, and to the last one.
     mat_ik = rotations_from_quaternions(_prefix_product(vectors).T)
     mat_ji = mat_ik[-1].T.copy()
     to_last = (mat_ji @ mat_ik.transpose(1, 2, 0).reshape(3, -1)).reshape(3, 3, -1)
+    # psi = sum over samples of weight @ delta rate, with rate = inverse @ centred.
     weight = _per_sample(_times_jacobian(to_last, vectors), step, rate, slopes)
     by_inverse = (weight.reshape(9, -1) @ centred.T).reshape(3, 3, 3)
     by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
     by_reading = inverse.T @ weight
-    by_further = (
-        np.zeros((3, 0))
-        if further is None
-        else -np.tensordot(by_reading, further[1], ((1, 2), (1, 0)))
-    )
+    by_further = np.zeros((3, 0))
+    if further is not None:
+        by_further = -np.tensordot(by_reading, further[1], ((1, 2), (1, 0)))
     path = float(np.sum(0.5 * step * np.linalg.norm(rate[:, :-1] + rate[:, 1:], axis=0)))
     integral = 0.5 * (centred[:, :-1] + centred[:, 1:]) @ step
     return Turn(
-        mat_ji,
-        -by_reading.sum(axis=2),
-        by_matrix,
-        by_further,
-        integral,
-        path,
-        float(time[-1] - time[0]),
+        mat_ji=mat_ji,
+        by_bias=-by_reading.sum(axis=2),
+        by_matrix=by_matrix,
+        by_further=by_further,
+        integral=integral,
+        angle=path,
+        duration=float(time[-1] - time[0]),
     )
 
 
 def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """
-    Return `Turn.mat_ji` of true rates, rad/s, shape (n, 3).
+    Return the rotation `Turn.mat_ji` of true rates, without its derivatives, shape (3, 3).
 
-    Without the derivatives, which take most of the time.
+    `time`, `rate`: s, rad/s, shapes (n,) and (n, 3).
     """
     vectors = _rotation_vectors(rate.T.copy(), np.diff(time), _slope_weights(time))
     return rotations_from_quaternions(_prefix_product(vectors)[:, -1]).T
 
 
-def _rotation_vectors(rate, step, slopes):
-    """Return the rotation vector of each step (`integrate_turn`), shape (3, n - 1)."""
+def _rotation_vectors(rate: np.ndarray, step: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """
+    Return the rotation vector of each step (`integrate_turn`), rad, shape (3, n - 1).
+
+    `rate`: shape (3, n); `step`: s, shape (n - 1,); `slopes`: `_slope_weights`.
+    """
     first = rate[:, :-1]
     second = rate[:, 1:]
     slope = slopes[1] * rate
@@ -145,32 +153,33 @@ def small_rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + turn + 0.5 * turn @ turn
 
 
-def _slope_weights(time):
+def _slope_weights(time: np.ndarray) -> np.ndarray:
     """
-    Return weights of the sample before, the sample and the one after in its slope.
+    Return the weights w of the slope at each sample, 1/s, shape (3, n).
 
-    Shape (3, n), 1/s; one-sided at the ends.
+    ``slope_k = w_0k x_(k-1) + w_1k x_k + w_2k x_(k+1)``, one-sided at the ends.
     """
     step = np.diff(time)
     before = step[:-1]
     after = step[1:]
     weights = np.zeros((3, len(time)))
-    weights[0, 1:-1], weights[2, 1:-1] = (
-        -after / (before * (before + after)),
-        before / (after * (before + after)),
-    )
-    weights[0, -1], weights[2, 0] = -1 / step[-1], 1 / step[0]
+    weights[0, 1:-1] = -after / (before * (before + after))
+    weights[2, 1:-1] = before / (after * (before + after))
+    weights[0, -1] = -1 / step[-1]
+    weights[2, 0] = 1 / step[0]
     weights[1] = -weights[0] - weights[2]
     return weights
 
 
-def _per_sample(gain, step, rate, slopes):
+def _per_sample(
+    gain: np.ndarray, step: np.ndarray, rate: np.ndarray, slopes: np.ndarray
+) -> np.ndarray:
     """
     Return H with ``psi = sum_m H_m @ delta rate_m``, shape (3, 3, n).
 
-    Each sample ends one step, begins the next, and enters its neighbours' slopes. The rows of
-    `gain`, shape (3, 3, n - 1), are multiplied from the right by a cross-product matrix: ``r^T [w
-    x] = (r x w)^T``.
+    Each sample ends one step, begins the next, and enters its neighbours' slopes. `gain` is the
+    derivative of psi by the rotation vector of each step, shape (3, 3, n - 1). Its rows r are
+    multiplied from the right by a cross-product matrix: ``r^T [w x] = (r x w)^T``.
     """
     half = 0.5 * step * gain
     by_vector = MAGNUS_SECOND * step**2 * gain
@@ -185,7 +194,7 @@ def _per_sample(gain, step, rate, slopes):
     return weight
 
 
-def _multiply(left, right):
+def _multiply(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     Return the products of quaternions as pairs of complex numbers, shape (2, n).
 
@@ -195,52 +204,56 @@ def _multiply(left, right):
 
     as ``j c = conj(c) j``. These are 8 operations on arrays; the four components need 28.
     """
-    (a, b), (c, d) = left, right
+    a, b = left
+    c, d = right
     product = np.empty((2, len(a)), complex)
     product[0] = a * c - b * d.conj()
     product[1] = a * d + b * c.conj()
     return product
 
 
-def _prefix_product(vectors):
+def _prefix_product(vectors: np.ndarray) -> np.ndarray:
     """
-    Return q_0, q_0 q_1, q_0 q_1 q_2, ... of rotation vectors, shape (3, n), as rows x, y, z, w.
+    Return the quaternions q_0, q_0 q_1, q_0 q_1 q_2, ... as rows x, y, z, w, shape (4, n).
 
-    Shape (4, n).
+    q_k is that of the rotation vector k; `vectors`: rad, shape (3, n).
     """
     x, y, z, w = quaternions_from_vectors(vectors.T).T
     u, v = _running_quaternion(np.stack([w + 1j * x, y + 1j * z]))
     return np.stack([u.imag, v.real, v.imag, u.real])
 
 
-def _running_quaternion(factors):
+def _running_quaternion(factors: np.ndarray) -> np.ndarray:
     """
-    Return the products of all factors up to each (`_multiply`), shape (2, n).
+    Return the product of the first k factors for each k (`_multiply`), shape (2, n).
 
-    Those of the pairs, then between the pairs; 2 n multiplications.
+    Recursive: with the products of neighbouring pairs as n / 2 factors, the products of the first
+    2, 4, ... factors; the remaining products need one more factor. 2 n multiplications in total.
     """
     if factors.shape[1] < 2:
         return factors
     pairs = _running_quaternion(_multiply(factors[:, :-1:2], factors[:, 1::2]))
-    product = factors.copy()
+    product = factors.copy()  # the first one is complete
     product[:, 1::2] = pairs
     product[:, 2::2] = _multiply(pairs[:, : (factors.shape[1] - 1) // 2], factors[:, 2::2])
     return product
 
 
-def _times_jacobian(rows, vectors):
+def _times_jacobian(rows: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """
-    Return ``rows J`` with ``exp(v + d) = exp(v) exp(J d)`` to first order.
+    Return ``rows J`` with ``exp(v + d) = exp(v) exp(J d)`` to first order in d, shape (3, 3, n).
 
-    The equation of J is ``J = 1 - one [v x] + two [v x]^2``, shape (3, 3, n).
+    With the angle a = |v|: ``J = 1 - (1 - cos a)/a^2 [v x] + (a - sin a)/a^3 [v x]^2``. `rows`: one
+    matrix for each vector, shape (3, 3, n); `vectors`: rad, shape (3, n).
     """
     angle = np.linalg.norm(vectors, axis=0)
+    # Series where the quotients lose digits.
     small = angle < 1e-3
     safe = np.where(small, 1.0, angle)
-    one = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
-    two = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    first_order = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    second_order = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
     across = cross(rows, vectors)
-    return rows - one * across + two * cross(across, vectors)
+    return rows - first_order * across + second_order * cross(across, vectors)
 
 
 def integrate_attitude(
@@ -268,9 +281,8 @@ def integrate_attitude(
         0.5 * (rate_s[1:] + rate_s[:-1]) * step + np.cross(rate_s[:-1], rate_s[1:]) * step**2 / 12
     )
     start = np.eye(3) if mat_ns0 is None else mat_ns0
-    return np.concatenate(
-        [start[None], start @ rotations_from_quaternions(_prefix_product(turns.T).T)]
-    )
+    from_start = rotations_from_quaternions(_prefix_product(turns.T).T)
+    return np.concatenate([start[None], start @ from_start])
 
 
 def dead_reckon(
@@ -299,9 +311,9 @@ def strapdown(
     mat_ns0: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return velocity and position in n, m/s and m, each shape (n, 3).
+    Return velocity and position in the level frame n, m/s and m, each shape (n, 3).
 
-    By accelerometers and gyroscopes only, from rest at the origin.
+    They are integrated from accelerometers and gyroscopes only, from rest at the origin.
 
     Parameters
     ----------
@@ -323,13 +335,11 @@ def error_growth(
     time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return velocity and position errors that a specific-force error causes.
+    Return the errors of velocity and position due to an error of specific force, each (n, 3).
 
-    The attitude is known. Each result has shape (n, 3).
-
-    With ``mat_ns=None`` the components are summed in the turning body frame, which is no
-    navigation: an error that turns with the body then appears as a steady drift (the reading behind
-    Zhang's "3 m/s and 150 m").
+    In m/s and m, with a correct attitude. With ``mat_ns=None`` the components are summed in the
+    turning body frame, which is no navigation: an error that turns with the body then appears as a
+    steady drift (the explanation of Zhang's "3 m/s and 150 m").
 
     """
     force_error = np.asarray(force_error_s, float)
@@ -342,9 +352,9 @@ def constant_error_growth(
     force_error: np.ndarray | float, seconds: float
 ) -> tuple[np.ndarray | float, np.ndarray | float]:
     """
-    Return the velocity and position error, m/s and m, of a constant error.
+    Return the velocity and position error, m/s and m, of a constant acceleration error.
 
-    The error is in m/s^2 along one axis of a body that does not turn.
+    The error, m/s^2, is along one axis of a body that does not turn.
     """
     return force_error * seconds, force_error * seconds**2 / 2
 
@@ -358,9 +368,7 @@ def dead_reckoning_errors(
     reference: Reference, force_s: np.ndarray, rate_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the errors of velocity and position in n, m/s and m, each shape (n, 3).
-
-    They are the errors of measured or compensated samples.
+    Return the errors of velocity and position from measured samples, m/s and m, each shape (n, 3).
 
     Navigation starts at rest from the true attitude. The reference's own samples are integrated by
     the same rule and subtracted, so that only sensor errors remain.
@@ -373,16 +381,18 @@ def dead_reckoning_errors(
         Measured or compensated samples, m/s^2 and rad/s.
 
     """
-    measured, true = (
-        strapdown(
-            reference.time, force, rate, gravity=reference.gravity, mat_ns0=reference.mat_sn[0].T
-        )
-        for force, rate in ((force_s, rate_s), (reference.force_s, reference.rate_s))
+    time = reference.time
+    gravity = reference.gravity
+    mat_ns0 = reference.mat_sn[0].T
+    velocity, position = strapdown(time, force_s, rate_s, gravity=gravity, mat_ns0=mat_ns0)
+    true_velocity, true_position = strapdown(
+        time, reference.force_s, reference.rate_s, gravity=gravity, mat_ns0=mat_ns0
     )
-    return measured[0] - true[0], measured[1] - true[1]
+    return velocity - true_velocity, position - true_position
 
 
-def _checked(time, rate_s):
+def _checked(time: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and rates as arrays; raises an InputError if they do not fit each other."""
     time = np.asarray(time, float)
     rate_s = np.asarray(rate_s, float)
     if rate_s.shape != (len(time), 3) or np.any(np.diff(time) <= 0):
@@ -394,6 +404,7 @@ def _checked(time, rate_s):
     return time, rate_s
 
 
-def _running_integral(time, values):
+def _running_integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the integral from the first sample by the trapezoid rule, shape (..., n, 3)."""
     areas = 0.5 * (values[..., 1:, :] + values[..., :-1, :]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros_like(values[..., :1, :]), np.cumsum(areas, axis=-2)], axis=-2)

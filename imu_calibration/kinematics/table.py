@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -58,46 +58,48 @@ class AxisAngle(NamedTuple):
 @lru_cache(maxsize=64)
 def axis_angles(joints: tuple[Joint, ...]) -> tuple[AxisAngle, ...]:
     """
-    Return the angles between each turning axis and the one before it.
+    Return the angular errors of each turning axis relative to the one before it.
 
-    Two axes enclose one angle, about their common perpendicular; the other direction in which the
-    second may stand wrong is the zero of the first joint. Parallel axes have no such perpendicular:
-    there are two angles, about `axis_error_directions`, and the zeros of their joints are one
-    (Hayati and Mirmirani 1985).
+    An error of the second axis has two directions. That about the common perpendicular is an angle;
+    the other one is equal to an error of the zero of the first joint. Parallel axes have no such
+    perpendicular: there are two angles, about `axis_error_directions`, and the zeros of their
+    joints are one (Hayati and Mirmirani 1985).
     """
-    found = []
-    before = None
-    name = ''
+    angles = []
+    axis_before = None
+    name_before = ''
     for index, joint in enumerate(joints):
-        # The axis of the turning joint before, brought along from frame to frame with all joints at
-        # zero.
-        before = None if before is None else joint.mat_before.T @ before
+        # The axis of the last turning joint in the frame of this one, with all joints at zero.
+        if axis_before is not None:
+            axis_before = joint.mat_before.T @ axis_before
         if not joint.turns:
             continue
         axis = np.array(joint.axis)
-        if before is not None:
-            found += _between(f'{name}_{joint.name}', index, before, axis)
-        before, name = axis, joint.name
-    return tuple(found)
+        if axis_before is not None:
+            angles += _angles_between(f'{name_before}_{joint.name}', index, axis_before, axis)
+        axis_before = axis
+        name_before = joint.name
+    return tuple(angles)
 
 
-def _between(name, index, before, axis):
-    normal = np.cross(before, axis)
+def _angles_between(
+    name: str, index: int, axis_before: np.ndarray, axis: np.ndarray
+) -> list[AxisAngle]:
+    """Return the angular errors of an axis relative to another, both in the frame of the joint."""
+    normal = np.cross(axis_before, axis)
     sine = np.linalg.norm(normal)
     if sine > PARALLEL:
         return [AxisAngle(name, index, normal / sine)]
-    return [
-        AxisAngle(f'{name}_{letter}', index, direction)
-        for letter, direction in zip('uv', axis_error_directions(axis), strict=True)
-    ]
+    u, v = axis_error_directions(axis)
+    return [AxisAngle(f'{name}_u', index, u), AxisAngle(f'{name}_v', index, v)]
 
 
 def axis_error_directions(axis: np.ndarray) -> np.ndarray:
     """
     Return two unit vectors u, v that form a right-handed triad u, v, axis; shape (2, 3).
 
-    u is the coordinate axis that lies farthest from `axis` (the first of equals), made orthogonal
-    to it; v = axis x u.
+    u is the coordinate axis with the smallest component of `axis` (the first of equals), made
+    orthogonal to `axis`; v = axis x u.
     """
     axis = np.asarray(axis, float)
     start = np.eye(3)[np.argmin(np.round(np.abs(axis), 6))]
@@ -131,7 +133,9 @@ TABLE = table_document(
 SITE = table_document(
     mapping(optional={**_SITE, 'joints': maybe(list_of(anything))}, closed=True), 'site'
 )
-"""A table description without joints, beside a robot description; its joints are limits by name."""
+"""
+A table description in addition to a robot description; its entries of joints are limits by name.
+"""
 
 
 @dataclass(frozen=True)
@@ -227,7 +231,7 @@ class Table:
         cls, gravity: float | None, gravity_sd: float, description: Mapping[str, Any]
     ) -> 'Table':
         """
-        Return the table of a description, at a local gravity that is given apart from it.
+        Return the table of a description, at a local gravity that is given separately.
 
         A measured gravity replaces that of the latitude, which still gives the Earth's rate.
 
@@ -249,8 +253,10 @@ class Table:
         """
         if gravity is None:
             return cls(**description)
-        stated = 'gravity' if gravity_sd == 0 else 'latitude'
-        if all(description.get(name) is None for name in ('gravity', stated)):
+        # A measured gravity replaces that of a latitude in the description. A gravity that follows
+        # from a latitude is used only if the description has neither.
+        excluding = ('gravity',) if gravity_sd == 0 else ('gravity', 'latitude')
+        if all(description.get(name) is None for name in excluding):
             sd = description.get('gravity_sd') or gravity_sd or None
             return cls(**{**description, 'gravity': gravity, 'gravity_sd': sd})
         table = cls(**description)
@@ -264,7 +270,7 @@ class Table:
         return table
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the mapping that `from_mapping` turns into an equal table."""
+        """Return the description from which `from_mapping` makes an equal table."""
         mapping = {
             f.name: getattr(self, f.name) for f in fields(self) if not f.name.startswith('mount_')
         }
@@ -282,20 +288,20 @@ class Table:
         turning = [joint.source for joint in self.joints if joint.turns]
         # A zero that affects only the first or the last axis is the azimuth, or belongs to the
         # mount.
-        apart = [name for name in turning[:1] + turning[-1:] if turning.count(name) == 1]
+        not_separate = [name for name in turning[:1] + turning[-1:] if turning.count(name) == 1]
         # A mimic joint is read from the same source as another one.
         read = tuple(dict.fromkeys(joint.source for joint in self.joints))
         turning = list(dict.fromkeys(turning))
         angles = tuple(angle.name for angle in axis_angles(self.joints))
         places = place_names([joint.name for joint in self.joints if joint.turns])
         return JointNames(
-            read,
-            tuple(turning),
-            tuple(name for name in turning if name not in apart),
-            angles,
-            places,
-            self.joint_error_rad or None,
-            self.joint_error_m or None,
+            read=read,
+            turning=tuple(turning),
+            zeros=tuple(name for name in turning if name not in not_separate),
+            angles=angles,
+            places=places,
+            angle_sd=self.joint_error_rad or None,
+            place_sd=self.joint_error_m or None,
         )
 
     @property
@@ -310,13 +316,15 @@ class Table:
     @property
     def gravity_sd_value(self) -> float:
         """
-        Standard deviation of `gravity_value`, m/s^2: as given.
+        Standard deviation of `gravity_value`, m/s^2.
 
-        Zero for a given gravity, else the accuracy of normal gravity.
+        As given; otherwise zero for a given gravity, and the accuracy of normal gravity without.
         """
         if self.gravity_sd is not None:
             return self.gravity_sd
-        return 0.0 if self.gravity is not None else NORMAL_GRAVITY_ACCURACY * self.gravity_value
+        if self.gravity is not None:
+            return 0.0
+        return NORMAL_GRAVITY_ACCURACY * self.gravity_value
 
     @property
     def mat_nb(self) -> np.ndarray:
@@ -335,9 +343,9 @@ class Table:
     @property
     def azimuth_n_deg(self) -> float | None:
         """Heading of the x axis of n, degrees clockwise from true north, or None."""
-        return (
-            None if self.azimuth_deg is None else self.azimuth_deg + base_heading_deg(self.mat_nb)
-        )
+        if self.azimuth_deg is None:
+            return None
+        return self.azimuth_deg + base_heading_deg(self.mat_nb)
 
     @property
     def earth_rate_n(self) -> np.ndarray | None:
@@ -360,16 +368,16 @@ def site_from_mapping(site: Mapping[str, Any]) -> dict[str, Any]:
 
 def base_heading_deg(mat_nb: np.ndarray) -> float:
     """
-    Return where the base x axis points in the level frame, in degrees.
+    Return the heading of the base x axis in the level frame, degrees.
 
-    The angle is counter-clockwise from the x axis of the level frame. It is zero when the base x
-    axis is vertical.
+    Counter-clockwise from the x axis of the level frame; zero when the base x axis is vertical.
     """
     x, y, _ = mat_nb[:, 0]
     return float(np.degrees(np.arctan2(y, x))) if np.hypot(x, y) > 1e-9 else 0.0
 
 
-def _require_joints(joints):
+def _require_joints(joints: Sequence[Joint]) -> None:
+    """Raise an InputError unless there are joints with different names, moved by read joints."""
     if not joints:
         raise InputError(
             'table: joints must list at least one joint, got none; describe them from the base'

@@ -1,7 +1,7 @@
 """
-A robot description (URDF) becomes the chain of joints that carries the sensor.
+The chain of joints that carries the sensor, from a robot description (URDF).
 
-The tree of static transforms, and poses through it.
+Also the tree of static transforms, and poses of its frames in each other.
 """
 
 from __future__ import annotations
@@ -41,6 +41,10 @@ class StaticTransforms:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}
+        """
+        Child -> (parent, origin of the child in the parent, m, matrix from the child to the
+        parent).
+        """
 
     def add(
         self,
@@ -56,19 +60,16 @@ class StaticTransforms:
         Returns
         -------
         bool
-            Whether it was usable: finite, a quaternion that turns, two frames.
+            Whether it was usable: finite, a quaternion of a length above 0.5, two frames.
 
         """
         xyz = np.array(xyz, float)
         quaternion = np.array(quaternion, float)
-        if (
-            not (
-                np.isfinite(xyz).all()
-                and np.isfinite(quaternion).all()
-                and np.linalg.norm(quaternion) > 0.5
-            )
-            or parent == child
-        ):
+        if parent == child:
+            return False
+        if not np.isfinite(xyz).all() or not np.isfinite(quaternion).all():
+            return False
+        if np.linalg.norm(quaternion) <= 0.5:
             return False
         self._parents[child] = (parent, xyz, rotations_from_quaternions(quaternion))
         return True
@@ -85,11 +86,10 @@ class StaticTransforms:
             Turns source vectors into target vectors, shape (3, 3).
 
         """
-        ups = self._to_root(source)
-        downs = self._to_root(target)
-        if ups[-1][0] != downs[-1][0]:
+        source_root, xyz_s, mat_rs = self._in_root(source)
+        target_root, xyz_t, mat_rt = self._in_root(target)
+        if source_root != target_root:
             return None
-        (_, xyz_s, mat_rs), (_, xyz_t, mat_rt) = ups[-1], downs[-1]
         return mat_rt.T @ (xyz_s - xyz_t), mat_rt.T @ mat_rs
 
     def why_not(self, target: str, source: str) -> str:
@@ -106,32 +106,37 @@ class StaticTransforms:
             )
         return (
             f"'{target}' and '{source}' are in trees without a static connection (roots:"
-            f' {self._to_root(target)[-1][0]}, {self._to_root(source)[-1][0]})'
+            f' {self._in_root(target)[0]}, {self._in_root(source)[0]})'
         )
 
-    def _to_root(self, frame):
+    def _in_root(self, frame: str) -> tuple[str, np.ndarray, np.ndarray]:
         """
-        Return (ancestor, origin of `frame` in it, matrix from `frame` to it).
+        Return (root, origin of `frame` in it, m, matrix from `frame` to it).
 
-        The ancestors run from the frame up to its root. A ring ends once closed.
+        In a circle of frames the root is the last one before the circle closes.
         """
-        steps = [(frame, np.zeros(3), np.eye(3))]
+        ancestor = frame
+        xyz = np.zeros(3)
+        matrix = np.eye(3)
         seen = {frame}
-        while (step := self._parents.get(steps[-1][0])) is not None and step[0] not in seen:
-            parent, xyz, mat = step
-            _, origin, turned = steps[-1]
-            steps.append((parent, xyz + mat @ origin, mat @ turned))
+        while ancestor in self._parents:
+            parent, xyz_in_parent, matrix_to_parent = self._parents[ancestor]
+            if parent in seen:
+                break
+            ancestor = parent
+            xyz = xyz_in_parent + matrix_to_parent @ xyz
+            matrix = matrix_to_parent @ matrix
             seen.add(parent)
-        return steps
+        return ancestor, xyz, matrix
 
 
 def up_of(
     root: str, transforms: Iterable[tuple[str, str, np.ndarray]]
 ) -> tuple[float, float, float]:
     """
-    Return the z axis of the outermost frame in the frame `root`.
+    Return the z axis of the outermost frame, a unit vector in the frame `root`.
 
-    Up, where that frame is the world or a map.
+    It is up where the outermost frame is the world or a map.
 
     Parameters
     ----------
@@ -149,7 +154,7 @@ def up_of(
     tree = StaticTransforms()
     for parent, child, quaternion in transforms:
         tree.add(parent, child, xyz=(0.0, 0.0, 0.0), quaternion=quaternion)
-    frame, _, mat = tree._to_root(root)[-1]
+    frame, _, mat = tree._in_root(root)
     if frame in tree._parents:
         raise InputError(
             f"static transforms must form a tree, those around '{frame}' form a circle; correct"
@@ -164,6 +169,7 @@ JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}
 """Default standard deviations of an arm's joints: arms have 0.1 to 1 mrad and 0.1 to 1 mm."""
 
 _MOVING = {'revolute': 'revolute', 'continuous': 'revolute', 'prismatic': 'prismatic'}
+"""Type of a moving joint in a URDF -> `Joint.type`."""
 _READ = {'link': (), 'joint': ('origin', 'parent', 'child', 'axis', 'limit', 'mimic')}
 """
 Elements that describe the kinematics, with their children; meshes, materials, controllers and
@@ -210,11 +216,12 @@ def table_from_urdf(
     require(site, SITE)
     values = site_from_mapping(site)
     if gravity is None and values.keys().isdisjoint(('gravity', 'latitude')):
-        gravity, gravity_sd = STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-    joints, rest = _chain(robot, link)
+        gravity = STANDARD_GRAVITY
+        gravity_sd = STANDARD_GRAVITY_SD
+    joints, link_placement = _chain(robot, link)
     xyz = np.array(values.get('mount_xyz', (0.0, 0.0, 0.0)), float)
     rpy_deg = np.array(values.get('mount_rpy_deg', (0.0, 0.0, 0.0)), float)
-    mount = rest.then(xyz, rotation_from_rpy(np.radians(rpy_deg)))
+    mount = link_placement.then(xyz, rotation_from_rpy(np.radians(rpy_deg)))
     values |= {f'mount_{name}': value for name, value in mount.fields.items()}
     joints = _with_limits(joints, site.get('joints') or (), link)
     return Table.at(gravity, gravity_sd, JOINT_ERRORS | values | {'joints': joints})
@@ -234,26 +241,28 @@ def root_of(text: str | bytes) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Placement:
-    """A frame in another one: where its origin is, and how it is turned."""
+    """A frame relative to an outer frame."""
 
     xyz: np.ndarray
+    """Origin in the outer frame, m, shape (3,)."""
     matrix: np.ndarray
+    """Turns vectors into the outer frame, shape (3, 3)."""
 
-    def then(self, xyz, matrix):
-        """Return the placement of a frame that is placed in this one."""
+    def then(self, xyz: np.ndarray, matrix: np.ndarray) -> '_Placement':
+        """Return the placement, in the outer frame, of a frame that is placed in this one."""
         return _Placement(self.xyz + self.matrix @ xyz, self.matrix @ matrix)
 
     @property
-    def fields(self):
-        """As fields of a `Joint`."""
+    def fields(self) -> dict[str, Any]:
+        """The fields `xyz` and `rpy_deg` of a `Joint`."""
         return {
             'xyz': tuple(self.xyz.tolist()),
             'rpy_deg': tuple(np.degrees(rpy_from_rotation(self.matrix)).tolist()),
         }
 
 
-def _read(text):
-    """Return the parser's robot from the links and joints of the text."""
+def _read(text: str | bytes) -> Any:
+    """Return the links and joints of a URDF as a `Robot` of urdf_parser_py."""
     from xml.etree import ElementTree
 
     try:
@@ -274,12 +283,13 @@ def _read(text):
             element.attrib.update((key, printable(value)) for key, value in element.items())
         if root.tag != 'robot':
             raise ValueError(f'its outermost element is <{root.tag}>')
-        bare = ElementTree.Element('robot', root.attrib)
-        for element in (child for child in root if child.tag in _READ):
-            ElementTree.SubElement(bare, element.tag, element.attrib).extend(
-                child for child in element if child.tag in _READ[element.tag]
-            )
-        return Robot.from_xml_string(ElementTree.tostring(bare))
+        # Only the elements that describe the kinematics.
+        kinematics = ElementTree.Element('robot', root.attrib)
+        for element in root:
+            if element.tag in _READ:
+                copied = ElementTree.SubElement(kinematics, element.tag, element.attrib)
+                copied.extend(child for child in element if child.tag in _READ[element.tag])
+        return Robot.from_xml_string(ElementTree.tostring(kinematics))
     except Exception as error:  # the parsers raise many kinds
         raise InputError(
             f'a robot description must be a URDF, this is not: {shortened(str(error), 200)}; give'
@@ -287,11 +297,12 @@ def _read(text):
         ) from error
 
 
-def _chain(robot, link):
+def _chain(robot: Any, link: str) -> tuple[list[Joint], _Placement]:
     """
-    Return the moving joints from the root to `link`, and the link's placement.
+    Return the moving joints from the root to `link`, and the placement of the link.
 
-    The placement of the link is after the last of these joints.
+    Fixed joints are part of the placement of the next frame. The placement of the link is relative
+    to the frame of the last moving joint.
     """
     if link not in robot.link_map:
         raise InputError(
@@ -310,7 +321,7 @@ def _chain(robot, link):
                 ' circle; correct it'
             )
     joints = []
-    placement = _Placement(np.zeros(3), np.eye(3))
+    placement = _Placement(np.zeros(3), np.eye(3))  # since the last moving joint
     for joint in reversed(on_the_way):
         placement = placement.then(*_origin(joint))
         if joint.type == 'fixed':
@@ -340,19 +351,22 @@ def _chain(robot, link):
     return joints, placement
 
 
-def _origin(joint):
-    xyz, rpy = (
-        three_numbers(
-            (joint.origin and getattr(joint.origin, name)) or (0, 0, 0),
-            f'origin {name} of joint {joint.name}',
-        )
-        for name in ('xyz', 'rpy')
-    )
-    return np.array(xyz), rotation_from_rpy(np.array(rpy))
+def _origin(joint: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return origin, m, and rotation matrix of a joint's frame in the frame of its parent link."""
+    numbers = {}
+    for name in ('xyz', 'rpy'):
+        value = joint.origin and getattr(joint.origin, name)
+        place = f'origin {name} of joint {joint.name}'
+        numbers[name] = np.array(three_numbers(value or (0, 0, 0), place))
+    return numbers['xyz'], rotation_from_rpy(numbers['rpy'])
 
 
-def _mimic(robot, joint):
-    """Return the joint at the end of the chain of followed joints, or None."""
+def _mimic(robot: Any, joint: Any) -> Mimic | None:
+    """
+    Return how a joint follows a joint that follows no other, or None if it follows none.
+
+    Several steps, each ``position = multiplier * followed + offset``, are joined into one.
+    """
     multiplier = 1.0
     offset = 0.0
     name = joint.name
@@ -371,24 +385,23 @@ def _mimic(robot, joint):
     return None if name == joint.name else Mimic(name, multiplier, offset)
 
 
-def _limits(joint):
+def _limits(joint: Any) -> JointLimits:
     """
-    Return the limits in the description.
+    Return the limits of a joint in the robot description.
 
-    A continuous joint is endless, placeholders (zero, infinite) count as not given.
+    A continuous joint is endless. Placeholders, zero or infinite, count as not given.
     """
     limit = joint.limit
     endless = joint.type == 'continuous'
-    ends = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
-    ends = (
-        (None, None) if endless or ends == (0.0, 0.0) or not all(map(math.isfinite, ends)) else ends
-    )
-    speed = (
-        limit.velocity
-        if limit is not None and limit.velocity and math.isfinite(limit.velocity)
-        else None
-    )
-    lower, upper = ends
+    lower = None
+    upper = None
+    speed = None
+    if limit is not None:
+        ends = (limit.lower or 0.0, limit.upper or 0.0)
+        if not endless and ends != (0.0, 0.0) and all(map(math.isfinite, ends)):
+            lower, upper = ends
+        if limit.velocity and math.isfinite(limit.velocity):
+            speed = limit.velocity
     return JointLimits(
         lower,
         upper,
@@ -398,8 +411,8 @@ def _limits(joint):
     )
 
 
-def _with_limits(joints, entries, link):
-    """Return the joints with the limits that the site gives, by name."""
+def _with_limits(joints: Sequence[Joint], entries: Iterable[Any], link: str) -> tuple[Joint, ...]:
+    """Return the joints with the limits that the entries of a site give for them by name."""
     by_name = {joint.name: joint for joint in joints}
     for entry in entries:
         name = entry.get('name') if isinstance(entry, Mapping) else None
@@ -413,17 +426,18 @@ def _with_limits(joints, entries, link):
         limits = mapping({'name': text()}, LIMITS[known.type], closed=True)
         require(entry, replace(SITE, name=f"limits of joint '{name}'"), limits)
         given = limits_from_mapping(entry, known.type)
-        better = {}
+        changes: dict[str, Any] = {}
         for key, value in vars(given).items():
             if key != 'described' and value is not None and value is not False:
-                better[key] = value
+                changes[key] = value
         if given.endless or given.lower is not None:  # a range and endless exclude each other
-            better = {'lower': None, 'upper': None, 'endless': False} | better
-        better['described'] = known.limits.described - set(better)
-        by_name[name] = replace(known, limits=replace(known.limits, **better))
+            changes = {'lower': None, 'upper': None, 'endless': False} | changes
+        changes['described'] = known.limits.described - set(changes)
+        by_name[name] = replace(known, limits=replace(known.limits, **changes))
     return tuple(by_name.values())
 
 
-def _listed(names):
+def _listed(names: Iterable[str]) -> str:
+    """Return the first names in alphabetical order, and the number of further ones."""
     names = sorted(names)
     return ', '.join(names[:12]) + (f' and {len(names) - 12} more' if len(names) > 12 else '')
