@@ -6,7 +6,6 @@ Tilt, wrong axes, sag with load, wobble.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -216,23 +215,37 @@ class _Link(NamedTuple):
     """`axis_error_directions`, shape (2, 3)."""
 
 
-class _Step(NamedTuple):
-    """
-    One step of the outward transformation: an offset, a constant rotation, then the moving joint.
-    """
+class _Displacement(NamedTuple):
+    """A constant offset, then a constant rotation, of the frame in which vectors are expressed."""
 
     offset: np.ndarray
-    """Displacement in the frame before the rotation, m, shape (3,)."""
+    """In the frame before the rotation, m, shape (3,)."""
     matrix: np.ndarray
-    """The rotation, shape (3, 3)."""
-    link: _Link | None
-    """The joint that moves, or None after the last one."""
-    sense: float = 1.0
+    """Turns vectors from the frame before into that after it, shape (3, 3)."""
+
+
+class _Step(NamedTuple):
+    """One step of the outward transformation: a constant displacement, then a moving joint."""
+
+    before: _Displacement
+    """From the joint before to this one."""
+    link: _Link
+    """The joint."""
+    sense: float
     """+1 or -1: the joint turns about ``sense`` times the coordinate axis `third`."""
-    third: int = 2
-    """Index of the coordinate axis that the joint turns about, after the rotation."""
-    across: np.ndarray | None = None
-    """Directions u, v of a lean after the rotation, shape (2, 3)."""
+    third: int
+    """Index of the coordinate axis that the joint turns about, after the displacement."""
+    across: np.ndarray
+    """Directions u, v of a lean after the displacement, shape (2, 3)."""
+
+
+class _Path(NamedTuple):
+    """The transformation from the base to the sensor."""
+
+    steps: list[_Step]
+    """One for each moving joint."""
+    to_sensor: _Displacement
+    """From the last moving joint to the sensor."""
 
 
 def reference_motion(
@@ -280,7 +293,7 @@ def reference_motion(
     rate_s = np.empty((n_samples, 3))
     alpha_s = np.empty((n_samples, 3))
     constants = _constants(table)
-    steps = _chain_steps(constants, motion)
+    path = _path_to_sensor(constants, motion)
     # Rate, angular acceleration and force are the last columns. Up, which a sag needs, is before
     # them: the last column of the attitude.
     has_sag = any(link.joint.sag for link in constants.links)
@@ -288,7 +301,7 @@ def reference_motion(
     base = constants.base[:, -n_columns:]
     for start in range(0, n_samples, _CHAIN_BLOCK_SAMPLES):
         part = slice(start, min(start + _CHAIN_BLOCK_SAMPLES, n_samples))
-        columns = _run_chain(base, motion, steps, part)
+        columns = _run_chain(base, motion, path, part)
         if attitude:
             mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
         rate_s[part] = columns[:, RATE].T
@@ -309,11 +322,11 @@ def reference_motion(
     )
 
 
-def _chain_steps(constants: _Constants, motion: JointMotion) -> list[_Step]:
+def _path_to_sensor(constants: _Constants, motion: JointMotion) -> _Path:
     """
-    Return the steps from the base to the sensor, one for each moving joint, and the last one.
+    Return the steps from the base to the sensor, one for each moving joint.
 
-    A joint at rest is part of the offset and the rotation of the next step.
+    A joint at rest is part of the displacement to the next moving joint, or to the sensor.
     """
     steps = []
     # Since the last joint that moves: rotation, and offset in the frame before that rotation.
@@ -342,13 +355,13 @@ def _chain_steps(constants: _Constants, motion: JointMotion) -> list[_Step]:
         if link.joint.turns:
             to_coordinate_axis, sense, third = _to_coordinate_axis(link.axis)
         across = link.across @ to_coordinate_axis.T
-        steps.append(_Step(offset, to_coordinate_axis @ matrix, link, sense, third, across))
+        before = _Displacement(offset, to_coordinate_axis @ matrix)
+        steps.append(_Step(before, link, sense, third, across))
         matrix = to_coordinate_axis.T
         offset = np.zeros(3)
 
-    # From the last joint to the sensor.
     offset = offset + matrix.T @ constants.mount_xyz
-    return [*steps, _Step(offset, constants.mat_sl @ matrix, None)]
+    return _Path(steps, _Displacement(offset, constants.mat_sl @ matrix))
 
 
 def _moves(motion: JointMotion, column: int) -> bool:
@@ -440,25 +453,32 @@ def _base_columns(table: Table) -> np.ndarray:
     return columns
 
 
-def _run_chain(
-    columns: np.ndarray, motion: JointMotion, steps: Sequence[_Step], part: slice
-) -> np.ndarray:
+def _run_chain(columns: np.ndarray, motion: JointMotion, path: _Path, part: slice) -> np.ndarray:
     """
     Return the k columns of `_base_columns` at the sensor, in its frame, shape (3, k, n).
 
     `columns`: all of the base or the last ones, shape (3, k, 1); `part`: the n samples.
     """
-    for step in steps:
-        # force += alpha x r + omega x (omega x r), then the constant rotation, then the joint.
-        if step.offset.any():
-            columns = columns.copy()
-            arm = step.offset[:, None]
-            columns[:, FORCE] += _arm_force(columns[:, RATE], columns[:, ALPHA], arm)
-        if not np.array_equal(step.matrix, np.eye(3)):
-            columns = np.tensordot(step.matrix, columns, 1)
-        if step.link is not None:
-            columns = _move(columns, step, motion, part)
+    for step in path.steps:
+        columns = _displace(columns, step.before)
+        columns = _move(columns, step, motion, part)
+    columns = _displace(columns, path.to_sensor)
     return np.broadcast_to(columns, (*columns.shape[:2], part.stop - part.start))
+
+
+def _displace(columns: np.ndarray, displacement: _Displacement) -> np.ndarray:
+    """
+    Return `columns` after a constant displacement.
+
+    ``force += alpha x r + omega x (omega x r)`` with the offset r, then the rotation.
+    """
+    if displacement.offset.any():
+        columns = columns.copy()
+        arm = displacement.offset[:, None]
+        columns[:, FORCE] += _arm_force(columns[:, RATE], columns[:, ALPHA], arm)
+    if not np.array_equal(displacement.matrix, np.eye(3)):
+        columns = np.tensordot(displacement.matrix, columns, 1)
+    return columns
 
 
 def _move(columns: np.ndarray, step: _Step, motion: JointMotion, part: slice) -> np.ndarray:
