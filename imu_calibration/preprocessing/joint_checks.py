@@ -79,6 +79,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     ]
     if not windows:
         return None
+    # 1. A frozen gyroscope.
     expected = _expected_rates(windows, table)
     differences = [window.rate_s - rate for window, rate in zip(windows, expected)]
     bias = np.median(np.concatenate(differences), axis=0)
@@ -90,6 +91,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
             f'the gyroscope must measure all the time, it repeats one reading {span_words(spans)} '
             'while the joints turn; check the sensor and its driver, and exclude that time',
         )
+    # 2. A frozen joint.
     windows = _unsaturated(windows)
     if not windows:
         return None
@@ -115,6 +117,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
                 ' the IMU turns about its axis; check the driver of the table, and exclude that'
                 ' time',
             )
+    # 3. An error of the table description without a frozen joint.
     return description_error(windows, table) if is_unexplained(windows, expected) else None
 
 

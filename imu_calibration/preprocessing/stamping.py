@@ -566,7 +566,7 @@ class SampleTimes:
         """Repeated messages."""
         # Newest line of each use of the stamps.
         self._line_of_use: dict[Stamping, StampLine] = {}
-        # The sample before the next ones, in an array of one.
+        # The newest sample, as samples of length one; None before the first.
         self._last: Any = None
         self._begin()
 
@@ -574,9 +574,9 @@ class SampleTimes:
         """Begin a stretch of the stream; the line and the counts remain."""
         # Whether the stamps of this stretch are not classified yet; its samples are buffered.
         self._learning = True
-        # Not None while times are computed.
+        # `CountedClock` that computes times; None while stamps are used unchanged.
         self._clock: Any = None
-        # Samples without a time.
+        # Samples whose times are not determined yet.
         self._buffered: Any = None
         # Newest stamps, the number of them since the last full block, and of blocks since a review
         # of counted stamps.

@@ -47,10 +47,11 @@ class StreamCheck:
 
     Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is
     kept), 'backward stamp' (a late sample), 'stray stamp' (one sample far from both neighbours), of
-    an IMU also 'zero' (`zero_filter`) and 'spike' (`spike_filter`). 'clock reset' counts the jumps,
-    each of which starts a new epoch; overflows of the counter from which stamps are made are
-    removed. Where the stamps of an IMU follow a clock only loosely (packets, times of arrival,
-    milliseconds, jitter), the times of its samples are computed first (see `sample_times`).
+    an IMU also 'zero' (`zero_filter`), 'spike' (`spike_filter`) and 'wrapped' (`wrap_filter`).
+    'clock reset' counts the jumps, each of which starts a new epoch; overflows of the counter from
+    which stamps are made are removed. Where the stamps of an IMU follow a clock only loosely
+    (packets, times of arrival, milliseconds, jitter), the times of its samples are computed first
+    (`stamping.SampleTimes`).
 
     Parameters
     ----------
