@@ -48,13 +48,18 @@ class BagWriter:
                 code='storage_unknown',
             )
         self.path = Path(path)
-        self.topics = {}
+        self.topics: dict[int, tuple[str, TypeDefinition, list]] = {}
+        """Topic id -> (name, definition, QoS profiles)."""
         self.counts = Counter()
+        """Topic id -> messages."""
         self.first_ns: int | None = None
+        """Smallest receive time; None without messages."""
         self.last_ns: int | None = None
+        """Largest receive time; None without messages."""
         self.kind = STORAGES[identifiers().index(storage)]
         self.file_name = f'{self.path.name}_0{self.kind.suffix}'
         self.partial = make_partial_folder(self.path)
+        """Temporary folder, which `close` renames."""
         self.storage = self.kind.writer(self.partial / self.file_name, ROS_DISTRO, **options)
 
     def add_topic(self, name: str, definition: TypeDefinition, qos: Sequence[Any] = ()) -> int:
@@ -103,8 +108,9 @@ class BagWriter:
         self.storage.abort()
         shutil.rmtree(self.partial, ignore_errors=True)
 
-    def _metadata(self):
-        times = {
+    def _metadata(self) -> dict[str, Any]:
+        """Return the content of metadata.yaml."""
+        extent = {
             'starting_time': {'nanoseconds_since_epoch': self.first_ns or 0},
             'duration': {'nanoseconds': (self.last_ns or 0) - (self.first_ns or 0)},
             'message_count': self.counts.total(),
@@ -126,12 +132,12 @@ class BagWriter:
         return {
             'version': METADATA_VERSION,
             'storage_identifier': self.kind.identifier,
-            **times,
+            **extent,
             'topics_with_message_count': topics,
             'compression_format': '',
             'compression_mode': '',
             'relative_file_paths': [self.file_name],
-            'files': [{'path': self.file_name, **times}],
+            'files': [{'path': self.file_name, **extent}],
             'custom_data': None,
             'ros_distro': ROS_DISTRO,
         }
@@ -140,6 +146,7 @@ class BagWriter:
         return self
 
     def __exit__(self, kind, error, _):
+        # A bag is finished only without an error; an error of its files has a remedy in its text.
         try:
             if kind is None:
                 return self.close()
@@ -178,22 +185,24 @@ def make_partial_folder(path: Path) -> Path:
     return partial
 
 
-def _remove_leftovers(path):
+def _remove_leftovers(path: Path) -> None:
     """
     Remove the temporary folders of processes that were killed while they wrote the same bag.
 
     Only real folders with the name that `make_partial_folder` gives and the files that `BagWriter`
-    writes; everything else is unchanged.
+    writes are removed.
     """
     pattern = re.compile(re.escape(f'.{path.name}.') + r'(\d{1,10})\.[0-9a-f]{16}\.partial')
-    for found in sorted(path.parent.iterdir()):
-        name = pattern.fullmatch(found.name)
-        if name is None or found.is_symlink() or not found.is_dir() or is_running(int(name[1])):
+    for folder in sorted(path.parent.iterdir()):
+        name = pattern.fullmatch(folder.name)
+        if name is None or folder.is_symlink() or not folder.is_dir():
             continue
-        content = [file.name for file in found.iterdir()]
+        if is_running(int(name[1])):  # the process that writes it
+            continue
+        content = [file.name for file in folder.iterdir()]
         if all(file == 'metadata.yaml' or file.startswith(f'{path.name}_0.') for file in content):
-            shutil.rmtree(found, ignore_errors=True)
-            print(f'removed {found}, which an ended run has not finished', file=sys.stderr)
+            shutil.rmtree(folder, ignore_errors=True)
+            print(f'removed {folder}, which an ended run has not finished', file=sys.stderr)
 
 
 def dump_yaml(value: Any) -> str:

@@ -55,13 +55,15 @@ def zstd() -> ModuleType:
 
 
 def _lz4() -> Any:
+    """Return the lz4 module; raises InputError without it."""
     try:
         return import_module('lz4.frame')
     except ModuleNotFoundError as error:
         raise _not_installed('lz4', 'lz4') from error
 
 
-def _not_installed(compression, package):
+def _not_installed(compression: str, package: str) -> InputError:
+    """Return the error for a compression whose Python package is missing."""
     return InputError(
         f'a recording compressed by {compression} needs the Python package {package} or a sourced'
         f" ROS 2 with rosbag2_py, both are absent; run 'pip install {package}'",
@@ -89,11 +91,11 @@ def decompress(compression: str, packed: bytes | memoryview, limit: int) -> byte
         For another compression; `decompression_errors` for damaged data.
 
     """
-    make = _decompressor(compression)
-    parts = []
+    make_decompressor = _decompressor(compression)
+    parts = []  # content of each frame
     n_bytes = 0
     for _ in range(MOST_FRAMES):
-        decompressor = make()
+        decompressor = make_decompressor()
         parts.append(decompressor.decompress(packed, limit - n_bytes))
         n_bytes += len(parts[-1])
         packed = decompressor.unused_data if decompressor.eof else b''
@@ -103,6 +105,7 @@ def decompress(compression: str, packed: bytes | memoryview, limit: int) -> byte
 
 
 def _decompressor(compression: str) -> Callable[[], Any]:
+    """Return the function that makes a decompressor of one frame; KeyError if unknown."""
     if compression == 'lz4':
         return _lz4().LZ4FrameDecompressor
     if compression == 'bz2':
@@ -175,16 +178,22 @@ def decompress_file(source: Path, target: Path) -> str | None:
         decompressor = module.ZstdDecompressor()
         n_frames = 0
         data = b''
-        started = True
+        in_frame = True  # whether a frame is incomplete; an empty file lacks its first one
         try:
-            while data or not decompressor.needs_input or (data := packed.read(PACKED_PIECE_BYTES)):
+            while True:
+                # The decompressor may hold output of earlier input.
+                if not data and decompressor.needs_input:
+                    data = packed.read(PACKED_PIECE_BYTES)
+                    if not data:
+                        break
                 plain.write(decompressor.decompress(data, PACKED_PIECE_BYTES))
-                data, started = b'', True
+                data = b''
+                in_frame = True
                 if decompressor.eof:  # a file may hold several frames
                     data = decompressor.unused_data
                     decompressor = module.ZstdDecompressor()
-                    n_frames = n_frames + 1
-                    started = bool(data)
+                    n_frames += 1
+                    in_frame = bool(data)
                 if plain.tell() > limit or n_frames > MOST_FRAMES:
                     raise ValueError(
                         f'it expands beyond the {limit} bytes or {MOST_FRAMES} frames that are'
@@ -192,7 +201,7 @@ def decompress_file(source: Path, target: Path) -> str | None:
                     )
         except module.ZstdError as error:
             return str(error)
-    return 'the stream is cut off' if started else None
+    return 'the stream is cut off' if in_frame else None
 
 
 def compressor(name: str) -> Callable | type:

@@ -2,22 +2,25 @@
 A copy of a recording with an additional corrected Imu topic; all other data are copied bit by bit.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.preprocessing.sensor_join import OtherSensor
-from msg_adapters.bag import open_recording
+from msg_adapters.bag import Recording, open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.csv_log import LogOptions
 from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
-from msg_adapters.layout import NS_PER_S, Packed, group_by_layout
+from msg_adapters.layout import NS_PER_S, MessageLayout, Packed, group_by_layout
+from msg_adapters.storage import RawMessages
 
 
 def copy_with_corrected(
@@ -99,12 +102,14 @@ def copy_with_corrected(
             correct, propagate, frame_id, mat_ts, late_ns, choice, keep=keep, other=other
         )
         with BagWriter(destination, bag.storage) as writer:
+            # Id in the new bag of each topic.
             ids = np.array(
                 [writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics]
             )
             corrected_id = writer.add_topic(corrected_topic, standard_definition(IMU_TYPE))
+            imu_number = topics.index(recording.imu_topic)
             for raw in bag.stretches(topics):
-                measured = np.flatnonzero(raw.topic == topics.index(recording.imu_topic))
+                measured = np.flatnonzero(raw.topic == imu_number)
                 _write(writer, ids[raw.topic], raw, measured, corrected_id, patch)
             if check is not None:
                 check()
@@ -112,8 +117,9 @@ def copy_with_corrected(
         return recording.lost | dict(patch.dropped)
 
 
-def _check(recording, corrected_topic):
-    bag, name = recording.source, recording.imu_topic
+def _check(recording: Recording, corrected_topic: str) -> None:
+    """Raise InputError for a recording that cannot be copied, or a topic that it has already."""
+    bag = recording.source
     if bag.ros1:
         raise InputError(
             f'{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with the'
@@ -134,162 +140,187 @@ def _check(recording, corrected_topic):
     if corrected_topic in recording.message_counts:
         raise InputError(
             f'the corrected topic must be new, {recording.path} has {corrected_topic} already in'
-            f' addition to {name}; choose another name',
+            f' addition to {recording.imu_topic}; choose another name',
             code='topic_taken',
         )
 
 
-def _write(writer, topic_ids, raw, measured, corrected_id, patch):
-    """Write one stretch, every corrected message after the measured one."""
+def _write(
+    writer: BagWriter,
+    topic_ids: np.ndarray,
+    raw: RawMessages,
+    measured: np.ndarray,
+    corrected_id: int,
+    patch: _Patch,
+) -> None:
+    """
+    Write one stretch, every corrected message after the measured one.
+
+    `topic_ids`: id of the topic of each message in the new bag, shape (n,); `measured`: index of
+    the messages to correct; `corrected_id`: topic of the corrected ones.
+    """
     received_ns = raw.received_ns()
-    done, corrected = (
-        patch(raw.packed.select(measured), received_ns[measured])
-        if len(measured)
-        else (measured, [])
-    )
-    measured = measured[done]
+    messages = raw.packed
+    if len(measured):
+        index, corrected = patch(raw.packed.select(measured), received_ns[measured])
+        measured = measured[index]
+        if len(index):
+            messages = Packed.chain([raw.packed, corrected])
+    # The corrected messages follow all others in `messages`; each has the place of its measured
+    # one, and the stable sort places it after that.
     order = np.argsort(np.concatenate([np.arange(len(raw.packed)), measured]), kind='stable')
     topic_ids = np.concatenate([topic_ids, np.full(len(measured), corrected_id)])
     received_ns = np.concatenate([received_ns, received_ns[measured]])
-    writer.write(
-        topic_ids[order], received_ns[order], Packed.chain([raw.packed, *corrected]).select(order)
-    )
+    writer.write(topic_ids[order], received_ns[order], messages.select(order))
 
 
+@dataclass(frozen=True, eq=False)
 class _Patch:
-    """Makes corrected messages from measured ones."""
+    """Makes corrected messages from measured ones; arguments as for `copy_with_corrected`."""
 
-    def __init__(
-        self, correct, propagate, frame_id, mat_ts, late_ns, choice, *, keep=None, other=None
-    ):
-        self.correct = correct
-        self.propagate = propagate
-        self.late_ns = late_ns
-        self.choice = choice
-        self.frame_id = frame_id
-        self.mat_st = None if mat_ts is None else np.asarray(mat_ts).T
-        self.dropped = Counter()
-        self.keep, self.other = keep, other
+    correct: Callable
+    propagate: Callable | None
+    frame_id: str | None
+    """New frame; None: unchanged."""
+    mat_ts: np.ndarray | None
+    late_ns: int
+    choice: FrameChoice
+    """Selects the messages by their frame."""
+    keep: Callable[[np.ndarray], np.ndarray] | None = None
+    other: OtherSensor | None = None
+    dropped: Counter = field(default_factory=Counter)
+    """Reason -> messages that could not be corrected."""
 
-    def __call__(self, packed, received_ns):
+    def __call__(self, packed: Packed, received_ns: np.ndarray) -> tuple[np.ndarray, Packed]:
         """
         Return (index of the messages that could be corrected, their corrected messages).
 
-        A zero stamp counts as the time of arrival.
+        A zero stamp counts as the time of arrival. `received_ns`: shape (n,).
         """
+        nothing = np.zeros(0, dtype=int), packed.select(np.zeros(0, dtype=int))
         # Messages of one layout are decoded together; messages of other IMUs are not changed.
         groups, n_broken = group_by_layout(packed, find_imu_layout)
         if n_broken:
             self.dropped['Imu message that cannot be decoded'] += n_broken
         groups = [group for group in groups if self.choice.wants(group[0].names[0], len(group[1]))]
         if not groups:
-            return np.zeros(0, dtype=int), []
-        done = np.sort(np.concatenate([index for _, index, _ in groups]))
+            return nothing
+        # Message of each sample, ascending.
+        message_of_sample = np.sort(np.concatenate([index for _, index, _ in groups]))
         samples = in_order([(index, decode_imu(layout, group)) for layout, index, group in groups])
-        stamp_ns = np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns)
+        stamp_ns = np.where(samples.stamp_ns == 0, received_ns[message_of_sample], samples.stamp_ns)
         samples = replace(samples, stamp_ns=stamp_ns)
 
         # Without excluded times.
         if self.keep is not None:
             kept = self.keep(stamp_ns)
             if not kept.any():
-                return np.zeros(0, dtype=int), []
-            groups = [
-                _selected(layout, index, group, kept[np.searchsorted(done, index)])
-                for layout, index, group in groups
-            ]
-            done = done[kept]
+                return nothing
+            kept_groups = []
+            for layout, index, group in groups:
+                kept_of_group = kept[np.searchsorted(message_of_sample, index)]
+                kept_messages = group.select(np.flatnonzero(kept_of_group))
+                kept_groups.append((layout, index[kept_of_group], kept_messages))
+            groups = kept_groups
+            message_of_sample = message_of_sample[kept]
             samples = samples.select(kept)
 
         # Correct all samples in order of time, then patch the bytes of each layout.
-        order = np.argsort(np.concatenate([index for _, index, _ in groups]))
         if self.other is not None:
             samples = self.other.added_to(samples)
         corrected = self.correct(samples)
         tables = []
         for layout, index, group in groups:
-            place = np.searchsorted(done, index)
-            fields = self._fields(
-                layout,
-                group,
-                (corrected.force[place], corrected.rate[place]),
-                corrected.marks[place],
-            )
+            sample = np.searchsorted(message_of_sample, index)
+            readings = {'force': corrected.force[sample], 'rate': corrected.rate[sample]}
+            fields = self._fields(layout, group, readings, corrected.marks[sample])
             table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
-            # Seconds (int32) and nanoseconds (uint32) of the stamp, without the delay.
             if self.late_ns:
-                for place, values, kind in zip(
-                    (4, 8),
-                    np.divmod(layout.stamp_ns(group) - self.late_ns, NS_PER_S),
-                    'iu',
-                    strict=True,
-                ):
-                    table[:, place : place + 4] = (
-                        values.astype(f'{layout.order}{kind}4').view(np.uint8).reshape(-1, 4)
-                    )
+                seconds, nanoseconds = np.divmod(layout.stamp_ns(group) - self.late_ns, NS_PER_S)
+                table[:, 4:8] = _bytes_of(seconds, layout.order + 'i4')
+                table[:, 8:12] = _bytes_of(nanoseconds, layout.order + 'u4')
             tables.append(Packed.of_rows(table))
-        return done, [Packed.chain(tables).select(order)]
+        # From the order of the groups to that of the messages.
+        order = np.argsort(np.concatenate([index for _, index, _ in groups]))
+        return message_of_sample, Packed.chain(tables).select(order)
 
-    def _fields(self, layout, packed, vectors, marks):
-        """Return the new fields of one group: field name -> values."""
-        measured = []
-        for quantity in ('force', 'rate'):
+    def _fields(
+        self,
+        layout: MessageLayout,
+        packed: Packed,
+        readings: dict[str, np.ndarray],
+        marks: np.ndarray,
+    ) -> dict[str, np.ndarray]:
+        """
+        Return the new fields of messages of one layout: field name -> values.
+
+        `readings`: 'force', 'rate' -> corrected values, (n, 3); `marks`: variances of force and
+        rate that replace their covariances where they are not zero, (n, 2).
+        """
+        measured_cov = {}
+        absent = {}
+        for quantity in readings:
             covariance = layout.column(packed, f'{quantity}_cov')
             if self.other is not None and quantity == self.other.quantity:
                 covariance = np.zeros_like(covariance)  # unknown: the messages lack this sensor
-            measured.append(covariance)
-        absent = [covariance[:, :1] == -1.0 for covariance in measured]
+            measured_cov[quantity] = covariance
+            absent[quantity] = covariance[:, :1] == -1.0
         fields = {}
-        for quantity, values, missing in zip(('force', 'rate'), vectors, absent, strict=True):
-            fields[f'{quantity}_s'] = np.where(
-                missing, layout.column(packed, f'{quantity}_s'), values
-            )
+        for quantity, values in readings.items():
+            measured = layout.column(packed, f'{quantity}_s')
+            fields[f'{quantity}_s'] = np.where(absent[quantity], measured, values)
         if self.propagate is not None:
-            covariances = _propagated(self.propagate, np.concatenate(measured, axis=1))
-            for k, (quantity, before, missing) in enumerate(
-                zip(('force', 'rate'), measured, absent, strict=True)
-            ):
+            pairs = np.concatenate(list(measured_cov.values()), axis=1)
+            propagated = np.split(_propagated(self.propagate, pairs), 2, axis=1)
+            for k, quantity in enumerate(readings):
                 mark = marks[:, k : k + 1]
-                after = np.where(
-                    mark > 0, mark * np.eye(3).ravel(), covariances[:, 9 * k : 9 * k + 9]
+                after = np.where(mark > 0, mark * np.eye(3).ravel(), propagated[k])
+                fields[f'{quantity}_cov'] = np.where(
+                    absent[quantity], measured_cov[quantity], after
                 )
-                fields[f'{quantity}_cov'] = np.where(missing, before, after)
-        if self.mat_st is not None:
+        if self.mat_ts is not None:
+            mat_ts = np.asarray(self.mat_ts)
             orientation_cov = layout.column(packed, 'orientation_cov')
-            fields['orientation'] = self._turned(
-                layout.column(packed, 'orientation'), orientation_cov[:, 0]
+            fields['orientation'] = _orientation_of_target(
+                layout.column(packed, 'orientation'), orientation_cov[:, 0], mat_ts.T
             )
-            turned = (self.mat_st.T @ orientation_cov.reshape(-1, 3, 3) @ self.mat_st).reshape(
-                -1, 9
-            )
+            turned = (mat_ts @ orientation_cov.reshape(-1, 3, 3) @ mat_ts.T).reshape(-1, 9)
             fields['orientation_cov'] = np.where(
                 orientation_cov[:, :1] == -1.0, orientation_cov, turned
             )
         return fields
 
-    def _turned(self, quaternion, first_cov):
-        """Return the orientation of the target frame: ``mat_wt = mat_ws @ mat_st``."""
-        from scipy.spatial.transform import Rotation  # here, because its import is slow
 
-        given = (first_cov != -1.0) & np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
-        turned = quaternion.copy()
-        if given.any():
-            turned[given] = (
-                Rotation.from_quat(quaternion[given]) * Rotation.from_matrix(self.mat_st)
-            ).as_quat()
-        return turned
+def _bytes_of(values: np.ndarray, dtype: str) -> np.ndarray:
+    """Return integers as bytes in a type of four bytes, uint8, shape (n, 4)."""
+    return values.astype(dtype).view(np.uint8).reshape(-1, 4)
 
 
-def _selected(layout, index, group, mask):
-    """Return the messages of a group of one layout that a mask selects."""
-    return layout, index[mask], group.select(np.flatnonzero(mask))
+def _orientation_of_target(
+    quaternion: np.ndarray, first_cov: np.ndarray, mat_st: np.ndarray
+) -> np.ndarray:
+    """
+    Return the orientation of the target frame, ``mat_wt = mat_ws @ mat_st``, shape (n, 4).
+
+    `quaternion`: x, y, z, w of mat_ws; unchanged where it is invalid or declared absent, by the
+    first element of its covariance `first_cov`, shape (n,).
+    """
+    from scipy.spatial.transform import Rotation  # here, because its import is slow
+
+    is_valid = np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
+    given = (first_cov != -1.0) & is_valid
+    turned = quaternion.copy()
+    if given.any():
+        target = Rotation.from_quat(quaternion[given]) * Rotation.from_matrix(mat_st)
+        turned[given] = target.as_quat()
+    return turned
 
 
-def _propagated(propagate, pairs):
+def _propagated(propagate: Callable, pairs: np.ndarray) -> np.ndarray:
     """
     Return the corrected covariances of measured ones, both (n, 18).
 
-    Nine numbers of force, nine of rate.
+    Columns: nine numbers of force, nine of rate. `propagate`: as for `copy_with_corrected`.
     """
     # Most drivers publish constants: each distinct pair once.
     if (pairs == pairs[0]).all():

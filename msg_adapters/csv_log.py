@@ -1,5 +1,7 @@
 """Logs as text with columns, read as a bag."""
 
+from __future__ import annotations
+
 import codecs
 import csv
 import io
@@ -7,7 +9,7 @@ import re
 import shutil
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -294,53 +296,57 @@ def read_csv(
     """
     path = Path(path)
     table = _Table(path)
+
+    # A log with a row per sensor: both sensors are read apart, or one of them is the log.
     rows = _rows_of_sensors(table, where)
     if len({each.sensor for each in rows}) == 2:
         return _read_sensor_rows(path, rows, columns, where, raw=raw)
     if rows:
-        # One of the sensors alone.
         table = _Table(path, rows[0].sensor)
         where = (*where, rows[0].condition)
-    found = [table.stated(_parse(text)) for text in columns]
-    given = {(each.quantity, each.joint) for each in found}
-    stated = {each.quantity for each in found}
-    guessed = _guess(table, stated)
-    found += [each for each in guessed if (each.quantity, each.joint) not in given]
-    found = [_as_raw(each) if each.quantity in raw else each for each in found]
-    by_quantity = {each.quantity: each for each in found}
-    lacking = _lacking(table, by_quantity, stated=bool(columns))
-    if lacking:
+
+    # Columns of the user, then those of the header for the other quantities and joints.
+    chosen = [table.stated(_parse(text)) for text in columns]
+    stated = {(each.quantity, each.joint) for each in chosen}
+    for guess in _guess(table, {quantity for quantity, _ in stated}):
+        if (guess.quantity, guess.joint) not in stated:
+            chosen.append(guess)
+    chosen = [_as_raw(each) if each.quantity in raw else each for each in chosen]
+    by_quantity = {each.quantity: each for each in chosen}
+    missing = _missing_quantity(table, by_quantity, stated=bool(columns))
+    if missing:
         raise InputError(
             f'{path} must have a column of'
-            f' {lacking}{"" if lacking == "time" else " per axis"}, got the columns'
+            f' {missing}{"" if missing == "time" else " per axis"}, got the columns'
             f' {shortened(", ".join(table.names), 300)}{_unnamed_axes(table)}; {REMEDY}',
             key='columns',
         )
-    table.load([name for each in found for name in each.names], where)
+
+    # Values and units, in the order in which a unit may depend on another one.
+    table.load([name for each in chosen for name in each.names], where)
     time, counted = _times(table, by_quantity['time'])
     stamp_ns = counted.stamp_ns
     readings = _sensors(table, by_quantity, stamp_ns, time)
     used = [time, *readings.columns]
     temperature = None
     joints = []
-    for each in found:
+    angles = {}
+    for each in chosen:
         if each.quantity == 'temperature':
             used.append(_with_unit(each, lambda: 'C', path))
             temperature = TemperatureSamples(stamp_ns, table.values(each.names)[:, 0])
         elif each.quantity == 'joint':
-            joints.append(_with_unit(each, lambda: None, path))
+            joint = _with_unit(each, lambda: None, path)
+            joints.append(joint)
+            unit_rad = COLUMN_UNITS['joint'][joint.unit]
+            angles[joint.joint] = table.values(joint.names)[:, 0] * unit_rad
     used += joints
-    taken = {name.removeprefix('-') for each in used for name in each.names}
-    angles = {
-        each.joint: table.values(each.names)[:, 0] * COLUMN_UNITS['joint'][each.unit]
-        for each in joints
-    }
     return CsvLog(
         tuple(used),
         readings.imu,
         JointSamples.of_angles(stamp_ns, angles) if angles else None,
         temperature,
-        tuple(name for name in table.names if name and name not in taken),
+        tuple(_unused_names(table, used)),
         table.n_dropped,
         counted.n_overflows,
         counted.size_ns,
@@ -349,7 +355,13 @@ def read_csv(
     )
 
 
-def _as_raw(columns):
+def _unused_names(table: _Table, used: Iterable[Columns]) -> list[str]:
+    """Return the names of the columns of a table that are not `used`."""
+    used_names = {name.removeprefix('-') for each in used for name in each.names}
+    return [name for name in table.names if name and name not in used_names]
+
+
+def _as_raw(columns: Columns) -> Columns:
     """Return Columns that are read without conversion, by the unit of an option."""
     if columns.unit is not None and columns.origin == 'given':
         raise InputError(
@@ -361,18 +373,27 @@ def _as_raw(columns):
     return replace(columns, unit=RAW_UNIT, origin='given')
 
 
-def _text_of(table, used, stamp_ns, joined):
-    """Return the `LogText` of a table; each sample is one of its rows."""
+def _text_of(
+    table: _Table,
+    used: Sequence[Columns],
+    stamp_ns: np.ndarray,
+    joined: JoinedSensors | None,
+) -> LogText:
+    """
+    Return the `LogText` of a table; each sample is one of its rows.
+
+    `used`: Columns that were read; `stamp_ns`: of each row; `joined`: how the samples were made
+    from rows of one sensor each, None where each row gave a sample.
+    """
     used = tuple(each for each in used if each.quantity != 'joint')
     places = {each.quantity: tuple(map(table.column, each.names)) for each in used}
     rows = np.arange(len(stamp_ns))
     if joined is not None:
         # Samples have the stamps of the slower sensor: find its first row with each stamp.
-        quantity = next(key for key, sensor in SENSOR_OF.items() if sensor == joined.slower)
-        names = next(each.names for each in used if each.quantity == quantity)
-        known = np.flatnonzero(np.isfinite(table.values(names)).all(axis=1))
-        stamps, first = np.unique(stamp_ns[known], return_index=True)
-        rows = known[first[np.searchsorted(stamps, joined.imu.stamp_ns)]]
+        names = next(each.names for each in used if SENSOR_OF.get(each.quantity) == joined.slower)
+        rows_of_sensor = np.flatnonzero(np.isfinite(table.values(names)).all(axis=1))
+        stamps, first = np.unique(stamp_ns[rows_of_sensor], return_index=True)
+        rows = rows_of_sensor[first[np.searchsorted(stamps, joined.imu.stamp_ns)]]
     return LogText(
         table.path,
         tuple(table.names),
@@ -385,9 +406,9 @@ def _text_of(table, used, stamp_ns, joined):
     )
 
 
-def _lacking(table, by_quantity, *, stated):
+def _missing_quantity(table: _Table, by_quantity: dict[str, Columns], *, stated: bool) -> str:
     """
-    Return the quantity that a log needs and lacks, or ''.
+    Return the quantity that a log needs and lacks ('time', 'force' or 'rate'), or ''.
 
     One sensor is enough; three further columns without a known name may be those of the other one,
     unless the columns are `stated`.
@@ -397,27 +418,29 @@ def _lacking(table, by_quantity, *, stated):
     missing = [quantity for quantity in SENSOR_OF if quantity not in by_quantity]
     if not missing:
         return ''
-    taken = {name.removeprefix('-') for each in by_quantity.values() for name in each.names}
-    unknown = [name for name in table.names if name and name not in taken]
-    if len(missing) == 2 or (len(unknown) >= 3 and not stated):
+    if len(missing) == 2:
         return missing[0]
-    return ''
+    may_have_both = len(_unused_names(table, by_quantity.values())) >= 3 and not stated
+    return missing[0] if may_have_both else ''
 
 
-def _unnamed_axes(table):
-    """Return that columns x, y, z belong to no sensor, or ''."""
-    readings = {name: _reading_of(_words(name)[0]) for name in table.names}
-    bare = [name for name, reading in readings.items() if reading and not reading.sensor]
-    if len(bare) < 3:
+def _unnamed_axes(table: _Table) -> str:
+    """Return the part of an error that columns x, y, z belong to no sensor; '' without any."""
+    unnamed = []
+    for name in table.names:
+        reading = _reading_of(_words(name)[0])
+        if reading and not reading.sensor:
+            unnamed.append(name)
+    if len(unnamed) < 3:
         return ''
     return (
-        f', of which {", ".join(bare)} name no sensor; write its name (accelerometer, gyroscope) in'
-        ' a column of each row or in the name of the file'
+        f', of which {", ".join(unnamed)} name no sensor; write its name (accelerometer, gyroscope)'
+        ' in a column of each row or in the name of the file'
     )
 
 
-def _times(table, columns):
-    """Return (Columns with the unit, `CounterStamps` without overflows)."""
+def _times(table: _Table, columns: Columns) -> tuple[Columns, CounterStamps]:
+    """Return the Columns of time with the unit, and the stamps of the rows without overflows."""
     values = table.raw(columns.names[0])
     if len(columns.names) == 2:
         values = table.stamps(columns).view('datetime64[ns]')
@@ -444,13 +467,15 @@ class _Readings:
     """Where the sensors have rows of their own."""
 
 
-def _sensors(table, by_quantity, stamp_ns, time):
-    """Return the `_Readings` of a table."""
-    nothing = np.full((len(stamp_ns), 3), np.nan)
+def _sensors(
+    table: _Table, by_quantity: dict[str, Columns], stamp_ns: np.ndarray, time: Columns
+) -> _Readings:
+    """Return the `_Readings` of a table with stamps of its rows; `time`: their Columns."""
+    absent = np.full((len(stamp_ns), 3), np.nan)
     if 'force' not in by_quantity:
         rate = _with_unit(by_quantity['rate'], lambda: None, table.path)
         rate_s = table.values(rate.names) * _size_of(rate)
-        return _Readings((rate,), ImuSamples(stamp_ns, nothing, rate_s, 'imu_link'))
+        return _Readings((rate,), ImuSamples(stamp_ns, absent, rate_s, 'imu_link'))
     raw_force = table.values(by_quantity['force'].names)
     force = _with_unit(
         by_quantity['force'],
@@ -459,7 +484,7 @@ def _sensors(table, by_quantity, stamp_ns, time):
     )
     force_s = raw_force * _size_of(force)
     if 'rate' not in by_quantity:
-        return _Readings((force,), ImuSamples(stamp_ns, force_s, nothing, 'imu_link'))
+        return _Readings((force,), ImuSamples(stamp_ns, force_s, absent, 'imu_link'))
     raw_rate = table.values(by_quantity['rate'].names)
 
     # Rows of both sensors give samples as they are.
@@ -475,17 +500,36 @@ def _sensors(table, by_quantity, stamp_ns, time):
     return _joined(force, by_quantity['rate'], accelerometer, gyroscope, path=table.path)
 
 
-def _joined(force, rate, accelerometer, gyroscope, *, path):
-    """Return the `_Readings` of sensors with stamps of their own; the rates as in the log."""
+def _joined(
+    force: Columns,
+    rate: Columns,
+    accelerometer: SensorStream,
+    gyroscope: SensorStream,
+    *,
+    path: Path,
+) -> _Readings:
+    """
+    Return the `_Readings` of sensors with separate stamps.
+
+    `accelerometer` in SI, `gyroscope` as in the log.
+    """
     joined = join_sensors(accelerometer, gyroscope, 'imu_link')
     return _with_rate_unit(force, rate, joined.imu, path=path, joined=joined)
 
 
-def _with_rate_unit(force, rate, imu, *, path, time=None, joined=None):
+def _with_rate_unit(
+    force: Columns,
+    rate: Columns,
+    imu: ImuSamples,
+    *,
+    path: Path,
+    time: Columns | None = None,
+    joined: JoinedSensors | None = None,
+) -> _Readings:
     """
-    Return the `_Readings` of samples with the rates as in the log.
+    Return the `_Readings` of samples, after the unit of the rates is found.
 
-    `time`: its Columns, where both sensors have one.
+    `imu`: force in SI, rates as in the log; `time`: its Columns, where both sensors have one.
     """
     _require_one_imu(imu)
     rate = _with_unit(rate, lambda: _rate_unit(imu.stamp_ns, imu.force_s, imu.rate_s), path)
@@ -527,7 +571,7 @@ def read_logs(
     in_folder = len(files) == 1
     if in_folder:
         files = sorted(path for path in files[0].iterdir() if is_text_log(path))
-    found: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
+    logs_of: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
     for path in files:
         try:
             log = _sensor_log(_Table(path), where)
@@ -536,10 +580,10 @@ def read_logs(
                 raise
             continue  # a folder has logs of other sensors too
         if log is not None:
-            found[log.columns.quantity].append(log)
+            logs_of[log.columns.quantity].append(log)
     if in_folder:
-        found['force'] = _with_gravity_only(found['force'])
-    for quantity, logs in found.items():
+        logs_of['force'] = _with_gravity_only(logs_of['force'])
+    for quantity, logs in logs_of.items():
         if len(logs) != 1:
             names = ', '.join(log.table.path.name for log in logs)
             if not logs:
@@ -549,18 +593,18 @@ def read_logs(
                 ' and gyroscope, or one that has both',
                 code='several_logs',
             )
-    return _log_of_two(found['force'][0], found['rate'][0])
+    return _log_of_two(logs_of['force'][0], logs_of['rate'][0])
 
 
-def _with_gravity_only(logs):
+def _with_gravity_only(logs: list[_SensorLog]) -> list[_SensorLog]:
     """Return the logs of force without the linear accelerations that phones add to them."""
     if len(logs) < 2:
         return logs
     return [log for log in logs if log.has_gravity]
 
 
-def _log_of_two(force, rate):
-    """Return the CsvLog of a `_SensorLog` of each sensor."""
+def _log_of_two(force: _SensorLog, rate: _SensorLog) -> CsvLog:
+    """Return the CsvLog of a log of each sensor."""
     readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.table.path)
     of_force, of_rate = readings.columns
     return CsvLog(
@@ -589,35 +633,43 @@ class _SensorRows:
     """COLUMN=VALUE of these rows."""
 
 
-def _rows_of_sensors(table, where):
+def _rows_of_sensors(table: _Table, where: Sequence[str]) -> list[_SensorRows]:
     """
     Return the `_SensorRows` of a log with a row per sensor; [] for another log.
 
-    Of several rows of one sensor those without "uncalibrated" in their name remain.
+    The first column with names of sensors counts. Rows with "uncalibrated" in their name are left
+    out where the sensor has other rows.
     """
     for name in table.word_columns:
-        names = table.values_of(name, where)
-        rows = [
-            _SensorRows(sensor, value, f'{name}={value}')
-            for value in names
-            if (sensor := sensor_of_label(value))
-        ]
-        # A name of all rows is needed where no column has the name of a sensor.
-        if not rows or (
-            len(names) == 1 and any(each.quantity in SENSOR_OF for each in _guess(table))
-        ):
+        cells = table.values_of(name, where)
+        rows = []
+        for cell in cells:
+            sensor = sensor_of_label(cell)
+            if sensor:
+                rows.append(_SensorRows(sensor, cell, f'{name}={cell}'))
+        if not rows:
             continue
-        plain = [each for each in rows if 'uncal' not in each.name.lower()]
-        named = {each.sensor for each in plain}
-        return plain + [each for each in rows if each.sensor not in named]
+        # One name in all rows is only needed where no name of a column has the sensor.
+        if len(cells) == 1 and any(each.quantity in SENSOR_OF for each in _guess(table)):
+            continue
+        calibrated = [each for each in rows if 'uncal' not in each.name.lower()]
+        sensors = {each.sensor for each in calibrated}
+        return calibrated + [each for each in rows if each.sensor not in sensors]
     return []
 
 
-def _read_sensor_rows(path, rows, columns, where, *, raw):
+def _read_sensor_rows(
+    path: Path,
+    rows: list[_SensorRows],
+    columns: Sequence[str],
+    where: Sequence[str],
+    *,
+    raw: Sequence[str],
+) -> CsvLog:
     """
-    Return the CsvLog of a log with a row per sensor.
+    Return the CsvLog of a log with a row per sensor; `rows`: of both sensors.
 
-    Arguments as for `read_csv`; `rows`: `_SensorRows` of both sensors.
+    The other arguments are those of `read_csv`.
     """
     stated = [_parse(text) for text in columns]
     other = [each for each in stated if each.quantity not in ('time', *SENSOR_OF)]
@@ -628,17 +680,18 @@ def _read_sensor_rows(path, rows, columns, where, *, raw):
             key='columns',
             code='sensor_rows',
         )
-    found: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
+    logs_of: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
+    n_rows_of = Counter(each.sensor for each in rows)
     for each in rows:
         quantity = 'force' if each.sensor == 'acc' else 'rate'
-        own = [columns for columns in stated if columns.quantity in ('time', quantity)]
+        stated_for_rows = [given for given in stated if given.quantity in ('time', quantity)]
         table = _Table(path, each.sensor)
         try:
-            log = _sensor_log(table, (*where, each.condition), own, raw)
+            log = _sensor_log(table, (*where, each.condition), stated_for_rows, raw)
         except InputError:
-            if sum(other.sensor == each.sensor for other in rows) == 1:
+            if n_rows_of[each.sensor] == 1:
                 raise
-            continue  # such as linear accelerations, whose unit is unknown
+            continue  # such as linear accelerations of unknown unit
         if log is None:
             raise InputError(
                 f'{path} must have a column of {quantity} per axis and one of time in the rows'
@@ -646,9 +699,9 @@ def _read_sensor_rows(path, rows, columns, where, *, raw):
                 key='columns',
                 code='sensor_rows',
             )
-        found[quantity].append(replace(log, condition=each.condition))
-    found['force'] = _with_gravity_only(found['force'])
-    for quantity, logs in found.items():
+        logs_of[quantity].append(replace(log, condition=each.condition))
+    logs_of['force'] = _with_gravity_only(logs_of['force'])
+    for quantity, logs in logs_of.items():
         if len(logs) != 1:
             conditions = ', '.join(log.condition for log in logs) or 'none with gravity'
             raise InputError(
@@ -657,13 +710,17 @@ def _read_sensor_rows(path, rows, columns, where, *, raw):
                 key='where',
                 code='sensor_rows',
             )
-    force = found['force'][0]
-    rate = found['rate'][0]
+    force = logs_of['force'][0]
+    rate = logs_of['rate'][0]
     return replace(_log_of_two(force, rate), row_names=(force.condition, rate.condition))
 
 
-def _text_of_two(force, rate, joined):
-    """Return the `LogText` of two logs: the rows of the slower one, with columns of the other."""
+def _text_of_two(force: _SensorLog, rate: _SensorLog, joined: JoinedSensors) -> LogText:
+    """
+    Return the `LogText` of two logs: the rows of the slower one.
+
+    Three columns for the readings of the other sensor follow, which have no cells in the rows.
+    """
     slow, other = force, rate
     if joined.slower == 'gyroscope':
         slow, other = rate, force
@@ -682,13 +739,14 @@ def _text_of_two(force, rate, joined):
 class _SensorLog:
     """A log of one sensor."""
 
-    table: '_Table'
+    table: _Table
     time: Columns
     columns: Columns
     """Of force, with its unit, or of rate."""
     stream: SensorStream
     """Force in SI; rates as in the log."""
     counted: CounterStamps
+    """Stamps of the rows, and the overflows that they are free of."""
     condition: str = ''
     """COLUMN=NAME of its rows, where a column names the sensor."""
 
@@ -699,31 +757,35 @@ class _SensorLog:
         return unit == SI_UNITS['accelerometer'] or (self.columns.unit == RAW_UNIT and bool(unit))
 
 
-def _one_sensor(columns):
+def _one_sensor(columns: Iterable[Columns]) -> str | None:
     """Return 'force' or 'rate' for the columns of a log of one sensor; None for another log."""
     quantities = {each.quantity for each in columns}
     sensors = [quantity for quantity in SENSOR_OF if quantity in quantities]
     return sensors[0] if 'time' in quantities and len(sensors) == 1 else None
 
 
-def _sensor_log(table, where, stated=(), raw=()):
+def _sensor_log(
+    table: _Table,
+    where: Sequence[str],
+    stated: Sequence[Columns] = (),
+    raw: Sequence[str] = (),
+) -> _SensorLog | None:
     """
-    Return the `_SensorLog` of a table; None where it has neither sensor.
+    Return the `_SensorLog` of a table; None where it has neither sensor, or both.
 
-    `stated`: Columns of the user; `raw` as for `read_csv`.
+    `stated`: Columns of the user; `where` and `raw` as for `read_csv`.
     """
-    known = [table.stated(each) for each in stated]
-    quantities = {each.quantity for each in known}
-    guess = known + [each for each in _guess(table, quantities) if each.quantity not in quantities]
-    found = {each.quantity: each for each in guess}
-    sensor = _one_sensor(guess)
-    if sensor is None:
+    by_quantity = {each.quantity: table.stated(each) for each in stated}
+    for guess in _guess(table, set(by_quantity)):
+        by_quantity.setdefault(guess.quantity, guess)
+    quantity = _one_sensor(by_quantity.values())
+    if quantity is None:
         return None
-    columns = found[sensor]
-    if sensor in raw:
+    columns = by_quantity[quantity]
+    if quantity in raw:
         columns = _as_raw(columns)
-    table.load([*found['time'].names, *columns.names], where)
-    time, counted = _times(table, found['time'])
+    table.load([*by_quantity['time'].names, *columns.names], where)
+    time, counted = _times(table, by_quantity['time'])
     # Both sensors count from one origin, but need not begin together.
     start_ns = table.start_ns(time)
     counted = replace(counted, stamp_ns=counted.stamp_ns + start_ns)
@@ -780,12 +842,12 @@ def corrected_log(path: str | PathLike[str]) -> Path | None:
     return None
 
 
-def _states_corrected(table):
+def _states_corrected(table: _Table) -> bool:
     """Return whether a header states corrected readings."""
     return any(_words(name)[1].endswith(CORRECTED) for name in table.names)
 
 
-def _require_one_imu(imu):
+def _require_one_imu(imu: ImuSamples) -> None:
     """Raise where the rows are those of two IMUs; units of force and rate do not matter."""
     sources = TwoSourceSearch()
     good = np.isfinite(imu.force_s).all(axis=1) & np.isfinite(imu.rate_s).all(axis=1)
@@ -793,11 +855,15 @@ def _require_one_imu(imu):
     sources.require_one(key='where')
 
 
-def _with_unit(columns, guess, path):
-    """Return Columns with a unit, by `guess` where neither the user nor the header states one."""
+def _with_unit(columns: Columns, find_unit: Callable[[], str | None], path: Path) -> Columns:
+    """
+    Return Columns with a unit, that of `find_unit` where neither user nor header states one.
+
+    Raises InputError where that is None.
+    """
     if columns.unit is not None:
         return columns
-    unit = guess()
+    unit = find_unit()
     if unit is None:
         raise InputError(
             f'the unit of {columns.quantity} in {path} must be stated by the header or follow from'
@@ -811,28 +877,26 @@ N_NAMES = {'force': (3,), 'rate': (3,), 'time': (1, 2)}
 """Quantity -> numbers of its columns; one for the other quantities."""
 
 
-def _parse(text):
-    """Return the Columns of one assignment of `columns`."""
-    label, _, rest = text.partition('=')
+def _parse(text: str) -> Columns:
+    """Return the Columns of one assignment QUANTITY=NAMES:UNIT; raises InputError."""
+    label, _, names_and_unit = text.partition('=')
     quantity, _, joint = label.partition('.')
-    # units with a colon of their own
-    scaled = re.fullmatch(r'(.*?):((counts|increments):.*)', rest)
+    # Units that contain a colon: counts:... and increments:...
+    scaled = re.fullmatch(r'(.*?):((counts|increments):.*)', names_and_unit)
     if scaled:
-        names = scaled[1]
-        colon = ':'
+        name_text = scaled[1]
         unit = scaled[2]
+    elif ':' in names_and_unit:
+        name_text, _, unit = names_and_unit.rpartition(':')
     else:
-        names, colon, unit = rest.rpartition(':')
-    if not colon:
-        names, unit = rest, ''
+        name_text = names_and_unit
+        unit = ''
     units = COLUMN_UNITS.get(quantity, {})
     unit = SPELLINGS.get(quantity, {}).get(unit.lower(), unit) if unit else None
-    names = tuple(name.strip() for name in names.split(',') if name.strip())
-    if (
-        not units
-        or (quantity == 'joint') != bool(joint)
-        or len(names) not in N_NAMES.get(quantity, (1,))
-    ):
+    names = tuple(name.strip() for name in name_text.split(',') if name.strip())
+    has_joint_as_needed = (quantity == 'joint') == bool(joint)
+    has_all_names = len(names) in N_NAMES.get(quantity, (1,))
+    if not units or not has_joint_as_needed or not has_all_names:
         raise InputError(
             'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and'
             f' rate, two for a time in seconds and nanoseconds, got {text!r}; {REMEDY}',
@@ -852,21 +916,25 @@ def _parse(text):
     return Columns(quantity, names, unit, joint, 'given')
 
 
-def _tick_size(unit):
+def _tick_size(unit: str) -> float:
     """Return the size of a unit of time that is a tick, s; 0.0 for another text."""
     tick = TICK.fullmatch(unit)
-    if tick is None or not float(tick[1]) or not int(tick[2] or 1):
+    if tick is None:
         return 0.0
-    return float(tick[1]) / int(tick[2] or 1) * COLUMN_UNITS['time'][tick[3]]
+    number = float(tick[1])
+    divisor = int(tick[2] or 1)
+    if not number or not divisor:
+        return 0.0
+    return number / divisor * COLUMN_UNITS['time'][tick[3]]
 
 
-def _time_size(unit):
+def _time_size(unit: str) -> float:
     """Return the size of a unit of time, s."""
     return COLUMN_UNITS['time'].get(unit) or _tick_size(unit)
 
 
-def _size_of(columns):
-    """Return the size in SI of the unit of force or rate."""
+def _size_of(columns: Columns) -> float | np.ndarray:
+    """Return the size in SI of the unit of force or rate, for each axis if it differs."""
     if columns.unit == RAW_UNIT:
         return 1.0
     return 1.0 / np.asarray(unit_of(SENSOR_OF[columns.quantity], columns.unit).scale)
@@ -878,12 +946,12 @@ COMPRESSORS = {b'\x1f\x8b': 'gzip', b'PK': 'zip', b'\x28\xb5': 'zstd', b'BZ': 'b
 """First two bytes -> program that has compressed a file."""
 
 
-def _without_comment(line):
+def _without_comment(line: str) -> str:
     """Return a line without its comment; most lines have none."""
     return COMMENT.sub('', line) if '#' in line else line
 
 
-def _is_utf_8(head):
+def _is_utf_8(head: bytes) -> bool:
     """Return whether the first bytes of a file are text in UTF-8, of which the last may be cut."""
     try:
         codecs.getincrementaldecoder('utf-8')().decode(head)
@@ -892,7 +960,8 @@ def _is_utf_8(head):
     return True
 
 
-def _opened(path):
+def _opened(path: Path) -> io.TextIOWrapper:
+    """Open a file as text in the encoding that its first bytes show."""
     file = open_regular(path)
     head = file.read(HEAD_BYTES)
     encoding = 'utf-8-sig'
@@ -904,7 +973,8 @@ def _opened(path):
     return io.TextIOWrapper(file, encoding=encoding, errors='replace')
 
 
-def _refuse_compressed(path):
+def _refuse_compressed(path: Path) -> None:
+    """Raise InputError for a file that a program of COMPRESSORS has made."""
     with open_regular(path) as file:
         program = COMPRESSORS.get(file.read(2))
         binary = b'\0' in file.read(HEAD_BYTES)
@@ -938,7 +1008,7 @@ class _Table:
     `sensor` ('acc' or 'gyro') has the rows that are read, whatever the names of their columns.
     """
 
-    def __init__(self, path, sensor=''):
+    def __init__(self, path: Path, sensor: str = ''):
         self.sensor = sensor
         if not path.is_file():
             raise InputError(f'a text log must be a regular file, got {path}; check the path')
@@ -953,7 +1023,10 @@ class _Table:
                 ' check the path'
             )
         self.delimiter = _delimiter(lines)
-        rows = [self._cells(line) for line in lines[: None if len(head) < HEAD_BYTES else -1]]
+        """None for white space."""
+        # The last line of a longer file is cut.
+        complete_lines = lines if len(head) < HEAD_BYTES else lines[:-1]
+        rows = [self._cells(line) for line in complete_lines]
         first = _first_row(rows)
         if first is None:
             raise InputError(
@@ -961,62 +1034,77 @@ class _Table:
                 ' got none; check the file'
             )
         self.first = first
+        """Lines in front of the first row of numbers."""
         self.first_row = rows[first]
+        """Its cells."""
         self.decimal_comma = any(
-            re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', cell)
-            and (self.delimiter != ',' or not GROUPED_NUMBER.fullmatch(cell))
-            for row in rows[first:]
-            for cell in row
+            _has_decimal_comma(cell, self.delimiter) for row in rows[first:] for cell in row
         )
-        width = len(rows[first])
+        self.names = _unique(self._header_names(rows[:first]))
+        """Names of the columns, all different."""
+        self.dates = set()
+        """Indexes of the columns of dates."""
+        self.clocks = set()
+        """Indexes of the columns of times of day."""
+        for k, cell in enumerate(self.first_row):
+            if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell):
+                self.dates.add(k)
+            if TIME_OF_DAY.fullmatch(cell):
+                self.clocks.add(k)
+        self.word_columns = []
+        """Names of the columns with a word in each row."""
+        for k, name in enumerate(self.names):
+            if all(len(row) > k and _is_word(row[k]) for row in rows[first:]):
+                self.word_columns.append(name)
+        self.n_dropped = 0
+        """Rows that `load` left out: too short, or repeated lines of the header."""
+        self.lines: list[str] = []
+        """Rows that `load` has read."""
+        self._values: dict[int, np.ndarray] = {}
+        """Index of a column -> values that `load` has read, shape (n,)."""
+        self._header_lines = {line.strip() for line in lines[:first]}
+        """Lines that some programs repeat between the rows."""
+
+    def _header_names(self, rows: list[list[str]]) -> list[str]:
+        """
+        Return the names of the columns, with units in brackets, from the rows before the numbers.
+
+        Of the last two rows of full width the second one has units. Without a header the names are
+        numbers.
+        """
+        width = len(self.first_row)
         if not self.first_row[-1].strip():  # rows end with a separator, the header does not
-            for row in rows[:first]:
+            for row in rows:
                 if len(row) == width - 1:
                     row.append('')
-        header = [row for row in rows[:first] if len(row) == width][-2:]
-        self.names = [
-            re.sub(r'\s+', ' ', ''.join(c if c.isprintable() else ' ' for c in name)).strip()
-            for name in (header[0] if header else [str(k + 1) for k in range(width)])
-        ]
-        if len(header) == 2:  # a second row with units
+        header = [row for row in rows if len(row) == width][-2:]
+        if not header:
+            return [str(k + 1) for k in range(width)]
+        names = []
+        for name in header[0]:
+            printable_name = ''.join(c if c.isprintable() else ' ' for c in name)
+            names.append(re.sub(r'\s+', ' ', printable_name).strip())
+        if len(header) == 2:
             units = [_without_brackets(unit) for unit in header[1]]
-            self.names = [
+            names = [
                 f'{name} ({unit})' if unit else name
-                for name, unit in zip(self.names, units, strict=True)
+                for name, unit in zip(names, units, strict=True)
             ]
-        longest = max(map(len, self.names))
+        longest = max(map(len, names))
         if longest > LONGEST_COLUMN_NAME:
             raise InputError(
-                f'a column name of {path} must have at most {LONGEST_COLUMN_NAME} characters, got'
-                f' {longest}; shorten the header',
+                f'a column name of {self.path} must have at most {LONGEST_COLUMN_NAME} characters,'
+                f' got {longest}; shorten the header',
                 code='csv_header',
             )
-        counts = Counter(self.names)
-        self.names = [
-            name if counts[name] == 1 else f'{name} [{k + 1}]' for k, name in enumerate(self.names)
-        ]
-        self.dates = {
-            k
-            for k, cell in enumerate(rows[first])
-            if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell)
-        }
-        self.word_columns = [
-            name
-            for k, name in enumerate(self.names)
-            if all(len(row) > k and _is_word(row[k]) for row in rows[first:])
-        ]
-        self.clocks = {k for k, cell in enumerate(rows[first]) if TIME_OF_DAY.fullmatch(cell)}
-        self.n_dropped = 0
-        self.lines = []
-        self._values = {}
-        # Lines that some programs repeat between the rows.
-        self._header_lines = {line.strip() for line in lines[:first]}
+        return names
 
-    def _cells(self, line):
+    def _cells(self, line: str) -> list[str]:
+        """Return the cells of a line."""
         return split_cells(line, self.delimiter, self.path)
 
-    def column(self, name):
-        """Return the index of a column by name or number."""
+    def column(self, name: str) -> int:
+        """Return the index of a column by name, also with a minus in front, or by number."""
         name = name if name in self.names else name.removeprefix('-')
         if name in self.names:
             return self.names.index(name)
@@ -1027,7 +1115,7 @@ class _Table:
             f' {shortened(", ".join(self.names), 300)}'
         )
 
-    def stated(self, columns):
+    def stated(self, columns: Columns) -> Columns:
         """
         Return Columns that the user states with the names of this table in place of numbers.
 
@@ -1042,7 +1130,7 @@ class _Table:
             names = clocks[-1:] or names
         return replace(columns, names=tuple(names))
 
-    def load(self, names, where=()):
+    def load(self, names: Iterable[str], where: Sequence[str] = ()) -> None:
         """
         Read the columns; cells without a number become NaN.
 
@@ -1051,8 +1139,8 @@ class _Table:
         wanted = sorted({self.column(name) for name in names})
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': None}
-        lines = self._selected(self._rows, where)
-        lines = self.lines = self._complete(lines, wanted[-1] + 1)
+        lines = self._complete(self._selected(self._rows, where), wanted[-1] + 1)
+        self.lines = lines
         number_lines = [self._as_numbers(line) for line in lines]
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', UserWarning)  # files without rows
@@ -1081,17 +1169,17 @@ class _Table:
             )
 
     @cached_property
-    def _rows(self):
+    def _rows(self) -> list[str]:
         """The lines of the rows; the file is read once for the names of sensors and the columns."""
         with _opened(self.path) as file:
             return plain_lines(file.read().splitlines())[self.first :]
 
-    def values_of(self, name, where):
+    def values_of(self, name: str, where: Sequence[str]) -> list[str]:
         """Return the different cells of a column in the rows that fulfil `where`, sorted."""
         rows = self._selected(self._rows, where)
         return sorted({cell for _, cell in self._column_of(rows, name)})
 
-    def _as_numbers(self, line):
+    def _as_numbers(self, line: str) -> str:
         """Return a line without comment, with cells that have no quotes, and decimal points."""
         line = _without_comment(line)
         if '"' not in line:
@@ -1105,8 +1193,12 @@ class _Table:
             plain.append(cell.replace(self.delimiter or ' ', ''))
         return (self.delimiter or ' ').join(plain)
 
-    def _complete(self, lines, width):
-        """Return the lines with at least `width` cells; count those that are dropped."""
+    def _complete(self, lines: Iterable[str], width: int) -> list[str]:
+        """
+        Return the lines with at least `width` cells; the other ones are counted in `n_dropped`.
+
+        Empty lines and comments are left out without a count.
+        """
         complete = []
         for line in lines:
             plain = _without_comment(line)
@@ -1125,17 +1217,21 @@ class _Table:
                 self.n_dropped += 1
         return complete
 
-    def _column_of(self, lines, name):
+    def _column_of(self, lines: Iterable[str], name: str) -> Iterator[tuple[str, str]]:
         """Yield (line, its cell in a column) of the lines that have the column."""
         column = self.column(name)
         for line in lines:
-            # Cells without quotes are quick to tell apart.
+            # Cells without quotes are separated without the slower csv module.
             cells = self._cells(line) if '"' in line else line.lstrip('# ').split(self.delimiter)
             if column < len(cells):
                 yield line, cells[column].strip()
 
-    def _selected(self, lines, where):
-        """Return the lines that fulfil all conditions COLUMN=VALUE; values as text or numbers."""
+    def _selected(self, lines: list[str], where: Sequence[str]) -> list[str]:
+        """
+        Return the lines that fulfil all conditions COLUMN=VALUE[,VALUE], as text or numbers.
+
+        Raises InputError when no line is left.
+        """
         for condition in where:
             name, equals, value = condition.partition('=')
             if not equals or not value.strip():
@@ -1144,37 +1240,38 @@ class _Table:
                     code='where',
                 )
             value = value.strip()
+            # A value may contain a comma.
+            accepted = (value, *value.split(','))
             kept = []
-            seen = Counter()
+            cell_counts = Counter()
             for line, cell in self._column_of(lines, name.strip()):
-                seen[cell] += 1
-                if any(_same(cell, each) for each in (value, *value.split(','))):
+                cell_counts[cell] += 1
+                if any(_same(cell, each) for each in accepted):
                     kept.append(line)
             if not kept:
-                most = ', '.join(cell for cell, _ in seen.most_common(5))
+                usual = ', '.join(cell for cell, _ in cell_counts.most_common(5))
                 raise InputError(
                     f'rows of {self.path} must fulfil {condition}, got none; {name} is'
-                    f' {shortened(most, 100)}; correct the column or its value',
+                    f' {shortened(usual, 100)}; correct the column or its value',
                     code='where',
                 )
             lines = kept
         return lines
 
-    def values(self, names):
-        """Return columns, shape (n, len(names))."""
-        return np.column_stack(
-            [
-                (1.0 if name in self.names or not name.startswith('-') else -1.0)
-                * self._values[self.column(name)]
-                for name in names
-            ]
-        )
+    def values(self, names: Sequence[str]) -> np.ndarray:
+        """Return columns, shape (n, len(names)); a minus before a name reverses the sign."""
+        columns = []
+        for name in names:
+            is_reversed = name not in self.names and name.startswith('-')
+            sign = -1.0 if is_reversed else 1.0
+            columns.append(sign * self._values[self.column(name)])
+        return np.column_stack(columns)
 
-    def raw(self, name):
+    def raw(self, name: str) -> np.ndarray:
         """Return one column as read, float or datetime64."""
         return self._values[self.column(name)]
 
-    def start_ns(self, time):
+    def start_ns(self, time: Columns) -> int:
         """Return the first of the Columns of time, ns; 0 for dates and times since 1970."""
         values = self.raw(time.names[0])
         if len(time.names) == 2 or values.dtype.kind == 'M':
@@ -1182,9 +1279,9 @@ class _Table:
         start = float(values[0]) * _time_size(time.unit)
         return 0 if start > EPOCH else round(start * 1e9)
 
-    def stamps(self, time):
+    def stamps(self, time: Columns) -> np.ndarray:
         """
-        Return stamps in ns of the Columns of time, int64, shape (n,).
+        Return stamps in ns of the Columns of time, int64, shape (n,); raises InputError.
 
         Two columns are seconds and nanoseconds.
         """
@@ -1192,14 +1289,15 @@ class _Table:
         if len(time.names) == 2:
             seconds_and_ns = self.values(time.names)
             if np.isfinite(seconds_and_ns).all():
-                whole, fraction_ns = seconds_and_ns.astype(np.int64).T
-                return whole * 10**9 + fraction_ns
-        if values.dtype.kind == 'M':
-            bad = np.count_nonzero(np.isnat(values))
+                seconds, nanoseconds = seconds_and_ns.astype(np.int64).T
+                return seconds * 10**9 + nanoseconds
+        is_date = values.dtype.kind == 'M'
+        if is_date:
+            n_bad = np.count_nonzero(np.isnat(values))
         else:
-            unit = _time_size(time.unit)
-            bad = np.count_nonzero(~(np.abs(values * unit) < MAX_TIME_SECONDS))
-        if bad == len(values):
+            unit_s = _time_size(time.unit)
+            n_bad = np.count_nonzero(~(np.abs(values * unit_s) < MAX_TIME_SECONDS))
+        if n_bad == len(values):
             cell = self.first_row[self.column(time.names[0])].strip()
             raise InputError(
                 f'the time in {self.path} must be a number, a date with time or a time of day'
@@ -1208,20 +1306,33 @@ class _Table:
                 key='columns',
                 code='csv_format',
             )
-        if bad:
+        if n_bad:
             raise InputError(
                 f'the time of every row of {self.path} must be a number below {MAX_TIME_SECONDS:g}'
-                f' s, got {bad} without one; remove these rows',
+                f' s, got {n_bad} without one; remove these rows',
                 code='csv_time',
             )
-        return values.astype(np.int64) if values.dtype.kind == 'M' else stamps_of(values, unit)
+        return values.astype(np.int64) if is_date else stamps_of(values, unit_s)
 
 
-def _dates(cells):
+def _has_decimal_comma(cell: str, delimiter: str | None) -> bool:
+    """Return whether a cell is a number with a decimal comma, without doubt."""
+    if not re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', cell):
+        return False
+    # In a quoted cell between commas, 1,234 may be a thousand.
+    return delimiter != ',' or not GROUPED_NUMBER.fullmatch(cell)
+
+
+def _unique(names: list[str]) -> list[str]:
+    """Return names in which repeated ones are followed by their number of column."""
+    counts = Counter(names)
+    return [name if counts[name] == 1 else f'{name} [{k + 1}]' for k, name in enumerate(names)]
+
+
+def _dates(cells: list[str]) -> np.ndarray:
     """Return dates with time as datetime64[ns], shape (n,); NaT where a cell is none."""
-    texts = [
-        re.sub(r'\s*(Z|[+-]\d\d:?\d\d)$', '', cell.strip()).replace(' ', 'T') for cell in cells
-    ]
+    time_zone = re.compile(r'\s*(Z|[+-]\d\d:?\d\d)$')
+    texts = [time_zone.sub('', cell.strip()).replace(' ', 'T') for cell in cells]
     try:
         return np.array(texts, 'datetime64[ns]')
     except ValueError:
@@ -1234,7 +1345,7 @@ def _dates(cells):
     return dates
 
 
-def _times_of_day(cells):
+def _times_of_day(cells: list[str]) -> np.ndarray:
     """
     Return times of day as datetime64[ns] from the midnight before the first one, shape (n,).
 
@@ -1242,37 +1353,39 @@ def _times_of_day(cells):
     """
     time_ns = np.full(len(cells), NO_TIME, np.int64)
     for k, cell in enumerate(cells):
-        found = TIME_OF_DAY.fullmatch(cell)
-        if found:
-            hours, minutes, seconds, fraction, half = found.groups(default='')
+        match = TIME_OF_DAY.fullmatch(cell)
+        if match:
+            hours, minutes, seconds, fraction, half = match.groups(default='')
             hour = int(hours)
             if half:  # 12 am is midnight, 12 pm is noon
                 hour = hour % 12 + 12 * (half in 'Pp')
-            whole = 3600 * hour + 60 * int(minutes) + int(seconds)
-            time_ns[k] = whole * 10**9 + int(fraction[:9].ljust(9, '0'))
-    good = time_ns != NO_TIME
-    known = time_ns[good]
-    midnights = np.cumsum(np.diff(known, prepend=known[:1]) < -DAY_NS // 2)
-    time_ns[good] = known + DAY_NS * midnights
+            time_s = 3600 * hour + 60 * int(minutes) + int(seconds)
+            time_ns[k] = time_s * 10**9 + int(fraction[:9].ljust(9, '0'))
+    is_time = time_ns != NO_TIME
+    time_of_day_ns = time_ns[is_time]
+    steps_ns = np.diff(time_of_day_ns, prepend=time_of_day_ns[:1])
+    n_midnights = np.cumsum(steps_ns < -DAY_NS // 2)
+    time_ns[is_time] = time_of_day_ns + DAY_NS * n_midnights
     return time_ns.view('datetime64[ns]')
 
 
-def _delimiter(lines):
+def _delimiter(lines: list[str]) -> str | None:
     """
     Return the delimiter that gives the same number of columns, at least four, in most lines.
 
     None for white space.
     """
 
-    def agreement(delimiter):
+    def agreement(delimiter: str | None) -> int:
+        """Return the number of lines with the most frequent width; 0 if that is below four."""
         counts = Counter(len(line.split(delimiter)) for line in lines[:50] if line.strip())
-        width, number = counts.most_common(1)[0]
-        return number if width >= 4 else 0
+        width, n_lines = counts.most_common(1)[0]
+        return n_lines if width >= 4 else 0
 
     return max((';', '\t', ',', None), key=agreement)
 
 
-def _first_row(rows):
+def _first_row(rows: list[list[str]]) -> int | None:
     """
     Return the index of the first row of numbers, or None.
 
@@ -1280,30 +1393,30 @@ def _first_row(rows):
     """
     n_numbers = [sum(map(_numeric, row)) for row in rows]
     n_words = [sum(map(_is_word, row)) for row in rows]
-    usual = Counter(number for number in n_numbers if number >= 2).most_common(1)
-    if not usual:
+    usual_n_numbers = Counter(number for number in n_numbers if number >= 2).most_common(1)
+    if not usual_n_numbers:
         return None
-    most_words = Counter(n_words).most_common(1)[0][0]
+    usual_n_words = Counter(n_words).most_common(1)[0][0]
     for k, row in enumerate(rows):
-        enough = n_numbers[k] >= min(4, len(row), usual[0][0])
-        if len(row) > 1 and enough and n_words[k] <= most_words:
+        has_numbers = n_numbers[k] >= min(4, len(row), usual_n_numbers[0][0])
+        if len(row) > 1 and has_numbers and n_words[k] <= usual_n_words:
             return k
     return None
 
 
-def _is_word(cell):
+def _is_word(cell: str) -> bool:
     """Return whether a cell is text that begins with a letter, no missing number."""
     text = cell.strip().strip('"')
     return text[:1].isalpha() and text.lower() not in ('nan', 'inf', 'null', 'na')
 
 
-def _same(cell, value):
+def _same(cell: str, value: str) -> bool:
     """Return whether a cell has a value, as text or as a number."""
     value = value.strip()
     return cell == value or (_numeric(cell) and _numeric(value) and float(cell) == float(value))
 
 
-def _without_brackets(text):
+def _without_brackets(text: str) -> str:
     """Return text without the brackets around it: (m/(s^2)) is m/(s^2)."""
     text = text.strip()
     while len(text) >= 2 and text[0] + text[-1] in ('()', '[]'):
@@ -1311,16 +1424,22 @@ def _without_brackets(text):
     return text
 
 
-def _numeric(cell):
+def _numeric(cell: str) -> bool:
+    """Return whether a cell is one number, with a decimal point or comma."""
     if len(cell) > LONGEST_NUMBER:
         return False
     return re.fullmatch(r'\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*', cell) is not None
 
 
-def _guess(table, stated=frozenset()):
-    """Return the Columns that the header names; sets of a `stated` quantity may be several."""
-    axes = {'force': {}, 'rate': {}}
-    found = []
+def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
+    """
+    Return the Columns that the header names, without force or rate if they are `stated`.
+
+    Raises InputError for several sets of axes of one sensor.
+    """
+    # Quantity -> set of axes (`_Reading.group`) -> axis -> (name, unit or None).
+    axes: dict[str, dict[str, dict[str, tuple[str, str | None]]]] = {'force': {}, 'rate': {}}
+    columns = []
     sensor_of_file = _words(table.path.stem)[0]
     for name in table.names:
         words, unit_text = _words(name)
@@ -1334,30 +1453,29 @@ def _guess(table, stated=frozenset()):
         if table.sensor and reading is not None:
             reading = replace(reading, sensor=table.sensor)
         for quantity, pattern in COLUMN_PATTERNS:
+            unit = _unit(quantity, unit_text)
             if quantity in axes:
                 if reading is not None and re.fullmatch(pattern, reading.sensor):
-                    unit = _unit(quantity, unit_text)
                     if unit is None and re.fullmatch(r'g ?f(orce)?', reading.sensor):
                         unit = 'g'
                     axes[quantity].setdefault(reading.group, {})[reading.axis] = (name, unit)
-            elif (
-                re.fullmatch(pattern, words)
-                # T (°C) is no time, and temp (F) is not read as °C
-                and (not unit_text or _unit(quantity, unit_text))
-                and quantity not in {each.quantity for each in found}
-            ):
-                found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
+                continue
+            # The first column with the name. T (°C) is no time, and temp (F) is not read as °C.
+            is_first = quantity not in {each.quantity for each in columns}
+            has_fitting_unit = not unit_text or unit
+            if is_first and has_fitting_unit and re.fullmatch(pattern, words):
+                columns.append(Columns(quantity, (name,), unit))
         if joint:
-            found.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
+            columns.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
     pair = _seconds_and_nanoseconds(table)
     if pair:
-        found = [pair, *(columns for columns in found if columns.quantity != 'time')]
-    if not any(columns.quantity == 'time' for columns in found):
-        found += _unnamed_time(table)
+        columns = [pair, *(each for each in columns if each.quantity != 'time')]
+    if not any(each.quantity == 'time' for each in columns):
+        columns += _unnamed_time(table)
     for quantity, groups in axes.items():
-        complete = {key: group for key, group in groups.items() if set(group) == set('xyz')}
         if quantity in stated:
             continue
+        complete = {key: group for key, group in groups.items() if set(group) == set('xyz')}
         if len(complete) > 1 and quantity == 'force':
             complete = _with_gravity(complete)
         if len(complete) > 1:
@@ -1373,8 +1491,8 @@ def _guess(table, stated=frozenset()):
         for group in complete.values():
             units = {group[axis][1] for axis in 'xyz'}
             names = tuple(group[axis][0] for axis in 'xyz')
-            found.append(Columns(quantity, names, units.pop() if len(units) == 1 else None))
-    return found
+            columns.append(Columns(quantity, names, units.pop() if len(units) == 1 else None))
+    return columns
 
 
 @dataclass(frozen=True)
@@ -1393,9 +1511,9 @@ DECORATION = r'(?:raw|cal|out|ln cal|wr cal|ln raw|wr raw|ln|wr)'
 """Words after the axis that loggers add; LN and WR: low noise and wide range."""
 
 
-def _reading_of(words):
-    """Return the `_Reading` of a name in words, or None."""
-    # A logger adds words behind the axis: acc x raw, accel ln x cal.
+def _reading_of(words: str) -> _Reading | None:
+    """Return the `_Reading` of a name in lower-case words, None for a name without an axis."""
+    # Additions of a logger after the axis: acc x raw, accel ln x cal.
     suffix = re.search(rf'(?<= ){DECORATION}$', words)
     bare = words
     if suffix:
@@ -1406,7 +1524,7 @@ def _reading_of(words):
         bare = f'{inner[1]} {inner[3]}'
         range_name = inner[2]
     bare = re.sub(r'^shimmer \w+ ', '', bare)
-    # The axis in front: x acc, xacc, x ang rate, behind the name of a message.
+    # The axis in front: x acc, xacc, x ang rate, after the name of a message.
     bare = re.sub(r'^(?:(?:.* )?imu\d? )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\2 \1', bare)
     bare = re.sub(r'^([xyz]) (.*)$', r'\2 \1', bare)
 
@@ -1430,7 +1548,7 @@ def _reading_of(words):
     return _Reading(axis[1], axis[2], group)
 
 
-def _sensor_of_unit(unit_text):
+def _sensor_of_unit(unit_text: str) -> str:
     """Return the sensor that has a unit, 'acc' or 'gyro'; '' for an unknown or missing unit."""
     for quantity, sensor in (('force', 'acc'), ('rate', 'gyro')):
         if unit_text and _unit(quantity, unit_text):
@@ -1438,33 +1556,38 @@ def _sensor_of_unit(unit_text):
     return ''
 
 
-def _with_gravity(sets):
-    """Return the sets of force without the linear accelerations that a phone adds to them."""
+def _with_gravity(sets: dict[str, dict]) -> dict[str, dict]:
+    """
+    Return the sets of force without the linear accelerations that a phone adds to them.
+
+    Keys: `_Reading.group`, such as 'linacc'; of a g-force ('gf...') only its set is returned.
+    """
     with_gravity = {key: group for key, group in sets.items() if not key.startswith('lin')}
-    total = {key: group for key, group in with_gravity.items() if key.startswith('gf')}
-    return total or with_gravity or sets
+    g_force = {key: group for key, group in with_gravity.items() if key.startswith('gf')}
+    return g_force or with_gravity or sets
 
 
 STAMP_NAMES = ('', 'header stamp', 'stamp', 'time', 'field header stamp')
 """Names of a stamp in two columns, before the word for seconds or nanoseconds."""
 
 
-def _seconds_and_nanoseconds(table):
+def _seconds_and_nanoseconds(table: _Table) -> Columns | None:
     """Return the Columns of a stamp in two columns, seconds and nanoseconds; None without them."""
-    columns = {}
+    # Name of the stamp -> is_nano -> name of the column.
+    columns_of: dict[str, dict[bool, str]] = {}
     for name in table.names:
         words = re.sub(r'[\s_./:-]+', ' ', name.lower()).strip()
-        part = re.fullmatch(r'(.*?) ?(secs?|seconds|nsecs?|nano ?secs?|nanoseconds)', words)
-        if part is not None and part[1] in STAMP_NAMES:
-            is_nano = part[2].startswith('n')
-            columns.setdefault(part[1], {})[is_nano] = name
-    for parts in columns.values():
-        if len(parts) == 2:
-            return Columns('time', (parts[False], parts[True]), 'ns')
+        match = re.fullmatch(r'(.*?) ?(secs?|seconds|nsecs?|nano ?secs?|nanoseconds)', words)
+        if match is not None and match[1] in STAMP_NAMES:
+            is_nano = match[2].startswith('n')
+            columns_of.setdefault(match[1], {})[is_nano] = name
+    for columns in columns_of.values():
+        if len(columns) == 2:
+            return Columns('time', (columns[False], columns[True]), 'ns')
     return None
 
 
-def _unnamed_time(table):
+def _unnamed_time(table: _Table) -> list[Columns]:
     """
     Return the column of time where no usual name has it, in a list; empty if several may be it.
 
@@ -1472,7 +1595,8 @@ def _unnamed_time(table):
     and "stamp" in its name.
     """
     clocks = [table.names[k] for k in sorted(table.clocks | table.dates)]
-    with_unit, stamps = [], []
+    with_unit = []
+    stamps = []
     for name in table.names:
         words, unit_text = _words(name)
         if re.search(r'[(\[]', name) and _unit('time', unit_text):
@@ -1491,8 +1615,12 @@ Elements of an array are axes: gyro[0] is x. A space before the bracket marks a 
 """
 
 
-def _words(name):
-    """Return (name in lower case with spaces, without unit; text of the unit)."""
+def _words(name: str) -> tuple[str, str]:
+    """
+    Return (name of a column in lower-case words without its unit, text of the unit or '').
+
+    ``'AccX (m/s^2)'`` gives ``('acc x', 'm/s^2')``; ``'gyro[0]'`` gives ``('gyro x', '')``.
+    """
     element = ELEMENT.fullmatch(name)
     if element:
         words, unit = _words(element.group(1))
@@ -1513,8 +1641,8 @@ def name_with_unit(name: str, quantity: str, unit: str) -> str:
     return f'{_without_unit(name)[0].strip()} ({unit})'
 
 
-def _without_unit(name):
-    """Return (name without its unit, text of the unit)."""
+def _without_unit(name: str) -> tuple[str, str]:
+    """Return (name without its unit, text of the unit or ''): in brackets, or as a suffix."""
     bracket = re.search(r'[(\[](.*?)[)\]]\s*(?:\[\d+\])?$', name)
     unit = bracket.group(1) if bracket else ''
     text = name[: bracket.start()] if bracket else name
@@ -1536,13 +1664,13 @@ def _without_unit(name):
     return text, unit
 
 
-def _unit(quantity, text):
+def _unit(quantity: str, text: str) -> str | None:
     """Return the unit of a quantity by its spelling in a header, or None."""
     text = text.strip().removesuffix(CORRECTED).replace(' ', '')
-    known = {unit.lower(): unit for unit in COLUMN_UNITS[quantity]} | SPELLINGS[quantity]
     if quantity == 'time' and _tick_size(text):
         return text
-    return known.get(text)
+    unit_of_spelling = {unit.lower(): unit for unit in COLUMN_UNITS[quantity]}
+    return (unit_of_spelling | SPELLINGS[quantity]).get(text)
 
 
 MIN_DISTINCT_TIMES = 0.1
@@ -1551,8 +1679,8 @@ MIN_ROWS_OF_TIMES = 20
 """Rows from which the share is tested."""
 
 
-def _require_distinct_times(values, path):
-    """Refuse times that are equal in nearly all rows."""
+def _require_distinct_times(values: np.ndarray, path: Path) -> None:
+    """Refuse times, float or datetime64, that are equal in nearly all rows."""
     # Cells that are no time are refused with their own cause.
     values = values[~np.isnan(values)] if values.dtype.kind == 'f' else values[~np.isnat(values)]
     n_distinct = len(np.unique(values))
@@ -1568,13 +1696,19 @@ def _require_distinct_times(values, path):
     )
 
 
-def _time_unit(values):
-    """Return the unit in which the median step is that of an IMU."""
+def _time_unit(values: np.ndarray) -> str | None:
+    """Return the unit in which the median step is that of an IMU, or None."""
     if values.dtype.kind == 'M':
         return 'ns'
-    step = np.diff(values)
-    step = float(np.median(step[step > 0])) if (step > 0).any() else np.nan
-    return next((unit for unit, low, high in PERIODS if low <= step <= high), None)
+    steps = np.diff(values)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None
+    median_step = float(np.median(steps))
+    for unit, low, high in PERIODS:
+        if low <= median_step <= high:
+            return unit
+    return None
 
 
 SAMPLE_TIME_FINE = ('sample time fine', 'sampletimefine')
@@ -1585,7 +1719,7 @@ Median step of SampleTimeFine: from it on microseconds (Xsens DOT, at most 250 H
 """
 
 
-def _unit_of_sample_time_fine(values):
+def _unit_of_sample_time_fine(values: np.ndarray) -> str:
     """Return the unit of a column SampleTimeFine of an Xsens log."""
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -1594,13 +1728,14 @@ def _unit_of_sample_time_fine(values):
     return '100us'
 
 
-def _require_time_of_turns(time, rate, imu, path):
+def _require_time_of_turns(time: Columns, rate: Columns, imu: ImuSamples, path: Path) -> None:
     """
-    Refuse stamps whose unit was found from the values, where gravity turns by another clock.
+    Refuse stamps with a unit found from the values, if the rates turn gravity by another clock.
 
     The turns of gravity per sample give the product of period and unit of the rates; with the unit
-    in the header, the period follows, and thereby the unit of time. A rate whose unit was found too
-    must agree well: the tick of a counter looks like another unit of the rate.
+    of the rates in the header, the period follows, and thereby the unit of time. A unit of the
+    rates that was found from the values too must agree well, because a wrong tick of a counter
+    has the same effect as another unit of the rates.
 
     `imu`: force in SI, rates as in the log.
     """
@@ -1611,24 +1746,26 @@ def _require_time_of_turns(time, rate, imu, path):
     period_s = float(np.median(np.diff(imu.stamp_ns))) * 1e-9
     if period_s <= 0.0:
         return
-    factor = _turning_factor(imu.stamp_ns, imu.force_s, imu.rate_s)
-    size = _size_of(rate)
+    unit_s = _time_size(time.unit)
+    unit_rad_s = _size_of(rate)
     band = RATE_BAND
     if rate.origin == 'values':
         band = OWN_RATE_BAND
-    if factor is not None and 1 / band < factor / size < band:
+    factor = _turning_factor(imu.stamp_ns, imu.force_s, imu.rate_s)
+    if factor is not None and 1 / band < factor / unit_rad_s < band:
         return
 
-    # Periods of usual IMUs, because a wrong one may hide the turns.
+    # A wrong period may hide the turns, therefore stamps with the periods of usual IMUs. The factor
+    # is proportional to 1 / period: the true one is tried_period_s * tried_factor / unit_rad_s.
     tick_s = None
-    for true_period_s in TRIED_PERIODS:
+    for tried_period_s in TRIED_PERIODS:
         samples = np.arange(len(imu.stamp_ns))
-        stamp_ns = np.round(samples * (true_period_s * 1e9)).astype(np.int64)
-        tried = _turning_factor(stamp_ns, imu.force_s, imu.rate_s)
-        if tried is not None:
-            tick_s = tried / size * true_period_s / period_s * _time_size(time.unit)
+        stamp_ns = np.round(samples * (tried_period_s * 1e9)).astype(np.int64)
+        tried_factor = _turning_factor(stamp_ns, imu.force_s, imu.rate_s)
+        if tried_factor is not None:
+            tick_s = tried_factor / unit_rad_s * tried_period_s / period_s * unit_s
             break
-    if tick_s is None or abs(np.log(tick_s / _time_size(time.unit))) < np.log(band):
+    if tick_s is None or abs(np.log(tick_s / unit_s)) < np.log(band):
         return
     usual = [tick for tick in USUAL_TICKS if abs(tick_s / _tick_size(tick) - 1.0) < NEAR_TICK]
     ticks = ' or '.join(usual) or f'{tick_s * 1e6:.3g}us'
@@ -1641,29 +1778,29 @@ def _require_time_of_turns(time, rate, imu, path):
     )
 
 
-def _force_unit(force):
-    """Return the unit in which the median length is that of gravity."""
+def _force_unit(force: np.ndarray) -> str | None:
+    """Return the unit in which the median length of readings, (n, 3), is that of gravity."""
     length = float(np.nanmedian(np.linalg.norm(force, axis=1)))
-    return next(
-        (
-            unit
-            for unit, size in COLUMN_UNITS['force'].items()
-            if 1 / GRAVITY_BAND < length * size / STANDARD_GRAVITY < GRAVITY_BAND
-        ),
-        None,
-    )
+    for unit, size in COLUMN_UNITS['force'].items():
+        if 1 / GRAVITY_BAND < length * size / STANDARD_GRAVITY < GRAVITY_BAND:
+            return unit
+    return None
 
 
-def _refuse_increments(force, stamp_ns):
-    """Raise for readings that are increments over one sample."""
+def _refuse_increments(force: np.ndarray, stamp_ns: np.ndarray) -> None:
+    """Raise InputError for readings, (n, 3), that are increments over one sample."""
     length = float(np.nanmedian(np.linalg.norm(force, axis=1)))
     error = force_error(length, 'in the log', per_second=samples_per_second(stamp_ns))
     if error is not None and error.code == 'increments':
         raise error
 
 
-def _turning_factor(stamp_ns, force_s, rate):
-    """Return the factor from readings to the rates that turn gravity, rad/s; None if unknown."""
+def _turning_factor(stamp_ns: np.ndarray, force_s: np.ndarray, rate: np.ndarray) -> float | None:
+    """
+    Return the size in rad/s of the unit of `rate` with which the rates turn the force.
+
+    None where the force does not turn enough. `rate`: readings in any unit, (n, 3).
+    """
     series = ChunkSeries()
     good = np.isfinite(force_s).all(axis=1) & np.isfinite(rate).all(axis=1)
     series.push(stamp_ns[good], np.concatenate([force_s[good].T, rate[good].T]))
@@ -1673,8 +1810,8 @@ def _turning_factor(stamp_ns, force_s, rate):
     return turning.factor
 
 
-def _rate_unit(stamp_ns, force_s, rate):
-    """Return the unit in which the rates turn gravity as the accelerometer measures it."""
+def _rate_unit(stamp_ns: np.ndarray, force_s: np.ndarray, rate: np.ndarray) -> str | None:
+    """Return the unit in which the rates turn gravity as the accelerometer measures it, or None."""
     factor = _turning_factor(stamp_ns, force_s, rate)
     if factor is None:
         return None
@@ -1694,9 +1831,9 @@ def is_log_folder(path: str | PathLike[str]) -> bool:
     folder = Path(path)
     if not folder.is_dir() or (folder / 'metadata.yaml').exists():
         return False
-    inner = list(folder.iterdir())
-    of_bag = [each for each in inner if each.suffix in suffixes()]
-    return any(map(is_text_log, inner)) and not of_bag
+    files = list(folder.iterdir())
+    has_storage_file = any(file.suffix in suffixes() for file in files)
+    return any(map(is_text_log, files)) and not has_storage_file
 
 
 def require_no_rows(options: LogOptions, path: str | PathLike[str]) -> None:
@@ -1777,9 +1914,9 @@ class ConvertedLog:
 
 
 @lru_cache(maxsize=1)
-def _converted(path, _modified_ns, _size, options):
+def _converted(path: Path, _modified_ns: int, _size: int, options: LogOptions) -> ConvertedLog:
     """
-    Return the ConvertedLog.
+    Return the ConvertedLog of a log that was modified at this time and has this size.
 
     A verb opens a recording several times, and converts an unchanged file once.
     """

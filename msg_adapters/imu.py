@@ -29,19 +29,14 @@ FIELDS = {
 
 def find_imu_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Imu message (raises MessageError)."""
-    return _layout(
-        data,
-        'Imu',
-        N_DOUBLES,
-        {name: (place.start, place.stop - place.start) for name, place in FIELDS.items()},
-    )
+    return _layout(data, 'Imu', N_DOUBLES, FIELDS)
 
 
-def _layout(data, kind, n_doubles, fields):
+def _layout(data: bytes, kind: str, n_doubles: int, fields: dict[str, slice]) -> MessageLayout:
     """
-    Return the MessageLayout of a message with doubles after its header.
+    Return the MessageLayout of a message with `n_doubles` doubles after its header.
 
-    `fields` are name -> (index of the first, number).
+    `kind`: type for errors; `fields`: name -> its doubles.
     """
     header = open_header(data)
     body = aligned(header.end, 8)
@@ -50,7 +45,9 @@ def _layout(data, kind, n_doubles, fields):
             f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles}'
             f' bytes, got {len(data)}'
         )
-    offsets = {name: (body + 8 * first, count) for name, (first, count) in fields.items()}
+    offsets = {
+        name: (body + 8 * place.start, place.stop - place.start) for name, place in fields.items()
+    }
     return MessageLayout(
         header.order,
         len(data),
@@ -68,9 +65,9 @@ def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
     A quantity declared absent (covariance -1) is NaN.
     """
     readings = {}
-    for name, cov in (('force_s', 'force_cov'), ('rate_s', 'rate_cov')):
+    for name, cov_name in (('force_s', 'force_cov'), ('rate_s', 'rate_cov')):
         values = layout.column(packed, name)
-        absent = layout.column(packed, cov, 1)[:, 0] == -1.0
+        absent = layout.column(packed, cov_name, 1)[:, 0] == -1.0
         if absent.any():
             values[absent] = np.nan
         readings[name] = values
@@ -128,7 +125,7 @@ TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
 
 def find_temperature_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Temperature message (raises MessageError)."""
-    return _layout(data, 'Temperature', 2, {'temperature_c': (0, 1)})
+    return _layout(data, 'Temperature', 2, {'temperature_c': slice(0, 1)})
 
 
 def decode_temperature(layout: MessageLayout, packed: Packed) -> TemperatureSamples:

@@ -15,6 +15,7 @@ from msg_adapters.imu import find_imu_layout
 from msg_adapters.layout import MessageError, frame_head
 
 STAMP_AT = 4
+"""Bytes before the stamp: encapsulation."""
 HEAD_AT = 12
 """Bytes before the frame_id's length: encapsulation and stamp."""
 NS = 1_000_000_000
@@ -34,20 +35,37 @@ class ImuStream:
     """
 
     def __init__(self, frame_id: str | None = None, late_ns: int = 0):
-        self._frame_out, self._late_ns = frame_id, late_ns
+        self._frame_out = frame_id
+        self._late_ns = late_ns
+        # Of the last opened message; a message with other bytes must be opened.
         self._size = -1
+        """Bytes; -1: the next message must be opened in any case."""
         self._order = b''
+        """First two bytes, which state the byte order."""
         self._head = b''
+        """Length and text of the frame_id, up to the byte `_head_end`."""
         self._head_end = HEAD_AT
         self._head_out = b''
-        self._body = self._rate_at = self._force_at = 0
-        self._rate_cov = self._force_cov = b''
+        """Frame of the written messages, with its padding."""
+        self._body = 0
+        """Offset of the orientation."""
+        self._rate_at = 0
+        """Offset of the angular velocity, which its covariance follows."""
+        self._force_at = 0
+        """Offset of the acceleration, which its covariance follows."""
+        self._rate_cov = b''
+        """Bytes of the covariance of the rate that `covariances` returned last."""
+        self._force_cov = b''
         self._use('<')
 
-    def _use(self, order):
-        self._stamp, self._readings = struct.Struct(order + 'iI'), struct.Struct(order + '3d72x3d')
+    def _use(self, order: str) -> None:
+        """Prepare the parsers of the parts of a message for a byte order, '<' or '>'."""
+        self._stamp = struct.Struct(order + 'iI')
+        # Rate, its covariance (72 bytes), force, its covariance.
+        self._readings = struct.Struct(order + '3d72x3d')
         self._tail = struct.Struct(order + '3d72s3d72s')
-        self._nine, self._four = struct.Struct(order + '9d'), struct.Struct(order + '4d')
+        self._nine = struct.Struct(order + '9d')
+        self._four = struct.Struct(order + '4d')
 
     def open(self, data: bytes) -> str:
         """
@@ -69,17 +87,18 @@ class ImuStream:
         self._head = data[HEAD_AT : self._head_end]
         self._rate_at = layout.offsets['rate_s'][0]
         self._force_at = layout.offsets['force_s'][0]
-        self._head_out = frame_head(
-            layout.names[0] if self._frame_out is None else self._frame_out, layout.order
-        )
+        frame_id = layout.names[0]
+        frame_out = frame_id if self._frame_out is None else self._frame_out
+        self._head_out = frame_head(frame_out, layout.order)
         self._size = len(data)
-        return layout.names[0]
+        return frame_id
 
     def take(self, data: bytes) -> tuple[int, tuple[float, ...]] | None:
         """
         Return (stamp in ns, readings: rate x, y, z, force x, y, z).
 
-        Or None where head or covariances differ from the last.
+        None where the head differs from that of the last opened message, or the covariances from
+        the last result of `covariances`.
         """
         if (
             len(data) != self._size
@@ -98,9 +117,7 @@ class ImuStream:
 
     def heads(self, data: bytes) -> bool:
         """
-        Return whether a message has the head of the last opened one.
-
-        So that all positions are equal.
+        Return whether a message has the head of the last opened one, and thereby its positions.
         """
         return (
             len(data) == self._size
@@ -113,15 +130,12 @@ class ImuStream:
         self._size = -1
 
     def covariances(self, data: bytes) -> tuple[np.ndarray, ...]:
-        """Return the covariances of (force, rate), each (3, 3)."""
-        self._rate_cov, self._force_cov = (
-            data[self._rate_at + 24 : self._rate_at + 96],
-            data[self._force_at + 24 :],
-        )
-        return tuple(
-            np.array(self._nine.unpack_from(raw)).reshape(3, 3)
-            for raw in (self._force_cov, self._rate_cov)
-        )
+        """Return the covariances of (force, rate), each (3, 3), and keep their bytes for `take`."""
+        self._rate_cov = data[self._rate_at + 24 : self._rate_at + 96]
+        self._force_cov = data[self._force_at + 24 :]
+        force_cov = np.array(self._nine.unpack_from(self._force_cov)).reshape(3, 3)
+        rate_cov = np.array(self._nine.unpack_from(self._rate_cov)).reshape(3, 3)
+        return force_cov, rate_cov
 
     def orientation(self, data: bytes) -> tuple[tuple[float, ...], bytes]:
         """Return (quaternion x, y, z, w; its covariance as bytes)."""
@@ -177,8 +191,13 @@ class ImuHeads:
     def __init__(self) -> None:
         self._stream = ImuStream()
         self._frame_ids = Counter[str]()
-        self._last, self._frame_id = b'', ''
+        """Frame -> messages."""
+        self._last = b''
+        """The last valid message."""
+        self._frame_id = ''
+        """Frame of the last message that was opened."""
         self._age: list[float] = []
+        """Time of reception minus stamp of each message that has both, s."""
 
     def add(self, data: bytes, received_ns: int) -> None:
         """

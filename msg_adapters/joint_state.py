@@ -12,6 +12,7 @@ from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.layout import (
     FRAME_OFFSET,
     NS_PER_S,
+    Header,
     MessageError,
     MessageLayout,
     Packed,
@@ -23,11 +24,10 @@ from msg_adapters.layout import (
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
-MAX_MESSAGE_JOINTS, MAX_NAME_BYTES = 1000, 1 << 16
-"""
-Joints of a message and bytes of their names; the time to compare names grows with the square of
-either.
-"""
+MAX_MESSAGE_JOINTS = 1000
+"""Joints of a message; the time to compare names grows with their square."""
+MAX_NAME_BYTES = 1 << 16
+"""Bytes of the names of a message; the time to compare them grows with their square."""
 MISSING_JOINT = 'JointState without every joint of the table'
 NO_NAMES = 'JointState without names'
 NO_POSITION = 'JointState without a position for every name'
@@ -44,21 +44,21 @@ def find_joint_layout(data: bytes) -> MessageLayout:
 
     """
     header = open_header(data)
-    walk = _Walk(bytes(data), header)
+    cursor = _Cursor(bytes(data), header)
     try:
-        n_names = walk.count()
-        names = tuple(walk.string() for _ in range(min(n_names, MAX_MESSAGE_JOINTS)))
-        if n_names > MAX_MESSAGE_JOINTS or walk.position > MAX_NAME_BYTES:
+        n_names = cursor.count()
+        names = tuple(cursor.string() for _ in range(min(n_names, MAX_MESSAGE_JOINTS)))
+        if n_names > MAX_MESSAGE_JOINTS or cursor.position > MAX_NAME_BYTES:
             raise MessageError(
                 f'a JointState must have at most {MAX_MESSAGE_JOINTS} joints and {MAX_NAME_BYTES}'
                 ' bytes of names'
             )
-        offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
+        offsets = {field: cursor.doubles() for field in ('position', 'velocity', 'effort')}
     except struct.error:
         raise MessageError(
             f'a JointState of {len(data)} bytes ends before its last field'
         ) from None
-    return MessageLayout(header.order, len(data), bytes(data), tuple(walk.fixed), offsets, names)
+    return MessageLayout(header.order, len(data), bytes(data), tuple(cursor.fixed), offsets, names)
 
 
 def decode_joints(
@@ -87,36 +87,40 @@ def decode_joints(
     return JointSamples(layout.stamp_ns(packed), position, velocity, tuple(joint_names))
 
 
-class _Walk:
+class _Cursor:
     """Steps through a message; raises struct.error at the end of the data."""
 
-    def __init__(self, data, header):
-        self.data, self.position = data, header.end
+    def __init__(self, data: bytes, header: Header):
+        self.data = data
+        self.position = header.end
+        """Next byte."""
         self.number = struct.Struct(header.order + 'I')
         self.fixed = [(0, 2), (FRAME_OFFSET, header.end)]
+        """Ranges (first, last + 1) of bytes that every message of the layout must share."""
 
-    def count(self):
+    def count(self) -> int:
         """Read a count or the length of a string, which every message of the layout must share."""
         start = aligned(self.position, 4)
         self.position = start + 4
         self.fixed.append((start, self.position))
         return self.number.unpack_from(self.data, start)[0]
 
-    def string(self):
+    def string(self) -> str:
         """Read a string, which every message of the layout must share."""
         length = self.count()
         start = self._skip(length)
         self.fixed.append((start, self.position))
         return clean_name(self.data[start : start + max(length - 1, 0)])
 
-    def doubles(self):
+    def doubles(self) -> tuple[int, int]:
         """Step over a sequence of doubles; return (offset, count)."""
         count = self.count()
         if count:
             self.position = aligned(self.position, 8)
         return self._skip(8 * count), count
 
-    def _skip(self, size):
+    def _skip(self, size: int) -> int:
+        """Step over some bytes; return the first of them."""
         start = self.position
         self.position += size
         if self.position > len(self.data):
@@ -126,6 +130,7 @@ class _Walk:
 
 JOINT_TRAJECTORY_TYPE = 'trajectory_msgs/msg/JointTrajectory'
 _FIELDS = {'position': 'positions', 'rate': 'velocities', 'acceleration': 'accelerations'}
+"""Column of TrajectoryPoints -> field of a point in the message."""
 
 
 class CdrWriter:
@@ -152,7 +157,8 @@ class CdrWriter:
             self._align(8)
             self.data += np.asarray(values, '<f8').tobytes()
 
-    def _align(self, size):
+    def _align(self, size: int) -> None:
+        """Append zeros up to a multiple of `size`, counted without the four bytes in front."""
         self.data += bytes(-(len(self.data) - 4) % size)
 
 
@@ -199,13 +205,13 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
         [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in points],
         float,
     )
-    given = {
-        name: [list(getattr(point, field)) for point in points] for name, field in _FIELDS.items()
-    }
     complete = {}
-    for name, values in given.items():
-        if all(len(row) == len(names) for row in values) and (values or name == 'position'):
-            complete[name] = np.array(values, float).reshape(len(points), len(names))
+    for name, field in _FIELDS.items():
+        rows = [list(getattr(point, field)) for point in points]
+        has_all_joints = all(len(row) == len(names) for row in rows)
+        # Without points only the positions, which are required, are given.
+        if has_all_joints and (rows or name == 'position'):
+            complete[name] = np.array(rows, float).reshape(len(points), len(names))
     if 'position' not in complete:
         raise InputError(
             f'each point of a trajectory must have {len(names)} positions, one for each joint, some'

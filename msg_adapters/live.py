@@ -4,6 +4,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -39,15 +40,17 @@ class LiveGatherer:
         max_messages: int = 1_000_000,
         frame_id: str | None = None,
     ):
-        imu = Decoder(IMU_TYPE, choice=None if frame_id is None else OneFrame(clean_name(frame_id)))
+        choice = None if frame_id is None else OneFrame(clean_name(frame_id))
+        imu = Decoder(IMU_TYPE, choice=choice)
+        # Keys: fields of a SampleBlock.
         self._topics = {
             'imu': _Topic(imu, max_messages),
             'joints': _Topic(JointDecoder(joint_names), max_messages),
             'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages),
         }
-        self.add_imu, self.add_joints, self.add_temperature = (
-            topic.add for topic in self._topics.values()
-        )
+        self.add_imu = self._topics['imu'].add
+        self.add_joints = self._topics['joints'].add
+        self.add_temperature = self._topics['temperature'].add
         """Add a serialized message, and when it was sent, ns."""
 
     def __len__(self) -> int:
@@ -86,29 +89,35 @@ class OneFrame:
 class _Topic:
     """Messages of one topic that wait for `flush`."""
 
-    def __init__(self, decoder, max_messages):
-        self.decoder, self.max_messages = decoder, max_messages
+    def __init__(self, decoder: Decoder, max_messages: int):
+        self.decoder = decoder
+        self.max_messages = max_messages
         self.lock = threading.Lock()
-        self.waiting = deque()
+        """For the two fields below, which two threads change."""
+        self.waiting: deque[tuple[bytes, int]] = deque()
+        """(serialized message, time of sending in ns or 0) since the last `take`."""
         self.n_lost = 0
+        """Messages discarded since the last `take`, because too many were waiting."""
 
     def add(self, message: bytes, sent_ns: int = 0) -> None:
+        """Keep a message; the oldest one is discarded when there are too many."""
         with self.lock:
             self.waiting.append((message, sent_ns))
             if len(self.waiting) > self.max_messages:
                 self.waiting.popleft()
                 self.n_lost += 1
 
-    def take(self):
+    def take(self) -> Any:
+        """Return the samples of the messages since the last call, None without any."""
         with self.lock:
-            messages, self.waiting = self.waiting, deque()
-            n_lost, self.n_lost = self.n_lost, 0
+            messages = self.waiting
+            n_lost = self.n_lost
+            self.waiting = deque()
+            self.n_lost = 0
         if n_lost:
-            self.decoder.dropped[
-                f'{self.decoder.name} message that was dropped because the queue was full'
-            ] += n_lost
+            reason = f'{self.decoder.name} message that was dropped because the queue was full'
+            self.decoder.dropped[reason] += n_lost
+        packed = Packed.join([message for message, _ in messages])
         sent_ns = np.array([sent for _, sent in messages], np.int64)
-        return self.decoder.decode(
-            Packed.join([message for message, _ in messages]),
-            (lambda: sent_ns) if np.all(sent_ns) else None,
-        )
+        # Times of sending replace zero stamps, if the middleware gives them.
+        return self.decoder.decode(packed, (lambda: sent_ns) if np.all(sent_ns) else None)

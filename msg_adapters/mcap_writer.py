@@ -48,9 +48,14 @@ class McapWriter:
         self.file.write(
             MAGIC + record(0x01, prefixed_string('ros2'), prefixed_string('imu_calibration'))
         )
-        self.schemas, self.channels = {}, {}
+        self.schemas: dict[str, tuple[int, bytes]] = {}
+        """Message type -> (id, Schema record)."""
+        self.channels: dict[int, bytes] = {}
+        """Topic id -> Channel record."""
         self.new_records = b''
-        self.chunk_indexes = []
+        """Schemas and channels that the next chunk begins with."""
+        self.chunk_indexes: list[bytes] = []
+        """ChunkIndex record of each chunk."""
 
     def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
         """Declare a topic; `definition` is a TypeDefinition."""
@@ -83,28 +88,34 @@ class McapWriter:
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
         headers = np.zeros(len(messages), dtype=MESSAGE_HEADER)
-        head = MESSAGE_HEADER.itemsize
-        headers['opcode'], headers['length'], headers['channel'] = (
-            0x05,
-            messages.size + 22,
-            topic_ids,
-        )
-        headers['log_ns'] = headers['publish_ns'] = received_ns
-        end = np.cumsum(messages.size + head)
-        place = end - messages.size - head
+        headers['opcode'] = 0x05
+        headers['length'] = messages.size + 22
+        headers['channel'] = topic_ids
+        headers['log_ns'] = received_ns
+        headers['publish_ns'] = received_ns
+        # Records of all messages, one after the other: header, then data.
+        n_head = MESSAGE_HEADER.itemsize
+        end = np.cumsum(messages.size + n_head)
+        start = end - messages.size - n_head
         content = np.empty(end[-1], np.uint8)
-        overlapping(content, f'V{head}')[place] = headers.view(f'V{head}')
-        messages.copy_to(content, place + head)
+        overlapping(content, f'V{n_head}')[start] = headers.view(f'V{n_head}')
+        messages.copy_to(content, start + n_head)
+        # A chunk ends with the message that passes a multiple of CHUNK_SIZE.
         cuts = np.flatnonzero(np.diff(end // CHUNK_SIZE)) + 1
-        for first, last in zip([0, *cuts], [*cuts, len(messages)], strict=True):
+        for first, stop in zip([0, *cuts], [*cuts, len(messages)], strict=True):
             self._write_chunk(
-                headers[first:last],
-                place[first:last] - place[first],
-                content[place[first] : end[last - 1]],
+                headers[first:stop],
+                start[first:stop] - start[first],
+                content[start[first] : end[stop - 1]],
             )
 
-    def _write_chunk(self, headers, offset, messages):
-        content = self.new_records + messages.tobytes()
+    def _write_chunk(self, headers: np.ndarray, offset: np.ndarray, records: np.ndarray) -> None:
+        """
+        Write a chunk with its message indexes, and keep its ChunkIndex record.
+
+        `headers` and `offset` of each message in the `records`, which are uint8, shape (n_bytes,).
+        """
+        content = self.new_records + records.tobytes()
         offset += len(self.new_records)
         self.new_records = b''
         packed = self.compress(content)
@@ -116,25 +127,32 @@ class McapWriter:
                 0x06, times, struct.pack('<QI', len(content), zlib.crc32(content)), sizes, packed
             )
         )
-        length = self.file.tell() - start
+        chunk_length = self.file.tell() - start
         places = self._write_message_indexes(headers, offset)
+        indexes_length = self.file.tell() - start - chunk_length
         self.chunk_indexes.append(
             record(
                 0x08,
                 times,
-                struct.pack('<QQ', start, length),
+                struct.pack('<QQ', start, chunk_length),
                 prefixed_string(places),
-                struct.pack('<Q', self.file.tell() - start - length),
+                struct.pack('<Q', indexes_length),
                 sizes,
                 struct.pack('<Q', len(content)),
             )
         )
 
-    def _write_message_indexes(self, headers, offset):
+    def _write_message_indexes(self, headers: np.ndarray, offset: np.ndarray) -> bytes:
+        """
+        Write a MessageIndex record for each channel of a chunk.
+
+        Return the pairs (channel id, position of its record) as bytes.
+        """
         places = b''
         for channel in np.unique(headers['channel']):
-            mine = headers['channel'] == channel
-            entries = np.stack([headers['log_ns'][mine], offset[mine].astype('<u8')], axis=1)
+            of_channel = headers['channel'] == channel
+            log_ns = headers['log_ns'][of_channel]
+            entries = np.stack([log_ns, offset[of_channel].astype('<u8')], axis=1)
             places += struct.pack('<HQ', channel, self.file.tell())
             self.file.write(
                 record(0x07, struct.pack('<H', channel), prefixed_string(entries.tobytes()))
@@ -193,7 +211,8 @@ class McapWriter:
         )
         self.file.close()
 
-    def _write_groups(self, groups):
+    def _write_groups(self, groups: dict[int, list[bytes]]) -> list[bytes]:
+        """Write the records of the summary by opcode; return the SummaryOffset records."""
         offsets = []
         for opcode, records in groups.items():
             start = self.file.tell()

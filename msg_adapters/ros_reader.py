@@ -64,7 +64,9 @@ class RosFile:
     """rosbag2_py has none: the types are those of the sourced ROS 2."""
 
     def __init__(self, path: Path, metadata: dict[str, Any]):
-        self.path, self.lost = path, {}
+        self.path = path
+        self.lost: dict[str, int] = {}
+        """No loss is known: rosbag2_py raises for damage."""
         self._compressed = bool(metadata.get('compression_mode'))
         storages = {storage.suffix: storage.identifier for storage in STORAGES}
         self.identifier = metadata.get('storage_identifier') or storages.get(path.suffix, '')
@@ -75,7 +77,7 @@ class RosFile:
         }
         self._content = reader.get_metadata()
 
-    def _reader(self):
+    def _reader(self) -> Any:
         """Return a reader at the first message."""
         ros = import_module('rosbag2_py')
         reader = ros.SequentialCompressionReader() if self._compressed else ros.SequentialReader()
@@ -103,7 +105,8 @@ class RosFile:
         """Yield RawMessages of the topics in the order of the recording."""
         return grouped(self._messages(list(topics)))
 
-    def _messages(self, topics):
+    def _messages(self, topics: list[str]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (index of the topic, receive time, message)."""
         ros = import_module('rosbag2_py')
         reader = self._reader()
         reader.set_filter(ros.StorageFilter(topics=topics))

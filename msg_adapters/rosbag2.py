@@ -5,7 +5,7 @@ rosbag2 recordings: a folder with its metadata, a folder without them, or a sing
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path, PurePath
@@ -59,7 +59,8 @@ def spelled_out(profiles: Sequence) -> list:
     return [{key: _name(key, value) for key, value in profile.items()} for profile in profiles]
 
 
-def _name(key, value):
+def _name(key: str, value: Any) -> Any:
+    """Return the name of the number of a QoS policy; unchanged for another key or value."""
     if key not in QOS_POLICIES or not isinstance(value, int):
         return value
     names = QOS_POLICIES[key]
@@ -110,22 +111,27 @@ class Rosbag2:
     def __init__(self, path: str | PathLike[str]):
         self.path = Path(path)
         self.folder: str | None = None
+        """Temporary folder of decompressed copies; None without any."""
         self.metadata = read_metadata(self.path) if self.path.is_dir() else {}
-        self._lost, self.files = {}, []
+        self._lost: dict[str, int] = {}
+        """Losses outside of the files' own counts, reason -> count."""
+        self.files: list = []
+        """Readers of the files that can be read, in their order."""
+        self.types: dict[str, str] = {}
+        """Topic -> message type."""
+        self.definitions: dict[str, tuple[str, str]] = {}
+        """Message type -> (language, text)."""
         by_message = (self.metadata.get('compression_mode') or '').lower() == 'message'
+        unpack = decompress_message if by_message else None
         try:
-            errors = [
-                self._open(path, decompress_message if by_message else None)
-                for path in self._storage_paths()
-            ]
+            errors = [self._open(path, unpack) for path in self._storage_paths()]
             if not self.files:
                 raise ValueError(
                     '; '.join(filter(None, errors)) or f'there is no {" or ".join(suffixes())} file'
                 )
-            self.types = {name: kind for file in self.files for name, kind in file.types.items()}
-            self.definitions = {
-                name: text for file in self.files for name, text in file.definitions.items()
-            }
+            for file in self.files:
+                self.types.update(file.types)
+                self.definitions.update(file.definitions)
             self.counts = self._counts()
         except BaseException:
             self.close()
@@ -136,8 +142,11 @@ class Rosbag2:
         """Time between the first and the last message by the clock of the recorder."""
         if 'duration' in self.metadata:
             return self.metadata['duration']['nanoseconds']
-        ranges = [times for times in (file.time_range() for file in self.files) if times]
-        return max(last for _, last in ranges) - min(first for first, _ in ranges) if ranges else 0
+        ranges = [file.time_range() for file in self.files]
+        ranges = [times for times in ranges if times]
+        if not ranges:
+            return 0
+        return max(last for _, last in ranges) - min(first for first, _ in ranges)
 
     @property
     def lost(self) -> dict[str, int]:
@@ -187,17 +196,18 @@ class Rosbag2:
                     f'rest of {file.path.name} after damage'
                     f' ({shortened(f"{type(error).__name__}: {error}", 100)})'
                 ] = 1
-        announced = sum(self._announced().get(topic, 0) for topic in topics)
-        if self.lost and announced > n_read:
-            self._lost['messages that the metadata announce and the files do not hold'] = (
-                announced - n_read
-            )
+        announced_counts = self._announced_counts()
+        n_missing = sum(announced_counts.get(topic, 0) for topic in topics) - n_read
+        if self.lost and n_missing > 0:
+            reason = 'messages that the metadata announce and the files do not hold'
+            self._lost[reason] = n_missing
 
-    def _entry(self, topic):
-        entries = [
-            entry['topic_metadata'] for entry in self.metadata.get('topics_with_message_count', ())
-        ]
-        return next((entry for entry in entries if entry['name'] == topic), {})
+    def _entry(self, topic: str) -> dict[str, Any]:
+        """Return the description of a topic in the metadata, {} without one."""
+        for entry in self.metadata.get('topics_with_message_count', ()):
+            if entry['topic_metadata']['name'] == topic:
+                return entry['topic_metadata']
+        return {}
 
     def close(self) -> None:
         """Close the files and remove decompressed copies."""
@@ -206,24 +216,21 @@ class Rosbag2:
         if self.folder:
             shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _storage_paths(self):
+    def _storage_paths(self) -> list[Path]:
+        """Return the storage files in the order of recording."""
         if not self.path.is_dir():
             return [self.path]
         if self.metadata.get('relative_file_paths'):
             names = [PurePath(name).name for name in self.metadata['relative_file_paths']]
             return [self.path / name for name in dict.fromkeys(names)]
-        return sorted(
-            (path for path in self.path.iterdir() if _storage_suffix(path) in suffixes()),
-            key=_natural,
-        )
+        paths = [path for path in self.path.iterdir() if _storage_suffix(path) in suffixes()]
+        return sorted(paths, key=_natural)
 
-    def _open(self, path, unpack):
-        """Open one storage file; return the error when that fails."""
+    def _open(self, path: Path, unpack: Callable[[bytes], bytes] | None) -> str | None:
+        """Open one storage file; return the error when that fails. `unpack`: for each message."""
         try:
-            reader = next(
-                (storage.reader for storage in STORAGES if storage.suffix == _storage_suffix(path)),
-                None,
-            )
+            readers = {storage.suffix: storage.reader for storage in STORAGES}
+            reader = readers.get(_storage_suffix(path))
             if reader is None:
                 raise ValueError(
                     f'a storage file must end in {", ".join(suffixes())}, with'
@@ -241,7 +248,8 @@ class Rosbag2:
             return f'{path.name}: {error}'
         return None
 
-    def _decompressed(self, path):
+    def _decompressed(self, path: Path) -> Path:
+        """Decompress a file into the temporary folder; return the copy."""
         self.folder = self.folder or mkdtemp(prefix='imu_calibration_')
         target = Path(self.folder, path.stem)
         error = decompress_file(path, target)
@@ -249,14 +257,18 @@ class Rosbag2:
             self._lost[f'end of {path.name} ({error})'] = 1
         return target
 
-    def _announced(self):
+    def _announced_counts(self) -> dict[str, int]:
+        """Return topic -> messages by the metadata; {} without metadata."""
         return {
             entry['topic_metadata']['name']: entry['message_count']
             for entry in self.metadata.get('topics_with_message_count', ())
         }
 
-    def _counts(self):
-        counts = self._announced() or sum((Counter(file.count()) for file in self.files), Counter())
+    def _counts(self) -> dict[str, int]:
+        """Return topic -> messages by the metadata, without them by the files."""
+        counts = self._announced_counts()
+        if not counts:
+            counts = sum((Counter(file.count()) for file in self.files), Counter())
         return {name: counts.get(name, 0) for name in self.types}
 
 
@@ -291,10 +303,11 @@ def _information(content: str) -> dict[str, Any]:
     return information
 
 
-def _storage_suffix(path):
+def _storage_suffix(path: Path) -> str:
+    """Return the suffix of a storage file without that of its compression."""
     return Path(path.stem).suffix if path.suffix in COMPRESSED else path.suffix
 
 
-def _natural(path):
+def _natural(path: Path) -> list[int | str]:
     """Sort key that places bag_10 after bag_9."""
     return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]

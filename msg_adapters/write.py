@@ -1,7 +1,9 @@
 """Messages from samples, and bags of a session."""
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from os import PathLike
 from typing import Any
 
@@ -64,14 +66,17 @@ def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarra
     With an empty sequence of velocities when these are left out.
     """
     count = struct.pack('<I', len(joints.names))
+    no_items = bytes(4)  # count of an empty sequence
     # Joined once: a sum that grows by each of many names needs quadratic time.
     names = [_padded(_string(name), 4) for name in joints.names]
     head = b''.join([_padded(_string(''), 4), count, *names])
-    velocity = [count + bytes(4), joints.velocity] if with_velocity and joints.names else [bytes(4)]
+    velocity = [no_items]
+    if with_velocity and joints.names:
+        velocity = [count + bytes(4), joints.velocity]  # doubles are aligned to 8 bytes
     return _table(
         joints.stamp_ns,
         _padded(head + count, 8 if joints.names else 4),
-        [joints.position, *velocity, bytes(4)],
+        [joints.position, *velocity, no_items],
     )
 
 
@@ -82,36 +87,37 @@ def encode_temperature(temperature: TemperatureSamples) -> np.ndarray:
     return _table(temperature.stamp_ns, frame_head(''), [doubles])
 
 
-def _string(text):
+def _string(text: str) -> bytes:
+    """Return a string in CDR: its length with the closing zero, then its bytes."""
     data = text.encode() + b'\0'
     return struct.pack('<I', len(data)) + data
 
 
-def _padded(data, size):
+def _padded(data: bytes, size: int) -> bytes:
     """Pad bytes that follow the 8 bytes of a stamp, so that their end is aligned."""
     return data + bytes(-len(data) % size)
 
 
-def _table(stamp_ns, head, pieces):
+def _table(stamp_ns: np.ndarray, head: bytes, pieces: Sequence[bytes | np.ndarray]) -> np.ndarray:
     """
-    Lay encapsulation, stamp, `head` and the pieces side by side.
+    Return one message per row, uint8: encapsulation, stamp, `head` and the pieces.
 
-    The pieces are constant bytes, or doubles per row.
+    A piece is the same bytes for all rows, or the doubles of each row, shape (n, count).
     """
     n = len(stamp_ns)
     stamps = np.empty((n, 2), dtype='<i4')
     stamps[:, 0], stamps[:, 1] = np.divmod(np.asarray(stamp_ns, dtype=np.int64), NS_PER_S)
     columns = [_constant(b'\0\x01\0\0', n), stamps.view(np.uint8), _constant(head, n)]
     for piece in pieces:
-        columns.append(
-            _constant(piece, n)
-            if isinstance(piece, bytes)
-            else np.ascontiguousarray(piece, dtype='<f8').view(np.uint8)
-        )
+        if isinstance(piece, bytes):
+            columns.append(_constant(piece, n))
+        else:
+            columns.append(np.ascontiguousarray(piece, dtype='<f8').view(np.uint8))
     return np.concatenate(columns, axis=1)
 
 
-def _constant(data, n):
+def _constant(data: bytes, n: int) -> np.ndarray:
+    """Return the same bytes in each of n rows, uint8, shape (n, n_bytes)."""
     return np.broadcast_to(np.frombuffer(data, dtype=np.uint8), (n, len(data)))
 
 
@@ -159,36 +165,22 @@ def write_session(
         When `path` exists already or cannot be written.
 
     """
-    streams: list[tuple[str, str, Any, Callable]] = [
-        (
-            imu_topic,
-            IMU_TYPE,
-            imu,
-            lambda part: encode_imu(part, force_cov=force_cov, rate_cov=rate_cov),
-        )
-    ]
+    encode = partial(encode_imu, force_cov=force_cov, rate_cov=rate_cov)
+    streams = [_Stream(imu_topic, IMU_TYPE, imu, encode)]
     if joints is not None:
-        keep_velocity = not np.isnan(joints.velocity).all()
-        streams.append(
-            (
-                joint_topic,
-                JOINT_STATE_TYPE,
-                joints,
-                lambda part: encode_joints(part, with_velocity=keep_velocity),
-            )
-        )
+        has_velocity = not np.isnan(joints.velocity).all()
+        encode = partial(encode_joints, with_velocity=has_velocity)
+        streams.append(_Stream(joint_topic, JOINT_STATE_TYPE, joints, encode))
     if temperature is not None:
-        streams.append((temperature_topic, TEMPERATURE_TYPE, temperature, encode_temperature))
+        streams.append(
+            _Stream(temperature_topic, TEMPERATURE_TYPE, temperature, encode_temperature)
+        )
     with BagWriter(path, storage, **options) as bag:
-        ids = [
-            bag.add_topic(name, standard_definition(message_type))
-            for name, message_type, _, _ in streams
-        ]
-        received = [np.maximum.accumulate(samples.stamp_ns) for _, _, samples, _ in streams]
-        for parts in _merged(received):
-            _write_batch(
-                bag, ids, received, [(samples, encode) for _, _, samples, encode in streams], parts
-            )
+        topic_ids = []
+        for stream in streams:
+            topic_ids.append(bag.add_topic(stream.topic, standard_definition(stream.message_type)))
+        for parts in _batches([stream.received_ns for stream in streams]):
+            _write_batch(bag, streams, topic_ids, parts)
 
 
 def write_trajectories(
@@ -216,31 +208,52 @@ def write_trajectories(
         )
 
 
-def _merged(received):
-    """Cut the merged streams into batches; yield for each stream its slice of a batch."""
-    everything = np.sort(np.concatenate(received), kind='stable')
-    limits = [*everything[WRITE_BATCH::WRITE_BATCH], None]
-    starts = [0] * len(received)
-    for limit in limits:
-        ends = [
-            len(times) if limit is None else int(np.searchsorted(times, limit))
-            for times in received
-        ]
+@dataclass(frozen=True, eq=False)
+class _Stream:
+    """Samples of one topic of a session."""
+
+    topic: str
+    message_type: str
+    samples: Any
+    encode: Callable[[Any], np.ndarray]
+    """Samples -> one message per row, uint8."""
+
+    @cached_property
+    def received_ns(self) -> np.ndarray:
+        """Receive times, ascending, int64, shape (n,)."""
+        return np.maximum.accumulate(self.samples.stamp_ns)
+
+
+def _batches(received_ns: Sequence[np.ndarray]) -> Iterator[list[slice]]:
+    """
+    Yield the slice of each stream for consecutive intervals of time.
+
+    An interval has about `WRITE_BATCH` messages of all streams. `received_ns`: ascending times of
+    each stream.
+    """
+    all_times = np.sort(np.concatenate(received_ns), kind='stable')
+    starts = [0] * len(received_ns)
+    for limit in all_times[WRITE_BATCH::WRITE_BATCH]:
+        ends = [int(np.searchsorted(times, limit)) for times in received_ns]
         yield [slice(start, end) for start, end in zip(starts, ends, strict=True)]
         starts = ends
+    yield [slice(start, len(times)) for start, times in zip(starts, received_ns, strict=True)]
 
 
-def _write_batch(bag, ids, received, streams, parts):
-    times = np.concatenate([times[part] for times, part in zip(received, parts, strict=True)])
-    topic_ids = np.concatenate(
-        [np.full(part.stop - part.start, topic) for topic, part in zip(ids, parts, strict=True)]
-    )
-    tables = [
-        encode(samples.select(part)) for (samples, encode), part in zip(streams, parts, strict=True)
-    ]
-    order = np.argsort(times, kind='stable')
-    bag.write(
-        topic_ids[order],
-        times[order],
-        Packed.chain([Packed.of_rows(table) for table in tables]).select(order),
-    )
+def _write_batch(
+    bag: BagWriter,
+    streams: Sequence[_Stream],
+    topic_ids: Sequence[int],
+    parts: Sequence[slice],
+) -> None:
+    """Write one slice of each stream, in the order of the receive times."""
+    times = []
+    ids = []
+    messages = []
+    for stream, topic_id, part in zip(streams, topic_ids, parts, strict=True):
+        times.append(stream.received_ns[part])
+        ids.append(np.full(part.stop - part.start, topic_id))
+        messages.append(Packed.of_rows(stream.encode(stream.samples.select(part))))
+    received_ns = np.concatenate(times)
+    order = np.argsort(received_ns, kind='stable')
+    bag.write(np.concatenate(ids)[order], received_ns[order], Packed.chain(messages).select(order))
