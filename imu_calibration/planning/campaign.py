@@ -13,6 +13,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD, tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits
 from imu_calibration.kinematics.table import Table
@@ -68,6 +69,7 @@ def make_separator(
         When the calibration lacks the first cause, or a motion cannot show one of them.
 
     """
+    # The model with all causes, at the values of the calibration.
     first, *mates = causes
     if first not in calibration.model.slices:
         raise InputError(
@@ -89,16 +91,14 @@ def make_separator(
     values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
     problem = PlanningProblem(MotionLibrary(table, limits), coordinates, dict(noise), rate=rate)
-    questions = len(model.catalogue.effects(model.joint_names))
-    problem.goal = ToldApart(
-        coordinates, suspected(problem, causes, table, sizes=sizes or {}), questions
-    )
-    names = {
-        name: k
-        for k, name in enumerate(calibration.param_names)
-        if k not in _indices(calibration.model, first)
-    }
-    problem.known = coordinates.information_from(names, calibration.covariance)
+    n_candidates = len(model.catalogue.effects(model.joint_names))
+    collinear = suspected(problem, causes, table, sizes=sizes or {})
+    problem.goal = ToldApart(coordinates, collinear, n_candidates)
+    # Without the first cause, because its estimate assumes that it is the true one.
+    rows = {name: k for k, name in enumerate(calibration.param_names)}
+    for k in _indices(calibration.model, first):
+        del rows[calibration.param_names[k]]
+    problem.known_information = coordinates.information_from(rows, calibration.covariance)
     return Planner(problem)
 
 
@@ -112,69 +112,71 @@ def suspected(
     """
     Return the causes with their sizes.
 
-    The first as estimated, the mates with the size that imitates it.
-
-    If `sizes` lacks a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra]
-    theta_a``, M the information of a usual session, r the baseline.
+    The first with its value in the model; the other ones with the values of `sizes` (parameter ->
+    SI), without which with the size that imitates the first one (`_imitating_sizes`).
     """
     coordinates = problem.coordinates
-    found = []
+    names = coordinates.model.param_names
+    effects = []
     for key in causes:
-        places = _indices(coordinates.model, key)
-        names = coordinates.model.param_names
-        known = (
-            coordinates.values[places]
-            if not found
-            else [sizes.get(names[k], np.nan) for k in places]
-        )
-        found.append(
-            CollinearEffect(
-                key, _places(coordinates, key), np.asarray(known, float) / coordinates.units[places]
-            )
-        )
-    unknown = [cause for cause in found if np.isnan(cause.size).any()]
-    passing = _imitating(problem, found, unknown, table) if unknown else {}
-    return [replace(cause, size=passing.get(cause.key, cause.size)) for cause in found]
+        parameters = _indices(coordinates.model, key)
+        if not effects:
+            values = coordinates.values[parameters]
+        else:
+            values = np.array([sizes.get(names[k], np.nan) for k in parameters], float)
+        size = values / coordinates.units[parameters]
+        effects.append(CollinearEffect(key, _places(coordinates, key), size))
+    unknown = [effect for effect in effects if np.isnan(effect.size).any()]
+    if not unknown:
+        return effects
+    imitating = _imitating_sizes(problem, effects, unknown, table)
+    return [replace(effect, size=imitating.get(effect.key, effect.size)) for effect in effects]
 
 
-def _imitating(problem, causes, unknown, table):
+def _imitating_sizes(
+    problem: PlanningProblem,
+    effects: Sequence[CollinearEffect],
+    unknown: Sequence[CollinearEffect],
+    table: Table,
+) -> dict[tuple[str, str], np.ndarray]:
     """
-    Return the sizes that causes must have to pass for the first one on a usual session, by key.
+    Return key -> size of each effect b of `unknown` that imitates the first of `effects`, a.
+
+    The estimate of b on a usual session with a as the true cause and b in the model::
+
+        theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a
+
+    with M the information of the session and r the baseline, which has none of the `effects`.
     """
     windows = problem.predictor.predict([make_profile(SESSION, 0, table).segments])[0]
     times = np.array([window.middle for window in windows])
     information = problem.coordinates.prior_information + exact_information(
         windows, times, problem.noise
     )
-    first = causes[0]
-    found = {}
-    rest = np.setdiff1d(
-        np.arange(len(information)), np.concatenate([cause.places for cause in causes])
-    )
-    inner = np.linalg.inv(information[np.ix_(rest, rest)])
-    for cause in unknown:
-        across = information[np.ix_(cause.places, rest)] @ inner
-        bb = (
-            information[np.ix_(cause.places, cause.places)]
-            - across @ information[np.ix_(rest, cause.places)]
-        )
-        ba = (
-            information[np.ix_(cause.places, first.places)]
-            - across @ information[np.ix_(rest, first.places)]
-        )
-        found[cause.key] = np.linalg.solve(bb, ba @ first.size)
-    return found
+    a = effects[0].places
+    all_places = np.concatenate([effect.places for effect in effects])
+    r = np.setdiff1d(np.arange(len(information)), all_places)
+    inverse_rr = np.linalg.inv(information[np.ix_(r, r)])
+    sizes = {}
+    for effect in unknown:
+        b = effect.places
+        regression = information[np.ix_(b, r)] @ inverse_rr
+        reduced_bb = information[np.ix_(b, b)] - regression @ information[np.ix_(r, b)]
+        reduced_ba = information[np.ix_(b, a)] - regression @ information[np.ix_(r, a)]
+        sizes[effect.key] = np.linalg.solve(reduced_bb, reduced_ba @ effects[0].size)
+    return sizes
 
 
-def _indices(model, key):
+def _indices(model: SensorModel, key: tuple[str, str]) -> np.ndarray:
+    """Return the indexes of the parameters of an effect in its model."""
     part = model.slices[key]
     return np.arange(part.start, part.stop)
 
 
-def _places(coordinates, key):
-    return np.array(
-        [int(np.argmax(np.abs(coordinates.basis[k]))) for k in _indices(coordinates.model, key)]
-    )
+def _places(coordinates: Coordinates, key: tuple[str, str]) -> np.ndarray:
+    """Return the coordinate z of each parameter of an effect."""
+    basis = coordinates.basis[_indices(coordinates.model, key)]
+    return np.argmax(np.abs(basis), axis=1)
 
 
 TIME_OVER = 'the time given is over'
@@ -183,8 +185,8 @@ STALL_MOTIONS = 6
 """Motions after which the standard deviations must have decreased."""
 MAX_REMAINING_SHARE = 0.93
 """
-Largest share of the logarithms of excess over tolerance that may remain after them; otherwise
-further motions do not pay.
+Largest share of the distance to the tolerances that may remain after them; otherwise further
+motions do not pay.
 """
 
 
@@ -256,14 +258,19 @@ class Campaign:
         self._make_separator = make_separator
         self._unwind = unwind
         self._first: Callable[[np.ndarray], Any] | None = first
+        """None after the first decision."""
         self._separator: Planner | None = None
+        """Planner of the present separating motions; None while there are none."""
         self.findings: list[Suspect] | None = None
         """Findings of the last diagnosis, the strongest first; None before the first diagnosis."""
         self.separations = 0
+        """Number of separations that were begun."""
         self.told_apart: tuple[str, ...] = ()
         """The collinear class of the last separating motion."""
-        self._is_asked = False
-        self._left: list[float] = []
+        self._is_diagnosed = False
+        """Whether a diagnosis was made since the last motion."""
+        self._distances: list[float] = []
+        """Distance to the tolerances after each calibration, sum of ln(sd / tolerance) above 0."""
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -276,9 +283,8 @@ class Campaign:
     def take(self, calibration: Any) -> None:
         """Replace the predicted information by that measured in the motions so far."""
         self.planner.take(calibration)
-        self._left.append(
-            sum(max(math.log(excess), 0.0) for excess in self.planner.excess.values() if excess > 0)
-        )
+        excess = self.planner.excess.values()
+        self._distances.append(sum(max(math.log(ratio), 0.0) for ratio in excess if ratio > 0))
 
     def take_findings(self, findings: list[Suspect] | None) -> str:
         """
@@ -286,27 +292,27 @@ class Campaign:
 
         Return the resulting action as text, '' for none.
         """
-        self._is_asked = True
-        self.findings = self.findings if findings is None else findings
-        for finding in findings or []:
-            if (
-                finding.mates
-                and self.separations < self.settings.separations
-                and self._make_separator is not None
-            ):
-                what = (
-                    f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion'
-                    ' so far'
-                )
-                try:
-                    self._separator = self._make_separator(finding)
-                except ImuCalibrationError as error:
-                    return f'{what}, and no motion is known that separates them: {error}'
-                self.separations += 1
-                self.told_apart = (finding.effect, *finding.mates)
-                self._left.clear()
-                return f'{what}: planning the motion that separates them'
-        return ''
+        self._is_diagnosed = True
+        if findings is None:
+            return ''
+        self.findings = findings
+        if self.separations >= self.settings.separations or self._make_separator is None:
+            return ''
+        # The strongest finding with a collinear effect.
+        finding = next((each for each in findings if each.mates), None)
+        if finding is None:
+            return ''
+        reason = (
+            f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion so far'
+        )
+        try:
+            self._separator = self._make_separator(finding)
+        except ImuCalibrationError as error:
+            return f'{reason}, and no motion is known that separates them: {error}'
+        self.separations += 1
+        self.told_apart = (finding.effect, *finding.mates)
+        self._distances.clear()
+        return f'{reason}: planning the motion that separates them'
 
     @property
     def is_separating(self) -> bool:
@@ -325,71 +331,79 @@ class Campaign:
             Seconds since the first motion began.
 
         """
-        first, self._first = self._first, None
-        if first is not None and (motion := first(position)) is not None:
-            return Decision(motion, 'the first motion is small and slow')
+        if self._first is not None:
+            first = self._first
+            self._first = None
+            motion = first(position)
+            if motion is not None:
+                return Decision(motion, 'the first motion is small and slow')
         decision = self._decide(position, elapsed)
-        if (
-            decision.motion is None
-            and not decision.diagnose
-            and (motion := self._unwind(position)) is not None
-        ):
-            return Decision(motion, f'{decision.why}; before the end, endless joints are unwound')
+        is_end = decision.motion is None and not decision.diagnose
+        if is_end:
+            motion = self._unwind(position)
+            if motion is not None:
+                why = f'{decision.why}; before the end, endless joints are unwound'
+                return Decision(motion, why)
         return decision
 
-    def _decide(self, position, elapsed):
+    def _decide(self, position: np.ndarray, elapsed: float) -> Decision:
+        """Return the next decision, without the first motion and the unwinding."""
         if elapsed >= self.settings.time_limit:
             return Decision(why=f'{TIME_OVER}{self._outside()}')
-        step = None if self._separator is None else self._separator.next_motion(position)
-        # Predicted only: a calibration has no information on causes that its model lacks.
-        if step is None or step.motion is None:
-            has_separated = self._separator is not None
-            self._separator = None
-            if has_separated:
+        if self._separator is not None:
+            # By prediction only: a calibration has no information on causes that its model lacks.
+            step = self._separator.next_motion(position)
+            if step.motion is None:
+                self._separator = None
                 return Decision(diagnose=True, why='the causes should be separable now')
-            if self._promises_in_vain:
-                return self._ending(IN_VAIN)
+        elif self._has_stalled:
+            return self._ending(IN_VAIN)
+        else:
             step = self.planner.next_motion(position)
-        if step.motion is not None and elapsed + step.seconds > self.settings.time_limit:
+            if step.motion is None:
+                return self._ending(step.why)
+        if elapsed + step.seconds > self.settings.time_limit:
             return Decision(
                 why=f'{TIME_OVER}: the next motion takes {step.seconds:.0f} s{self._outside()}'
             )
-        if step.motion is not None:
-            self._is_asked = False
-            return step
-        return self._ending(step.why)
+        self._is_diagnosed = False
+        return step
 
-    def _ending(self, reason):
-        if self.settings.separations and not self._is_asked:
+    def _ending(self, reason: str) -> Decision:
+        """Return the end for a reason, or the diagnosis that must precede it."""
+        if self.settings.separations and not self._is_diagnosed:
             return Decision(diagnose=True, why=reason)
-        return Decision(why=reason + self._outside() + self._named())
+        return Decision(why=reason + self._outside() + self._findings_text())
 
     @property
-    def _promises_in_vain(self):
+    def _has_stalled(self) -> bool:
         """Whether the last motions gave almost none of the predicted reduction."""
-        return (
-            len(self._left) > STALL_MOTIONS
-            and self._left[-1] > MAX_REMAINING_SHARE * self._left[-1 - STALL_MOTIONS] > 0
-        )
+        if len(self._distances) <= STALL_MOTIONS:
+            return False
+        earlier = self._distances[-1 - STALL_MOTIONS]
+        return self._distances[-1] > MAX_REMAINING_SHARE * earlier > 0
 
-    def _outside(self):
+    def _outside(self) -> str:
+        """Return the parameters outside their tolerance as the end of a sentence, '' for none."""
         missing = [name for name, excess in self.planner.excess.items() if excess > 1.0]
         if not missing:
             return ''
-        return f'; outside its tolerance: {", ".join(missing[:3])}' + (
-            f' and {len(missing) - 3} more' if missing[3:] else ''
-        )
+        text = f'; outside its tolerance: {", ".join(missing[:3])}'
+        if len(missing) > 3:
+            text += f' and {len(missing) - 3} more'
+        return text
 
-    def _named(self):
+    def _findings_text(self) -> str:
+        """Return the findings as the end of a sentence, '' for none."""
         if not self.findings:
             return ''
-        mates = [
-            f' (collinear with {", ".join(each.mates)})' if each.mates else ''
-            for each in self.findings
-        ]
-        return '; beyond bias and matrix there is ' + ', '.join(
-            each.effect + text for each, text in zip(self.findings, mates, strict=True)
-        )
+        texts = []
+        for finding in self.findings:
+            text = finding.effect
+            if finding.mates:
+                text += f' (collinear with {", ".join(finding.mates)})'
+            texts.append(text)
+        return f'; beyond bias and matrix there is {", ".join(texts)}'
 
 
 LONGEST_SEPARATION = 180.0
@@ -455,6 +469,9 @@ def with_suspect(
 ) -> Calibration:
     """
     Return the calibration with an effect at its estimated size; the other parameters do not change.
+
+    The covariance of the effect is that of its prior. `sizes`: parameter -> value, SI; 0 for a
+    parameter without one.
     """
     if cause in calibration.model.slices:
         return calibration
@@ -466,8 +483,8 @@ def with_suspect(
     covariance = np.diag(model.prior()[1] ** 2)
     status = [HELD] * len(values)
     covariance[np.ix_(places, places)] = calibration.covariance
-    for place, known in zip(places, calibration.status, strict=True):
-        status[place] = known
+    for place, parameter_status in zip(places, calibration.status, strict=True):
+        status[place] = parameter_status
     return replace(
         calibration,
         model=model.at(values),

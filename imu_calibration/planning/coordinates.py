@@ -30,6 +30,8 @@ class Coordinates:
     """
     A model at a point: ``values = point + units * (basis @ z)`` with z free of the gauge.
 
+    The gauge are directions of the parameters that no data determine.
+
     Parameters
     ----------
     model : SensorModel
@@ -45,6 +47,7 @@ class Coordinates:
     ):
         start = model.start() if values is None else np.asarray(values, float)
         self.values = np.where(np.isfinite(start), start, 0.0)
+        """The point, SI, shape (n_params,)."""
         self.model = model.at(self.values)
         self.tolerances = np.asarray(tolerances, float)
         # At a fixed point the derivative of a lag needs no columns for each arm: a third of the
@@ -52,20 +55,25 @@ class Coordinates:
         self.folded = replace(self.model, folded_arms=all_arms(self.model, self.values))
         prior = make_prior(model)
         self.prior_sd = prior.sd
+        """SI, shape (n_params,)."""
         self.wanted = model.requested & ~fixed_parameters(model)
+        """Whether each parameter must meet its tolerance, shape (n_params,)."""
         self.units = np.where(self.wanted, self.tolerances, prior.sd)
+        """Units of the parameters, SI, shape (n_params,)."""
         self.basis = _basis(prior.gauge * self.units)
-        own = self.basis / (model.prior()[1] / self.units)[:, None]
-        self.prior_information = own.T @ own
+        """Orthonormal columns, shape (n_params, n)."""
+        whitened_basis = self.basis / (model.prior()[1] / self.units)[:, None]
+        self.prior_information = whitened_basis.T @ whitened_basis
         """Of z, shape (n, n)."""
 
     def excess(self, covariance: np.ndarray) -> np.ndarray:
         """
-        Return the standard deviations of the requested parameters, in tolerances, shape (p,).
+        Return the standard deviations of the p requested parameters in tolerances, (..., p).
 
-        Leading axes are kept.
+        `covariance`: of z, shape (..., n, n).
         """
-        variance = np.einsum('pn,...nm,pm->...p', self.asked, covariance, self.asked, optimize=True)
+        rows = self.requested_rows
+        variance = np.einsum('pn,...nm,pm->...p', rows, covariance, rows, optimize=True)
         return np.sqrt(np.maximum(variance, 1e-300))
 
     @property
@@ -74,21 +82,18 @@ class Coordinates:
         return self.basis.shape[1]
 
     @cached_property
-    def asked(self) -> np.ndarray:
+    def requested_rows(self) -> np.ndarray:
         """Rows that map z to the requested parameters, in tolerances, shape (k, n)."""
         return self.basis[self.wanted]
 
     @cached_property
     def slopes(self) -> dict[str, np.ndarray]:
         """Sensor -> derivative of the coefficients of the columns by z, shape (n_columns, 3, n)."""
-        found = {}
+        slopes = {}
         for sensor in SENSORS:
-            found[sensor] = np.einsum(
-                'cap,pq->caq',
-                coefficient_jacobian(self.folded, sensor, self.values) * self.units,
-                self.basis,
-            )
-        return found
+            by_parameters = coefficient_jacobian(self.folded, sensor, self.values) * self.units
+            slopes[sensor] = np.einsum('cap,pq->caq', by_parameters, self.basis)
+        return slopes
 
     @property
     def names(self) -> list[str]:
@@ -97,13 +102,15 @@ class Coordinates:
 
     def sd(self, covariance: np.ndarray) -> np.ndarray:
         """Return standard deviations of all parameters, SI, from the covariance of z."""
-        return self.units * np.sqrt(
-            np.clip(np.einsum('pi,ij,pj->p', self.basis, covariance, self.basis), 0, None)
-        )
+        variance = np.einsum('pi,ij,pj->p', self.basis, covariance, self.basis)
+        return self.units * np.sqrt(np.clip(variance, 0, None))
 
     def information_from(self, names: Mapping[str, int], covariance: np.ndarray) -> np.ndarray:
         """
-        Return the information about z that a calibration holds beyond the prior, shape (n, n).
+        Return the information about z that a calibration adds to the prior, shape (n, n).
+
+        ``basis' C^-1 basis - prior_information``, with C the covariance in units, without negative
+        eigenvalues.
 
         Parameters
         ----------
@@ -113,41 +120,41 @@ class Coordinates:
             Of all its parameters, SI; parameters that this model lacks are averaged over.
 
         """
-        shared = [
-            (k, names[name]) for k, name in enumerate(self.model.param_names) if name in names
-        ]
-        if not shared:
-            return np.zeros((self.size,) * 2)
-        own, theirs = (np.array(part) for part in zip(*shared, strict=True))
-        scaled = covariance[np.ix_(theirs, theirs)] / np.outer(self.units[own], self.units[own])
-        basis = self.basis[own]
-        values, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
+        # Shared parameters: indexes in this model, and in the covariance.
+        shared = np.array(
+            [k for k, name in enumerate(self.model.param_names) if name in names], int
+        )
+        if not len(shared):
+            return np.zeros((self.size, self.size))
+        source = np.array([names[self.model.param_names[k]] for k in shared])
+        units = self.units[shared]
+        scaled = covariance[np.ix_(source, source)] / np.outer(units, units)
+        variances, directions = scipy.linalg.eigh((scaled + scaled.T) / 2)
         # Directions that the gauge fixes have no variance and no component in the basis;
         # KNOWN_SHARE is as good as certain.
-        rows = (vectors.T @ basis) / np.sqrt(
-            np.maximum(values, max(1e-13 * values.max(), KNOWN_SHARE**2))
-        )[:, None]
-        known = rows.T @ rows - self.prior_information
-        weights, directions = scipy.linalg.eigh((known + known.T) / 2)
+        least_variance = max(1e-13 * variances.max(), KNOWN_SHARE**2)
+        sd = np.sqrt(np.maximum(variances, least_variance))
+        rows = (directions.T @ self.basis[shared]) / sd[:, None]
+        added = rows.T @ rows - self.prior_information
+        weights, directions = scipy.linalg.eigh((added + added.T) / 2)
         return (directions * np.maximum(weights, 0.0)) @ directions.T
 
 
-def _basis(gauge):
+def _basis(gauge: np.ndarray) -> np.ndarray:
     """
-    Return orthonormal directions that a gauge leaves free.
+    Return orthonormal directions b of the parameters with ``gauge @ b = 0``, (n_params, n).
 
-    Unaffected parameters are separate coordinates.
+    `gauge`: shape (n_rows, n_params). A parameter without an element in it is a coordinate by
+    itself; these coordinates are the first ones.
     """
-    concerned = np.any(gauge != 0, axis=0)
-    inner = (
-        scipy.linalg.null_space(gauge[:, concerned] / np.abs(gauge).max())
-        if concerned.any()
-        else np.zeros((0, 0))
-    )
-    free = np.flatnonzero(~concerned)
-    basis = np.zeros((len(concerned), len(free) + inner.shape[1]))
+    in_gauge = np.any(gauge != 0, axis=0)
+    null_space = np.zeros((0, 0))
+    if in_gauge.any():
+        null_space = scipy.linalg.null_space(gauge[:, in_gauge] / np.abs(gauge).max())
+    free = np.flatnonzero(~in_gauge)
+    basis = np.zeros((len(in_gauge), len(free) + null_space.shape[1]))
     basis[free, np.arange(len(free))] = 1.0
-    basis[np.ix_(concerned, len(free) + np.arange(inner.shape[1]))] = inner
+    basis[np.ix_(in_gauge, len(free) + np.arange(null_space.shape[1]))] = null_space
     return basis
 
 
@@ -163,24 +170,26 @@ class WithinTolerances:
     """
 
     words = ''
+    """Causes that are to be separated, as text: none."""
 
     def __init__(self, coordinates: Coordinates, weights: np.ndarray | float = 1.0):
-        self.coordinates, self.weights = coordinates, weights
+        self.coordinates = coordinates
+        self.weights = weights
 
-    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
-        """Return the weighted sum of the logarithms of the excess."""
-        return (
-            self.weights * np.maximum(np.log(margin * self.coordinates.excess(covariance)), 0.0)
-        ).sum(axis=1)
+    def distance(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
+        """
+        Return the distance to the goal for covariances of z, (k, n, n); 0 where it is reached.
+
+        The weighted sum of the logarithms of the excess; `margin` is a factor on the sd.
+        """
+        log_excess = np.log(margin * self.coordinates.excess(covariance))
+        return (self.weights * np.maximum(log_excess, 0.0)).sum(axis=1)
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
-        """Return the parameters outside their tolerance."""
+        """Return the parameters outside their tolerance, for one covariance of z, (n, n)."""
         excess = self.coordinates.excess(covariance)
-        return tuple(
-            name
-            for name, ratio in zip(self.coordinates.names, excess, strict=True)
-            if ratio > 1.0 + 1e-6
-        )
+        names = zip(self.coordinates.names, excess, strict=True)
+        return tuple(name for name, ratio in names if ratio > 1.0 + 1e-6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +206,12 @@ class CollinearEffect:
 
 class ToldApart:
     """
-    Each cause of a class with its assumed size.
+    Each cause of a collinear class is separated from each other one.
 
-    With another member of the class in the model instead.
-
-    The noncentrality of cause a with cause b is ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra]
-    theta_a`` with r the baseline and b (Atkinson and Fedorov 1975); other members of the class are
-    omitted. A pair is separated when both noncentralities suffice.
+    If a is the true cause, with its assumed size theta_a, and the model has b in its place, the
+    test of a has the noncentrality ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra] theta_a`` with M
+    the information and r the baseline and b (Atkinson and Fedorov 1975); other members of the class
+    are omitted. A pair is separated when both noncentralities suffice.
 
     Parameters
     ----------
@@ -219,8 +227,14 @@ class ToldApart:
         self.coordinates = coordinates
         self.causes = tuple(causes)
         self.pairs = list(permutations(self.causes, 2))
+        """(true cause, cause in the model), each pair in both orders."""
         self.words = ' and '.join(cause.key[1] for cause in causes)
-        self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
+        """Causes that are to be separated, as text."""
+        self.sufficient = {
+            cause.key: sufficient_noncentrality(len(cause.places), questions)
+            for cause in self.causes
+        }
+        """Key of the true cause -> noncentrality that suffices."""
         self.reachable = np.ones(len(self.pairs), bool)
         """
         Pairs that some motion separates: no time is planned for the remaining pairs, which are
@@ -228,34 +242,41 @@ class ToldApart:
         """
 
     def noncentrality(self, covariance: np.ndarray) -> np.ndarray:
-        """Return lambda of each pair in units of the sufficient value, shape (k, n_pairs)."""
-        found = np.empty((len(covariance), len(self.pairs)))
+        """
+        Return lambda of each pair in units of the sufficient value, shape (k, n_pairs).
+
+        `covariance`: of z with all causes, shape (k, n, n). Omitting causes is conditioning on
+        them, and ``[M_aa - M_ar M_rr^-1 M_ra]`` is the inverse of the conditional covariance of a.
+        """
+        ratios = np.empty((len(covariance), len(self.pairs)))
         prior = self.coordinates.prior_information
         for number, (a, b) in enumerate(self.pairs):
-            others = [cause.places for cause in self.causes if cause is not a and cause is not b]
-            out = np.concatenate(others) if others else np.zeros(0, int)
-            own = covariance[:, a.places[:, None], a.places]
-            if len(out):
-                cross = covariance[:, a.places[:, None], out]
-                own = own - cross @ np.linalg.solve(
-                    covariance[:, out[:, None], out], cross.transpose(0, 2, 1)
+            omitted = np.zeros(0, int)
+            for cause in self.causes:
+                if cause is not a and cause is not b:
+                    omitted = np.concatenate([omitted, cause.places])
+            conditional = covariance[:, a.places[:, None], a.places]
+            if len(omitted):
+                cross = covariance[:, a.places[:, None], omitted]
+                conditional = conditional - cross @ np.linalg.solve(
+                    covariance[:, omitted[:, None], omitted], cross.transpose(0, 2, 1)
                 )
-            information = np.linalg.inv(own) - prior[np.ix_(a.places, a.places)]
-            found[:, number] = (
-                np.einsum('i,kij,j->k', a.size, information, a.size) / self.enough[a.key]
-            )
-        return np.maximum(found, 1e-12)
+            # Only the information of the motions, without that of the prior.
+            information = np.linalg.inv(conditional) - prior[np.ix_(a.places, a.places)]
+            noncentrality = np.einsum('i,kij,j->k', a.size, information, a.size)
+            ratios[:, number] = noncentrality / self.sufficient[a.key]
+        return np.maximum(ratios, 1e-12)
 
-    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
+    def distance(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
         """
-        Return half the sum of the logarithms of the shortfall of separable pairs.
+        Return the distance to the goal for covariances of z, (k, n, n); 0 where it is reached.
 
-        The worst is weighted three times.
+        Half the sum of the logarithms of (sufficient / present noncentrality) of the reachable
+        pairs, with the worst weighted three times; `margin` is a factor on the sd.
         """
-        lacking = np.maximum(
-            -0.5 * np.log(self.noncentrality(covariance)[:, self.reachable] / margin**2), 0.0
-        )
-        return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1, initial=0.0)
+        ratios = self.noncentrality(covariance)[:, self.reachable]
+        shortfall = np.maximum(-0.5 * np.log(ratios / margin**2), 0.0)
+        return shortfall.sum(axis=1) + 2.0 * shortfall.max(axis=1, initial=0.0)
 
     def leave_out_of_reach(self, covariance: np.ndarray) -> None:
         """
@@ -263,49 +284,48 @@ class ToldApart:
 
         The covariance is a lower bound of all plans.
         """
-        enough_left = self.noncentrality(covariance[None])[0] >= 1.0
-        apart = set()
-        for (a, b), reached in zip(self.pairs, enough_left, strict=True):
-            if reached:
-                apart.add((a.key, b.key))
+        separable = set()
+        ratios = self.noncentrality(covariance[None])[0]
+        for (a, b), ratio in zip(self.pairs, ratios, strict=True):
+            if ratio >= 1.0:
+                separable.add((a.key, b.key))
         self.reachable = np.array(
-            [(a.key, b.key) in apart and (b.key, a.key) in apart for a, b in self.pairs]
+            [(a.key, b.key) in separable and (b.key, a.key) in separable for a, b in self.pairs]
         )
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
-        """Return the pairs that would not be separated."""
-        found = self.noncentrality(covariance[None])[0]
-        return tuple(
-            dict.fromkeys(
-                ' and '.join(sorted((a.key[1], b.key[1])))
-                for (a, b), value in zip(self.pairs, found, strict=True)
-                if value < 1.0
-            )
-        )
+        """Return the pairs that would not be separated, for one covariance of z, (n, n)."""
+        missing = []
+        ratios = self.noncentrality(covariance[None])[0]
+        for (a, b), ratio in zip(self.pairs, ratios, strict=True):
+            pair = ' and '.join(sorted((a.key[1], b.key[1])))
+            if ratio < 1.0 and pair not in missing:
+                missing.append(pair)
+        return tuple(missing)
 
 
 Goal = WithinTolerances | ToldApart
 """Requirement on the covariance of z."""
 
 
-def enough(size: int, questions: int) -> float:
+def sufficient_noncentrality(size: int, questions: int) -> float:
     """
-    Return the noncentrality that identifies and prefers an effect.
+    Return the noncentrality with which an effect is found and preferred to another one.
 
-    The effect has this number of parameters and is identified and preferred with
-    SEPARATION_PROBABILITY.
-
-    Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two
-    models of which one is right the logarithm of the likelihood ratio is normal with mean ``lambda
-    / 2`` and variance ``lambda``; it must exceed the search's TIE.
+    Each with SEPARATION_PROBABILITY. Found: its chi-square with `size` parameters exceeds the
+    threshold of a search among `questions` effects. Preferred: of two models of which one is right
+    the logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance
+    ``lambda``; it must exceed the search's TIE.
     """
     from scipy.stats import ncx2  # here, because its import is slow
 
     threshold = chi2_isf(FAMILY_WISE / questions, size)
-    named = next(
+    to_be_found = next(
         value
         for value in np.geomspace(1.0, 1e4, 2000)
         if ncx2.sf(threshold, size, value) >= SEPARATION_PROBABILITY
     )
+    # lambda / 2 - quantile sqrt(lambda) = TIE
     quantile = ndtri(SEPARATION_PROBABILITY)
-    return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE)) ** 2))
+    to_be_preferred = (quantile + np.sqrt(quantile**2 + 2 * TIE)) ** 2
+    return float(max(to_be_found, to_be_preferred))

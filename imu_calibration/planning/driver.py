@@ -145,19 +145,32 @@ class Driver:
         self.change(settings)
         self.state = DriveState.IDLE
         self.reason = 'no motion before start'
+        """Cause of the state, or the motion that is made, as text."""
         self.motions = 0
+        """Motions that were begun."""
         self.position: np.ndarray | None = None
         """Where the joints were seen last."""
         self.ignored: dict[str, int] = {}
         """Joint -> number of joint states that were ignored because its position was not finite."""
+        # Times of the joints are by their stamps, "steady" ones by the clock of this process; s.
         self._time = 0.0
+        """Stamp of the last joint state."""
         self._heard = -np.inf
+        """Steady time of the last joint state."""
         self._advanced = -np.inf
+        """Steady time of the last joint state with another stamp than the one before."""
         self._watch: PathWatch | None = None
+        """Progress along the present trajectory; None without one."""
         self._rested_at: np.ndarray | None = None
-        self._rested_since = self._settling_since = 0.0
+        """Position near which the joints rest since `_rested_since`; None: not known."""
+        self._rested_since = 0.0
+        """Stamp since which the joints rest."""
+        self._settling_since = 0.0
+        """Stamp at which the joints reached the end of the trajectory."""
         self._stopped: tuple[float, float] | None = None
+        """(stamp, steady time) of the last stop in mid-motion; None without one."""
         self._slow = True
+        """Whether the next motion is slow, because none larger than `first_reach` was made."""
 
     def change(self, settings: DriverSettings) -> None:
         """Use other settings from now on; speed and tolerances from the next motion on."""
@@ -200,10 +213,8 @@ class Driver:
         """
         if self._stopped is None:
             return False
-        return (
-            min(self._time - self._stopped[0], self._heard - self._stopped[1])
-            < self.settings.stall_patience
-        )
+        seconds = min(self._time - self._stopped[0], self._heard - self._stopped[1])
+        return seconds < self.settings.stall_patience
 
     def is_silent(self, now: float) -> bool:
         """Whether the time since the last joint state exceeds `silence`, by a steady clock."""
@@ -211,9 +222,7 @@ class Driver:
 
     def stamp_fault(self, now: float) -> str:
         """
-        Return a line if joint states arrive with unchanged stamps, '' otherwise.
-
-        The stamps have not changed for `silence`.
+        Return a line if joint states arrive whose stamps have not changed for `silence`, else ''.
         """
         constant = self._heard - self._advanced
         if self.is_silent(now) or not constant > self.settings.silence:
@@ -259,34 +268,29 @@ class Driver:
                 ' when they rest',
                 code='joints_moving',
             )
-        points = points.ordered(self.joint_names).slowed(
-            self.settings.first_speed if self._slow else 1.0
-        )
+        speed_share = self.settings.first_speed if self._slow else 1.0
+        points = points.ordered(self.joint_names).slowed(speed_share)
         self._require_within_limits(points)
-        is_small = np.all(
-            np.abs(points.position - self.position)
-            <= self.first_reach + MAX_REST_MOVEMENT * self.tolerance
-        )
-        self._watch, self._slow = (
-            PathWatch(self.position, points, self.tolerance),
-            self._slow and bool(is_small),
-        )
+        small_excursion = self.first_reach + MAX_REST_MOVEMENT * self.tolerance
+        is_small = np.all(np.abs(points.position - self.position) <= small_excursion)
+        self._watch = PathWatch(self.position, points, self.tolerance)
+        # Motions are slow up to and including the first one that is larger.
+        self._slow = self._slow and bool(is_small)
         self.motions += 1
         self._become(DriveState.MOVING, words)
         return points
 
-    def _require_within_limits(self, points):
+    def _require_within_limits(self, points: TrajectoryPoints) -> None:
+        """Raise InputError for a trajectory beyond a limit, or without accelerations."""
         assert self.position is not None
         path = trajectory_from(rest_at(self.position[None]), points)
         beyond, speed, acceleration = limit_excess(path, self.limits)
-        # A joint whose encoder reads slightly outside its range may return into it.
+        # An encoder may read slightly outside the range: its joint may return into it.
         outside = np.maximum(self.limits.lower - self.position, self.position - self.limits.upper)
         beyond -= max(float(np.max(outside)), 0.0)
-        if (
-            beyond > LIMIT_ROUNDING
-            or max(speed, acceleration) > 1.0 + LIMIT_ROUNDING
-            or points.acceleration is None
-        ):
+        leaves_range = beyond > LIMIT_ROUNDING
+        is_too_fast = max(speed, acceleration) > 1.0 + LIMIT_ROUNDING
+        if leaves_range or is_too_fast or points.acceleration is None:
             raise InputError(
                 'a motion must have accelerations and stay within the limits of the joints, it'
                 f' leaves the range by {max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of'
@@ -314,29 +318,30 @@ class Driver:
         # The driver ros2_control publishes NaN until the hardware was read.
         if not np.all(np.isfinite(position)):
             for joint in np.flatnonzero(~np.isfinite(position)):
-                self.ignored[self.joint_names[joint]] = (
-                    self.ignored.get(self.joint_names[joint], 0) + 1
-                )
+                name = self.joint_names[joint]
+                self.ignored[name] = self.ignored.get(name, 0) + 1
             return False
         # After a clock step backwards the wait starts again.
         if self._stopped is not None and time < self._time:
             self._stopped = time, now
         if time != self._time or self.position is None:
             self._advanced = now
-        self._time, self._heard, self.position = time, now, np.asarray(position, float)
-        if self.is_driving and (trouble := self.stamp_fault(now)):
-            return self.stop(trouble)
+        self._time = time
+        self._heard = now
+        self.position = np.asarray(position, float)
+        if self.is_driving and (fault := self.stamp_fault(now)):
+            return self.stop(fault)
         self._note_rest()
         if self._watch is None or not self.is_driving:
             return False
-        trouble = self._beyond(position, rate)
-        if trouble:
-            return self.stop(trouble)
+        fault = self._limit_fault(position, rate)
+        if fault:
+            return self.stop(fault)
         if self.state is DriveState.MOVING:
             self._watch.observe(time, self.position, now=now)
-            trouble = self._straying()
-            if trouble:
-                return self.stop(trouble)
+            fault = self._tracking_fault()
+            if fault:
+                return self.stop(fault)
             if self._watch.at_end:
                 self._rested_at = self.position
                 self._rested_since = time
@@ -356,9 +361,7 @@ class Driver:
 
     def ignored_words(self) -> str:
         """
-        Return the joints without finite positions and the number of ignored states.
-
-        The number is that of ignored joint states, in brackets. The result is '' for none.
+        Return the joints without finite positions and their ignored states, in brackets, or ''.
         """
         counts = ', '.join(f'{name} {count}' for name, count in self.ignored.items())
         return f' (ignored because a position was not finite: {counts})' if counts else ''
@@ -390,41 +393,44 @@ class Driver:
         self._become(DriveState.DONE, why)
 
     def _become(self, state: DriveState, reason: str) -> None:
-        self.state, self.reason = state, reason
+        """Enter a state for a reason."""
+        self.state = state
+        self.reason = reason
 
-    def _beyond(self, position, rate):
-        """Return the fault of joint positions and speeds, '' for none."""
+    def _limit_fault(self, position: np.ndarray, rate: np.ndarray) -> str:
+        """Return the fault of joint positions or speeds beyond the limits, '' for none."""
         assert self.position is not None
-        over = (
-            np.maximum(self.limits.lower - position, position - self.limits.upper) - self.tolerance
-        )
-        if np.max(over) > 0:
-            joint = int(np.argmax(over))
+        outside = np.maximum(self.limits.lower - position, position - self.limits.upper)
+        excess = outside - self.tolerance
+        if np.max(excess) > 0:
+            joint = int(np.argmax(excess))
             return (
                 f'joint {self._place_of(joint, position)} is beyond its range: stopped; see the'
                 ' limits in the description of the joints'
             )
-        fast = np.where(np.isfinite(rate), np.abs(rate), 0.0) / self.limits.speed
-        if np.max(fast) > OVERSPEED:
-            joint = int(np.argmax(fast))
+        speed_share = np.where(np.isfinite(rate), np.abs(rate), 0.0) / self.limits.speed
+        if np.max(speed_share) > OVERSPEED:
+            joint = int(np.argmax(speed_share))
             return (
-                f'joint {self.joint_names[joint]} turns at {fast[joint]:.2f} times its largest'
+                f'joint {self.joint_names[joint]} turns at {speed_share[joint]:.2f} times its'
+                ' largest'
                 ' speed: stopped; see the limits in the description of the joints and in the'
                 ' controller'
             )
         return ''
 
-    def _straying(self):
-        """Return the fault of path tracking, '' for none."""
+    def _tracking_fault(self) -> str:
+        """Return the fault of joints that leave their path or do not advance on it, '' for none."""
         watch = self._watch
         # Called only during a motion.
         assert watch is not None
         if watch.has_strayed:
             joint = watch.suspect()
+            distance = watch.deviation.max() * watch.tolerance[joint]
             return (
                 f'joint {self._place_of(joint, self.position)} does not follow: the joints are'
-                f' {self._amount(joint, watch.deviation.max() * watch.tolerance[joint])} from their'
-                ' path: stopped; see whether something holds it'
+                f' {self._amount(joint, distance)} from their path: stopped; see whether something'
+                ' holds it'
             )
         if watch.has_stalled_for <= self.settings.stall_patience:
             return ''
@@ -438,17 +444,18 @@ class Driver:
             ' s: stopped; see whether something holds it'
         )
 
-    def _note_rest(self):
-        """Restart the timer when the joints have moved, or their clock was set back."""
+    def _note_rest(self) -> None:
+        """Restart the timer of rest when the joints have moved, or their clock was set back."""
         if (
             self._rested_at is None
             or self._time < self._rested_since
             or np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)
         ):
-            self._rested_at, self._rested_since = self.position, self._time
+            self._rested_at = self.position
+            self._rested_since = self._time
 
-    def _settle(self):
-        """Wait for rest; return whether all joints must stop."""
+    def _settle(self) -> bool:
+        """Begin to measure once the joints rest; return whether all joints must stop."""
         if self.rests:
             self._watch = None
             self._become(DriveState.MEASURING, self.reason)
@@ -459,8 +466,10 @@ class Driver:
             )
         return False
 
-    def _place_of(self, joint, position):
+    def _place_of(self, joint: int, position: np.ndarray) -> str:
+        """Return the name of a joint and its position as text."""
         return f'{self.joint_names[joint]}, at {self._amount(joint, position[joint])},'
 
-    def _amount(self, joint, value):
+    def _amount(self, joint: int, value: float) -> str:
+        """Return an angle (rad) or length (m) of a joint as text in degrees or millimetres."""
         return f'{value / DEG:.1f} deg' if self.limits.turns[joint] else f'{1000.0 * value:.1f} mm'

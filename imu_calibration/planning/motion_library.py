@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any
@@ -59,16 +59,16 @@ class PlannedMotion:
     text: str
     """Description of the segments."""
     limits: MotionLimits
-    """Limits that it keeps, with which the way to it is timed."""
+    """Limits that it keeps, also in the move to its place."""
 
     @property
     def seconds(self) -> float:
-        """Length without the way to its place, s."""
+        """Length without the move to its place, s."""
         return float(sum(segment.duration for segment in self.segments))
 
     def travel(self, position: np.ndarray) -> tuple[Segment, ...]:
         """
-        Return the way from where the joints are to the place of the motion: one move, or none.
+        Return the segments of the move from a position to the place of the motion, () for none.
         """
         return (
             MotionBuilder(len(self.place), limits=self.limits, start=position)
@@ -80,14 +80,14 @@ class PlannedMotion:
         """
         Return all segments from the present position, with whole turns of endless joints unchanged.
         """
-        way = self.travel(position)
-        shift = (way[-1].end if way else np.asarray(position, float)) - self.place
-        return way + tuple(
-            replace(segment, start=segment.start + shift) for segment in self.segments
-        )
+        move = self.travel(position)
+        # Whole turns of endless joints between where the move ends and the place.
+        shift = (move[-1].end if move else np.asarray(position, float)) - self.place
+        shifted = tuple(replace(segment, start=segment.start + shift) for segment in self.segments)
+        return move + shifted
 
     def seconds_from(self, position: np.ndarray) -> float:
-        """Return the length with the way to its place, s."""
+        """Return the length with the move to its place, s."""
         return self.seconds + sum(segment.duration for segment in self.travel(position))
 
     def points(self, position: np.ndarray) -> TrajectoryPoints:
@@ -103,10 +103,10 @@ class PlannedMotion:
         """Numbers of the motion for plan.yaml; angles of joints in degrees, named so."""
         units = np.where(self.limits.turns, 180.0 / np.pi, 1.0)
         rates = [segment.rate_to for segment in self.segments if segment.kind == 'spin']
-        found = {'place_deg_or_m': np.round(self.place * units, 4).tolist()}
-        return found | (
-            {'rates_deg_s_or_m_s': np.round(np.array(rates) * units, 4).tolist()} if rates else {}
-        )
+        details = {'place_deg_or_m': np.round(self.place * units, 4).tolist()}
+        if rates:
+            details['rates_deg_s_or_m_s'] = np.round(np.array(rates) * units, 4).tolist()
+        return details
 
     @property
     def words(self) -> str:
@@ -121,17 +121,18 @@ def trajectory(joint_names: tuple[str, ...], segments: tuple[Segment, ...]) -> T
     """
     if not segments:
         return TrajectoryPoints.stop(joint_names)
-    edges = np.concatenate([[0.0], np.cumsum([segment.duration for segment in segments])])
-    times = np.concatenate(
-        [
-            np.linspace(a, b, max(int(np.ceil((b - a) / TRAJECTORY_STEP_SECONDS)), 1) + 1)[1:]
-            for a, b in zip(edges, edges[1:], strict=False)
-        ]
-    )
+    transitions = np.concatenate([[0.0], np.cumsum([segment.duration for segment in segments])])
+    times_of_segments = []
+    for begin, end in zip(transitions[:-1], transitions[1:], strict=True):
+        n_steps = max(int(np.ceil((end - begin) / TRAJECTORY_STEP_SECONDS)), 1)
+        times_of_segments.append(np.linspace(begin, end, n_steps + 1)[1:])
+    times = np.concatenate(times_of_segments)
     motion = motion_at(segments, times)
     rate = motion.rate.copy()
     acceleration = motion.acceleration.copy()
-    rate[-1], acceleration[-1] = 0.0, 0.0
+    # At rest at the end, without rounding.
+    rate[-1] = 0.0
+    acceleration[-1] = 0.0
     return TrajectoryPoints(joint_names, times, motion.position, rate, acceleration)
 
 
@@ -173,27 +174,27 @@ def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
 
     Of joints that turn, at most one turn about the middle of the range.
     """
-    wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
+    is_wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
     # 0 without ends.
     middle = 0.5 * (np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END))
-    return np.where(wide, middle - np.pi, limits.lower), np.where(
-        wide, middle + np.pi, limits.upper
-    )
+    lower = np.where(is_wide, middle - np.pi, limits.lower)
+    upper = np.where(is_wide, middle + np.pi, limits.upper)
+    return lower, upper
 
 
 def up_at(table: Table, position: np.ndarray) -> np.ndarray:
-    """
-    Return which direction of the sensor frame points up at a position.
-
-    The joints rest at the position. The direction is a unit vector, shape (3,).
-    """
-    return reference_motion(table, rest_at(np.asarray(position, float)[None])).mat_sn[0] @ np.array(
-        [0.0, 0.0, 1.0]
-    )
+    """Return the vertical unit vector in the sensor frame, joints at rest at a position, (3,)."""
+    mat_sn = reference_motion(table, rest_at(np.asarray(position, float)[None])).mat_sn[0]
+    return mat_sn @ np.array([0.0, 0.0, 1.0])
 
 
 def candidates(limits: MotionLimits) -> np.ndarray:
-    """Return positions to choose from, the first that nearest to zero, shape (n, n_joints)."""
+    """
+    Return positions to choose from, shape (n, n_joints), first the one nearest to zero.
+
+    With at most three joints a grid follows, by distance from zero, then a Sobol sequence within
+    the reachable range.
+    """
     from scipy.stats import qmc  # here, because its import is slow
 
     lower, upper = reachable(limits)
@@ -206,7 +207,7 @@ def candidates(limits: MotionLimits) -> np.ndarray:
             if not turning:
                 steps.append(np.linspace(a, b, 3))
                 continue
-            # Multiples of the grid within the limits, those of rounding errors included.
+            # Multiples of the grid within the limits, up to rounding errors.
             first = np.ceil(a / POSITION_GRID - 1e-9)
             last = np.floor(b / POSITION_GRID + 1e-9)
             steps.append(np.arange(first, last + 1) * POSITION_GRID)
@@ -225,18 +226,20 @@ def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
     distant attitudes the position nearest to zero is chosen, by the order of `candidates`. Fewer
     positions are returned where the remaining attitudes are close to chosen ones.
     """
-    tried = candidates(limits)
-    mats = reference_motion(table, rest_at(tried)).mat_sn
+    positions = candidates(limits)
+    mat_sn = reference_motion(table, rest_at(positions)).mat_sn
+    # The axes of the level frame in the sensor frame, first the vertical one.
     features = np.concatenate(
-        [mats[:, :, 2], HEADING * mats[:, :, 0], HEADING * mats[:, :, 1]], axis=1
+        [mat_sn[:, :, 2], HEADING * mat_sn[:, :, 0], HEADING * mat_sn[:, :, 1]], axis=1
     )
     chosen = [0]
+    # Distance of each attitude to the nearest chosen one.
     distance = np.linalg.norm(features - features[0], axis=1)
     while len(chosen) < REST_PLACES and distance.max() > 0.05:
-        nearly = distance > distance.max() - 1e-6
-        chosen.append(int(np.argmax(nearly)))
+        is_furthest = distance > distance.max() - 1e-6
+        chosen.append(int(np.argmax(is_furthest)))
         distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
-    return tried[chosen]
+    return positions[chosen]
 
 
 LIMIT_SHARE = 0.98
@@ -256,11 +259,19 @@ SPEEDS = (1.0, 0.5)
 """Spins, as shares of the largest speed."""
 MAX_SWING = {True: 120.0 * DEG, False: 0.3}
 """Amplitude of a swing of a joint that turns, rad, or slides, m, at most."""
-REST_PLACES, SPIN_PLACES, SWING_PLACES, TOGETHER_PLACES = 20, 4, 3, 2
-"""
-Places for rests; for spins and for swings of each joint, and for each set of joints, of a chain
-with at most three joints.
-"""
+REST_PLACES = 20
+"""Places for rests."""
+# Of a chain with at most three joints:
+SPIN_PLACES = 4
+"""Places for spins of each joint."""
+SWING_PLACES = 3
+"""Places for swings of each joint."""
+TOGETHER_PLACES = 2
+"""Places for motions of each set of joints."""
+JOINT_FREQUENCIES = 0.5 * np.array([1.0, 1.4, 0.7, 1.7, 0.6, 1.2, 0.85, 1.55] * 2)
+"""Frequencies of joints that swing together, Hz."""
+MotionParts = tuple[np.ndarray, tuple[Segment, ...], str]
+"""Place, segments and text of a PlannedMotion."""
 
 
 class MotionLibrary:
@@ -287,35 +298,40 @@ class MotionLibrary:
         )
         self.names = tuple(table.joint_names)
         self.spread = choose_places(table, self.limits)
+        """Positions of the rests, with the largest differences in attitude first."""
         self.motions = [
-            PlannedMotion(kind, self.names, place, segments, text, self.limits)
-            for kind, place, segments, text in (
-                *self._rests(),
-                *self._spins(),
-                *self._swings(),
-                *self._together(),
-            )
+            *self._rests(),
+            *self._spins(),
+            *self._swings(),
+            *self._swings_together(),
+            *self._spins_together(),
         ]
         self.places = np.unique(np.round([motion.place for motion in self.motions], 9), axis=0)
+        """Positions where motions start and end, shape (n_places, n_joints)."""
         nearest = []
         for motion in self.motions:
             nearest.append(int(np.argmin(np.abs(self.places - motion.place).sum(axis=1))))
         self.place_of = np.array(nearest)
+        """Index into `places` for each motion."""
 
-    def _rests(self):
+    def _motion(
+        self, kind: MotionKind, place: np.ndarray, segments: tuple[Segment, ...], text: str
+    ) -> PlannedMotion:
+        """Return a motion of the chain within its limits."""
+        return PlannedMotion(kind, self.names, place, segments, text, self.limits)
+
+    def _rests(self) -> Iterator[PlannedMotion]:
+        """Yield a mere move to each place, and rests of several lengths there."""
         for place in self.spread:
-            yield MotionKind.MOVE, place, (), ''
+            yield self._motion(MotionKind.MOVE, place, (), '')
             for dwell in DWELLS:
-                yield (
-                    MotionKind.POSE,
-                    place,
-                    self._builder(place).rest(dwell).segments,
-                    f'rest for {dwell:g} s',
-                )
+                segments = self._builder(place).rest(dwell).segments
+                yield self._motion(MotionKind.POSE, place, segments, f'rest for {dwell:g} s')
 
-    def _spins(self):
-        moving = np.flatnonzero(self.limits.turns & (self.limits.upper > self.limits.lower))
-        for joint in moving:
+    def _spins(self) -> Iterator[PlannedMotion]:
+        """Yield turns of each rotating joint: whole ones if endless, otherwise sweeps."""
+        rotating = np.flatnonzero(self.limits.turns & (self.limits.upper > self.limits.lower))
+        for joint in rotating:
             for place in self._subset(SPIN_PLACES, int(joint)):
                 for share in SPEEDS:
                     rates = np.zeros(len(self.names))
@@ -323,116 +339,130 @@ class MotionLibrary:
                     if self.limits.endless[joint]:
                         for sense, seconds in product((1.0, -1.0), SPIN_TIME):
                             turns = self._whole_turns(place, sense * rates, seconds)
-                            yield MotionKind.SPIN, *turns
-                    elif made := self._sweep(place, rates):
-                        yield MotionKind.SPIN, *made
+                            yield self._motion(MotionKind.SPIN, *turns)
+                        continue
+                    sweep = self._sweep(place, rates)
+                    if sweep is not None:
+                        yield self._motion(MotionKind.SPIN, *sweep)
 
-    def _swings(self):
+    def _swings(self) -> Iterator[PlannedMotion]:
+        """Yield swings of each joint that can move."""
         for joint in np.flatnonzero(self.limits.upper > self.limits.lower):
+            swings = np.arange(len(self.names)) == joint
             for place in self._subset(SWING_PLACES, int(joint) + 1):
-                for frequency in SWING_FREQUENCIES:
-                    shares = np.zeros(len(self.names))
-                    shares[joint] = 1.0
-                    for seconds in SWING_TIME:
-                        yield MotionKind.SWING, *self._swing(place, shares, frequency, seconds)
+                for frequency, seconds in product(SWING_FREQUENCIES, SWING_TIME):
+                    swing = self._swing(place, swings, frequency, seconds)
+                    yield self._motion(MotionKind.SWING, *swing)
 
-    def _together(self):
+    def _pairs(self) -> list[tuple[int, ...]]:
+        """Return the pairs of joints that move together: the last ones, near the sensor."""
         moving = np.flatnonzero(self.limits.upper > self.limits.lower)
-        pairs = [pair for pair in combinations(moving, 2)][-6:]
-        sets = [*pairs, *([tuple(moving)] if len(moving) > 2 else [])]
+        return list(combinations(moving, 2))[-6:]
+
+    def _swings_together(self) -> Iterator[PlannedMotion]:
+        """Yield swings of pairs of joints, and of all joints, with different frequencies."""
+        moving = np.flatnonzero(self.limits.upper > self.limits.lower)
+        sets = self._pairs()
+        if len(moving) > 2:
+            sets.append(tuple(moving))
         for number, joints in enumerate(sets):
+            swings = np.isin(np.arange(len(self.names)), joints)
+            frequency = np.full(len(self.names), 0.5)
+            frequency[list(joints)] = JOINT_FREQUENCIES[: len(joints)]
             for place in self._subset(TOGETHER_PLACES, number + 2):
-                frequency = np.full(len(self.names), 0.5)
-                frequency[list(joints)] = (
-                    0.5 * np.array([1.0, 1.4, 0.7, 1.7, 0.6, 1.2, 0.85, 1.55] * 2)[: len(joints)]
-                )
                 for seconds in SWING_TIME:
-                    yield (
-                        MotionKind.TOGETHER,
-                        *self._swing(
-                            place, np.isin(np.arange(len(self.names)), joints), frequency, seconds
-                        ),
-                    )
-        for pair in pairs:
-            if self.limits.endless[list(pair)].all():
-                for place in self._subset(TOGETHER_PLACES, int(pair[0] + pair[1])):
-                    for sense in (1.0, -1.0):
-                        rates = np.zeros(len(self.names))
-                        rates[list(pair)] = self.limits.speed[list(pair)].min() * np.array(
-                            [1.0, sense]
-                        )
-                        yield MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0)
+                    swing = self._swing(place, swings, frequency, seconds)
+                    yield self._motion(MotionKind.TOGETHER, *swing)
+
+    def _spins_together(self) -> Iterator[PlannedMotion]:
+        """Yield turns of two endless joints at equal speed, in equal and in opposite sense."""
+        for pair in self._pairs():
+            joints = list(pair)
+            if not self.limits.endless[joints].all():
+                continue
+            speed = self.limits.speed[joints].min()
+            for place in self._subset(TOGETHER_PLACES, int(sum(pair))):
+                for sense in (1.0, -1.0):
+                    rates = np.zeros(len(self.names))
+                    rates[joints] = speed * np.array([1.0, sense])
+                    yield self._motion(MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0))
 
     def _subset(self, count: int, first: int) -> np.ndarray:
         """
-        Return a subset of the positions, different for each motion.
+        Return about `count` of the positions, evenly from number `first` on.
 
-        Fewer for a long chain, because moves grow with their square.
+        Fewer for a long chain, because the number of moves grows with their square.
         """
         count = max(1, min(count, 3 * count // len(self.names)))
-        some = (np.arange(count) * max(len(self.spread) // count, 1) + first) % len(self.spread)
-        return self.spread[np.unique(some)]
+        stride = max(len(self.spread) // count, 1)
+        numbers = (np.arange(count) * stride + first) % len(self.spread)
+        return self.spread[np.unique(numbers)]
 
-    def _builder(self, place):
+    def _builder(self, place: np.ndarray) -> MotionBuilder:
+        """Return a builder of segments that begin at a position."""
         return MotionBuilder(len(self.names), limits=self.limits, start=place)
 
-    def _whole_turns(self, place, rates, seconds):
+    def _whole_turns(self, place: np.ndarray, rates: np.ndarray, seconds: float) -> MotionParts:
         """Turn at constant rates for at least `seconds`, until endless joints have returned."""
         speed = np.abs(rates).max()
-        ramp = self._spun(place, rates, 1.0)
-        extra = np.abs(sum(segment.end - segment.start for segment in ramp)).max() - speed
-        turns = np.ceil((seconds * speed + extra) / (2 * np.pi))
-        held = (2 * np.pi * turns - extra) / speed
+        # Angle of the ramps: that of a spin of one second without this second.
+        one_second = self._spun(place, rates, 1.0)
+        angle = np.abs(sum(segment.end - segment.start for segment in one_second)).max()
+        ramps = angle - speed
+        turns = np.ceil((seconds * speed + ramps) / (2 * np.pi))
+        held = (2 * np.pi * turns - ramps) / speed
         ending = 'turn' if turns == 1 else 'turns'
-        return (
-            place,
-            self._spun(place, rates, held),
-            f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}',
-        )
+        text = f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}'
+        return place, self._spun(place, rates, held), text
 
-    def _sweep(self, place, rates):
+    def _sweep(self, place: np.ndarray, rates: np.ndarray) -> MotionParts | None:
         """
         Turn a limited joint at a constant rate through its range and back.
 
-        None if that is too short for a window.
+        Slower where the time at the rate is too short for a window; None if it always is.
         """
         joint = int(np.argmax(np.abs(rates)))
         lower = self.limits.lower[joint]
         upper = self.limits.upper[joint]
         start = place.copy()
         start[joint] = lower + 0.02 * (upper - lower)
-        there = np.stack([rates, -rates])
+        to_and_fro = np.stack([rates, -rates])
         for share in (1.0, 0.6, 0.35, 0.2, 0.1):
-            held = self._longest(start, share * there, joint)
-            if held >= SPIN_TIME[0]:
-                segments = self._spun(start, share * there, min(held, SPIN_TIME[1]))
-                return (
-                    start,
-                    segments,
-                    (
-                        f'sweep {self._rate_words(share * rates)} for {min(held, SPIN_TIME[1]):.1f}'
-                        ' s and back'
-                    ),
-                )
+            longest = self._longest(start, share * to_and_fro, joint)
+            if longest >= SPIN_TIME[0]:
+                held = min(longest, SPIN_TIME[1])
+                segments = self._spun(start, share * to_and_fro, held)
+                text = f'sweep {self._rate_words(share * rates)} for {held:.1f} s and back'
+                return start, segments, text
         return None
 
-    def _longest(self, start, rates, joint):
-        """Return the time at a rate until the end of the range, s."""
-        trial = self._spun(start, rates, 1.0)
-        time = np.linspace(0.0, sum(segment.duration for segment in trial), 400)
-        reached = np.abs(motion_at(trial, time).position[:, joint] - start[joint]).max()
-        return 1.0 + (
-            0.96 * (self.limits.upper[joint] - self.limits.lower[joint]) - reached
-        ) / np.abs(rates[0, joint])
+    def _longest(self, start: np.ndarray, rates: np.ndarray, joint: int) -> float:
+        """
+        Return the time at a rate through 96 % of the range of a joint, with both ramps, s.
 
-    def _spun(self, place, rates, seconds) -> tuple[Segment, ...]:
+        `rates`: of all joints on the way out and back, shape (2, n_joints).
+        """
+        one_second = self._spun(start, rates, 1.0)
+        time = np.linspace(0.0, sum(segment.duration for segment in one_second), 400)
+        travelled = np.abs(motion_at(one_second, time).position[:, joint] - start[joint]).max()
+        remaining = 0.96 * (self.limits.upper[joint] - self.limits.lower[joint]) - travelled
+        return 1.0 + remaining / np.abs(rates[0, joint])
+
+    def _spun(self, place: np.ndarray, rates: np.ndarray, seconds: float) -> tuple[Segment, ...]:
+        """Return the segments of a spin at constant rates (rad/s) for a time, with its ramps."""
         return self._builder(place).spin(np.degrees(rates), seconds).segments
 
-    def _swing(self, place, shares, frequency, seconds):
-        """Swing with the largest amplitude within range, speed and acceleration."""
+    def _swing(
+        self, place: np.ndarray, swings: np.ndarray, frequency: np.ndarray | float, seconds: float
+    ) -> MotionParts:
+        """
+        Swing with the largest amplitude within range, speed and acceleration.
+
+        `swings`: whether each joint swings, shape (n_joints,); `frequency` in Hz, of each or all.
+        """
         # Largest position, rate and acceleration of a swing of unit amplitude.
         frequency = np.broadcast_to(frequency, place.shape).astype(float)
-        unit = np.where(shares, 1.0, 0.0)
+        unit = np.where(swings, 1.0, 0.0)
         unit_swing = self._builder(np.zeros(len(place))).swing(unit, frequency, seconds).segments
         motion = motion_at(unit_swing, np.linspace(0.0, seconds, int(60 * seconds)))
         largest_position = np.maximum(np.abs(motion.position).max(axis=0), 1e-9)
@@ -462,6 +492,7 @@ class MotionLibrary:
         return middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s'
 
     def _rate_words(self, rates: Sequence[float]) -> str:
+        """Return the joints that turn and their rates (rad/s) as text."""
         return ' and '.join(
             f'{name} at {np.degrees(rate):+.0f} deg/s'
             for name, rate in zip(self.names, rates, strict=True)
@@ -469,15 +500,17 @@ class MotionLibrary:
         )
 
 
-SPEED, ACCELERATION = 60.0 * DEG, 90.0 * DEG
-"""Rotation of a mobile base on the spot, rad/s and rad/s^2."""
+SPEED = 60.0 * DEG
+"""Rotation of a mobile base on the spot, rad/s."""
+ACCELERATION = 90.0 * DEG
+"""The same, rad/s^2."""
 
 
 def yaw_table(gravity: float | None = None) -> Table:
     """
-    Return the table.
+    Return the table of a mobile base that turns on the spot: one vertical joint without end.
 
-    One vertical joint without end, whose angle is known from odometry or marks on the floor.
+    Its angle is measured by odometry or by marks on the floor.
     """
     joint = Joint(
         'yaw', (0.0, 0.0, 1.0), limits=JointLimits(None, None, SPEED, ACCELERATION, endless=True)

@@ -57,25 +57,44 @@ class PathWatch:
     def __init__(self, start: np.ndarray, points: TrajectoryPoints, tolerance: np.ndarray):
         path = trajectory_from(rest_at(np.asarray(start, float)[None]), points)
         count = max(int(np.ceil(points.duration / PATH_STEP_SECONDS)), 1)
+        # The path at n instants, in the time of the path.
         self._time = np.linspace(0.0, points.duration, count + 1)
+        """Instants, s, shape (n,)."""
         motion = path.at(self._time)
         self._path = motion.position / tolerance
+        """Positions in tolerances, shape (n, n_joints)."""
         self.tolerance = np.asarray(tolerance, float)
         # The rate of the spline may vanish where an oscillation reverses: rest means no motion over
         # several steps.
         moved = np.max(np.abs(np.diff(self._path, axis=0, prepend=self._path[:1])), axis=1)
         self._rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
-        edge = np.append(np.flatnonzero(~self._rests), len(self._time) - 1)
-        self._rest_end = edge[np.searchsorted(edge, np.arange(len(self._time)))]
+        """Whether the path rests at each instant, shape (n,)."""
+        moving = np.append(np.flatnonzero(~self._rests), len(self._time) - 1)
+        self._rest_end = moving[np.searchsorted(moving, np.arange(len(self._time)))]
+        """First instant from each one on at which the path moves, or the last, shape (n,)."""
         self._at = 0
+        """Instant of the path at which the joints are."""
         self._start = np.asarray(start, float) / tolerance
+        """Where the joints rested before, in tolerances."""
         self._last: float | None = None
-        self._now = self._further = 0.0
-        self._came = self._took = self._remainder = 0.0
+        """Time of the joints at the last position, s; None before the first one."""
+        self._now = 0.0
+        """Steady time of the last position, s."""
+        self._further = 0.0
+        """Steady time of the last progress, s."""
+        # The pace is the ratio of both, over the progress in motion so far.
+        self._came = 0.0
+        """Time of the path, s."""
+        self._took = 0.0
+        """Time of the joints, s."""
+        self._remainder = 0.0
+        """Expected progress that is less than a step, s of the time of the path."""
         self._recent: deque = deque([(0.0, self._start)])
+        """(time of the joints, position in tolerances) in the last `STALLED_SECONDS`."""
         self._most = np.zeros(len(start))
+        """Largest distance of each joint from its start, in tolerances."""
         self.has_begun = False
-        """Whether the joints have left where they were."""
+        """Whether the joints have left their start."""
         self.waited = 0.0
         """Seconds of their clock since the last progress of the joints along an unfinished path."""
         self.deviation = np.zeros(len(start))
@@ -94,17 +113,17 @@ class PathWatch:
     @property
     def pace(self) -> float:
         """Speed of the joints along the path as a share of the speed of the path."""
-        return float(np.clip(self._came / self._took, MIN_PACE, 1.0)) if self._took > 0 else 1.0
+        if self._took <= 0:
+            return 1.0
+        return float(np.clip(self._came / self._took, MIN_PACE, 1.0))
 
     @property
     def has_stalled_for(self) -> float:
         """
-        Seconds without progress of the joints.
+        Seconds without progress of the joints, scaled to the speed of the path.
 
-        By their clock and by ours, scaled to the speed of the path.
-
-        A simulated clock that runs faster than ours gives the controller less time than its stamps
-        show.
+        By their clock or by the steady one, the smaller time: a simulated clock that runs faster
+        gives the controller less time than its stamps show.
         """
         return min(self.waited, self._now - self._further) * self.pace
 
@@ -117,7 +136,7 @@ class PathWatch:
 
         # The part of the path that may be reached by now. Joints may end a rest before the
         # scheduled time, so its end is evaluated as well.
-        rests = self._rests[self._at]
+        path_rests = self._rests[self._at]
         latest = self._time[self._rest_end[self._at]] + elapsed + MAX_LEAD_SECONDS
         stop = np.searchsorted(self._time, latest, side='right')
         ahead = slice(self._at, max(stop, self._at + 1))
@@ -126,16 +145,18 @@ class PathWatch:
         distance = np.max(np.abs(self._path[ahead] - place), axis=1)
         fits = np.flatnonzero(distance <= max(DEAD_BAND, np.min(distance)))
         # The remainder below a step is kept; otherwise a slow pace would never end a rest.
-        expected = self.progress + self._remainder + elapsed * (self.pace if rests else 1.0)
+        pace = self.pace if path_rests else 1.0
+        expected = self.progress + self._remainder + elapsed * pace
         before = self._at
-        self._at += int(fits[np.argmin(np.abs(self._time[ahead][fits] - expected))])
+        nearest = np.argmin(np.abs(self._time[ahead][fits] - expected))
+        self._at += int(fits[nearest])
         remainder = expected - self.progress
         self._remainder = float(np.clip(remainder, -PATH_STEP_SECONDS, PATH_STEP_SECONDS))
         self.deviation = np.abs(self._path[self._at] - place)
 
         # Scheduled and elapsed time in motion give the pace.
         advances = self._at > before or self.at_end
-        if advances and not rests and self.has_begun:
+        if advances and not path_rests and self.has_begun:
             self._came += float(self._time[self._at] - self._time[before])
             self._took += elapsed + self.waited
         self._now = now
@@ -143,7 +164,8 @@ class PathWatch:
         if self.waited == 0.0:
             self._further = now
 
-    def _remember(self, time, place):
+    def _remember(self, time: float, place: np.ndarray) -> None:
+        """Update the distances from the start and the recent positions, in tolerances."""
         self._most = np.maximum(self._most, np.abs(place - self._start))
         self.has_begun = self.has_begun or bool(np.max(self._most) > MIN_BEGUN_MOVEMENT)
         self._recent.append((time, place))
@@ -157,17 +179,19 @@ class PathWatch:
 
     def suspect(self) -> int:
         """
-        Return the joint with the smallest share of the commanded motion.
+        Return the joint whose recent motion is smallest, compared with the commanded motion.
 
-        Before this point after a deviation, after it in a stall.
+        Commanded before the present point of the path after a deviation, after it in a stall.
         """
-        near = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1
+        n_steps = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1
         place = self._recent[-1][1]
         if self.has_strayed:
-            wanted = np.ptp(self._path[max(self._at - near, 0) : self._at + 1], axis=0)
-        # Distance to the following path: of joints with equal motion, a joint that has arrived is
-        # not the cause
+            path = self._path[max(self._at - n_steps, 0) : self._at + 1]
+            commanded = np.ptp(path, axis=0)
         else:
-            wanted = np.max(np.abs(self._path[self._at : self._at + near + 1] - place), axis=0)
+            # Distance to the following path: of joints with equal motion, a joint that has arrived
+            # is not the cause.
+            path = self._path[self._at : self._at + n_steps + 1]
+            commanded = np.max(np.abs(path - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
-        return int(np.argmax(wanted - moved - LATENESS_TIE * self._most))
+        return int(np.argmax(commanded - moved - LATENESS_TIE * self._most))

@@ -52,7 +52,22 @@ distance.
 
 
 class CandidateMotions:
-    """The gain of every motion from where the joints are."""
+    """
+    The gain of every motion from where the joints are.
+
+    Parameters
+    ----------
+    problem : PlanningProblem
+    posterior : Posterior
+        After the motions so far.
+    place : int
+        Place where the joints are.
+    margin : float
+        Factor on the standard deviations.
+    factor : float
+        On the variance of the noise.
+
+    """
 
     def __init__(
         self,
@@ -64,37 +79,40 @@ class CandidateMotions:
         factor: float = 1.0,
     ):
         self.places = problem.library.place_of
-        self.seconds = problem.seconds + problem.way_seconds[place, self.places]
-        self.information = (problem.information + problem.way_information(place)) / factor
+        """Place of each motion, shape (k,)."""
+        self.seconds = problem.seconds + problem.move_seconds[place, self.places]
+        """Length of each motion with the move to its place, s, shape (k,)."""
+        self.information = (problem.information + problem.move_information(place)) / factor
+        """Of each motion with the move, shape (k, m, m)."""
         self.possible = self.seconds > 0
         self._goal = problem.goal
         self._posterior = posterior
         self._margin = margin
-        self._before = float(problem.goal.left(posterior.known[None], margin)[0])
-        self.least = MIN_PLAN_GAIN * min(1.0, self._before)
+        self._distance = float(problem.goal.distance(posterior.covariance_z[None], margin)[0])
+        """Distance to the goal before the motion."""
+        self.min_gain = MIN_PLAN_GAIN * min(1.0, self._distance)
 
     @cached_property
-    def left(self) -> np.ndarray:
+    def distance_after(self) -> np.ndarray:
         """Distance to the goal after each motion; mandatory motions are chosen without it."""
         size = self._posterior.size
-        after = self._posterior.after(self.information, self.seconds)
-        return self._goal.left(after[:, :size, :size], self._margin)
+        covariance = self._posterior.after(self.information, self.seconds)
+        return self._goal.distance(covariance[:, :size, :size], self._margin)
 
     @cached_property
     def gain(self) -> np.ndarray:
         """Reduction of the distance to the goal by each motion."""
-        return np.where(self.possible, self._before - self.left, 0.0)
+        return np.where(self.possible, self._distance - self.distance_after, 0.0)
 
     def hopeless(self, number: int) -> bool:
         """Return whether a motion has almost no gain and does not reach the goal."""
-        return bool(self.gain[number] < self.least and self.left[number] > 0)
+        return bool(self.gain[number] < self.min_gain and self.distance_after[number] > 0)
 
     @property
     def best(self) -> int:
         """The motion with the largest gain per second."""
-        return int(
-            np.argmax(np.where(self.possible, self.gain / np.maximum(self.seconds, 1e-9), -np.inf))
-        )
+        gain_per_second = self.gain / np.maximum(self.seconds, 1e-9)
+        return int(np.argmax(np.where(self.possible, gain_per_second, -np.inf)))
 
 
 def greedy(
@@ -119,70 +137,79 @@ def greedy(
     posterior = problem.posterior()
     place = start
     chosen = []
-    spent = 0.0
-    margin = 1.0
-    factor = 0.0
-    taken: list[tuple[np.ndarray, float]] = []
-    beginning = problem.goal.left(posterior.known[None])[0]
+    spent = 0.0  # s
+    margin = 1.0  # on the standard deviations of the search
+    factor = 0.0  # on the variance of the noise
+    # Information without the factor, and length, of each chosen motion.
+    steps: list[tuple[np.ndarray, float]] = []
+    first_distance = problem.goal.distance(posterior.covariance_z[None])[0]
     while len(chosen) < MAX_PLAN_MOTIONS and spent < longest:
-        if factor != (factor := problem.variance_factor(problem.timed(chosen, start)[0])):
+        # More rests reduce the factor: the motions so far have more information.
+        windows, _, _ = problem.timed(chosen, start)
+        new_factor = problem.variance_factor(windows)
+        if new_factor != factor:
+            factor = new_factor
             posterior = problem.posterior()
-            for information, seconds in taken:
+            for information, seconds in steps:
                 posterior.take(information / factor, seconds)
-        choice = CandidateMotions(problem, posterior, place, margin=margin, factor=factor)
-        must = len(chosen) < len(first)
-        number = first[len(chosen)] if must else choice.best
-        if not must and (
-            choice.hopeless(number) or spent + float(choice.seconds[number]) > longest
-        ):
-            break
-        taken.append((factor * choice.information[number], float(choice.seconds[number])))
-        posterior.take(choice.information[number], taken[-1][1])
-        chosen.append(number)
-        spent += float(choice.seconds[number])
-        place = int(problem.library.place_of[number])
-        left = problem.goal.left(posterior.known[None], margin)[0]
-        report('planning', 1.0 - left / max(beginning, 1e-9), 1.0)
-        if left == 0.0 and len(chosen) >= len(first):
-            if remaining(problem, chosen, start) == 0.0:
+
+        candidates = CandidateMotions(problem, posterior, place, margin=margin, factor=factor)
+        if len(chosen) < len(first):
+            number = first[len(chosen)]
+        else:
+            number = candidates.best
+            if candidates.hopeless(number):
                 break
-            # The belief has constant biases within a motion; if that was optimistic, the target
+            if spent + float(candidates.seconds[number]) > longest:
+                break
+        information = candidates.information[number]
+        seconds = float(candidates.seconds[number])
+        steps.append((factor * information, seconds))
+        posterior.take(information, seconds)
+        chosen.append(number)
+        spent += seconds
+        place = int(problem.library.place_of[number])
+
+        distance = problem.goal.distance(posterior.covariance_z[None], margin)[0]
+        report('planning', 1.0 - distance / max(first_distance, 1e-9), 1.0)
+        if distance == 0.0 and len(chosen) >= len(first):
+            if remaining_distance(problem, chosen, start) == 0.0:
+                break
+            # The posterior has constant biases within a motion; if that was optimistic, the target
             # must be lower.
             margin *= FURTHER
     return chosen
 
 
-def remaining(problem: PlanningProblem, sequence: Sequence[int], start: int) -> float:
-    """Return the distance to the goal after motions; 0 where they reach it."""
-    return float(
-        problem.goal.left(problem.covariance_after(sequence, start, cautious=True)[0][None])[0]
-    )
+def remaining_distance(problem: PlanningProblem, sequence: Sequence[int], start: int) -> float:
+    """Return the distance to the goal after motions from a place; 0 where they reach it."""
+    covariance, _ = problem.covariance_after(sequence, start, cautious=True)
+    return float(problem.goal.distance(covariance[None])[0])
 
 
 def shortened_plan(
     problem: PlanningProblem, sequence: Sequence[int], start: int, *, fixed: int = 0
 ) -> list[int]:
     """
-    Return a shorter plan that does as much.
+    Return a plan without the motions that do not reduce the distance to the goal.
 
-    Motions are left out, latest first and none of the first `fixed`.
+    Each motion is tried in turn, the latest first, without the first `fixed` ones.
     """
-    best = list(sequence)
-    goal = remaining(problem, sequence, start) + 1e-9
-    for place in range(len(best) - 1, fixed - 1, -1):
-        trial = best[:place] + best[place + 1 :]
-        if remaining(problem, trial, start) <= goal:
-            best = trial
-    return best
+    shortest = list(sequence)
+    accepted = remaining_distance(problem, sequence, start) + 1e-9
+    for index in range(len(shortest) - 1, fixed - 1, -1):
+        trial = shortest[:index] + shortest[index + 1 :]
+        if remaining_distance(problem, trial, start) <= accepted:
+            shortest = trial
+    return shortest
 
 
 GOAL_REACHED = 'all that was wanted is reached'
 STUCK = 'no motion within the limits reduces the remaining standard deviations'
-MAX_BOUND_RATIO, MIN_RELATIVE_WEIGHT = 1.1, 0.03
-"""
-A plan this many times longer than the bound is searched again, each parameter with at least this
-share of the largest weight.
-"""
+MAX_BOUND_RATIO = 1.1
+"""A plan this many times longer than the bound is searched again with other weights."""
+MIN_RELATIVE_WEIGHT = 0.03
+"""Least weight of a parameter in this search, as a share of the largest one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,8 +315,11 @@ class Planner:
     def __init__(self, problem: PlanningProblem):
         self.problem = problem
         self._posterior = problem.posterior()
+        """After the motions so far, by prediction or by the last calibration."""
         self._visited: set[int] = set()
-        self._first: list[int] | None = None if problem.known is None else []
+        """Places of the rests so far."""
+        self._first: list[int] | None = None if problem.known_information is None else []
+        """Mandatory next motions; None before they are chosen, from the first position."""
 
     def take(self, calibration: Calibration) -> None:
         """
@@ -298,7 +328,7 @@ class Planner:
         For the parameters that the model shares with it.
         """
         names = {name: k for k, name in enumerate(calibration.param_names)}
-        self.problem.known = self.problem.coordinates.information_from(
+        self.problem.known_information = self.problem.coordinates.information_from(
             names, calibration.covariance
         )
         self._posterior = self.problem.posterior()
@@ -308,7 +338,11 @@ class Planner:
         """Standard deviation over tolerance of each requested parameter, estimated or predicted."""
         coordinates = self.problem.coordinates
         return dict(
-            zip(coordinates.names, coordinates.excess(self._posterior.known).tolist(), strict=True)
+            zip(
+                coordinates.names,
+                coordinates.excess(self._posterior.covariance_z).tolist(),
+                strict=True,
+            )
         )
 
     def next_motion(self, position: np.ndarray) -> Decision:
@@ -317,24 +351,29 @@ class Planner:
 
         The gain is from where the joints are.
         """
-        missing = self.problem.goal.missing(self._posterior.known)
+        missing = self.problem.goal.missing(self._posterior.covariance_z)
         place = self.problem.place_near(position)
         if self._first is None:
-            self._first = [] if self.problem.known is not None else self.problem.first_rests(place)
-        if not self._first and not self.problem.goal.left(self._posterior.known[None])[0] > 0:
+            self._first = (
+                []
+                if self.problem.known_information is not None
+                else self.problem.first_rests(place)
+            )
+        is_mandatory = bool(self._first)
+        covariance = self._posterior.covariance_z
+        if not is_mandatory and not self.problem.goal.distance(covariance[None])[0] > 0:
             return Decision(why=STUCK if missing else GOAL_REACHED)
-        choice = CandidateMotions(self.problem, self._posterior, place)
-        must = bool(self._first)
-        number = self._first.pop(0) if must else choice.best
-        if not must and self._visited and choice.hopeless(number):
-            return Decision(why=STUCK)
-        self._posterior.take(choice.information[number], float(choice.seconds[number]))
-        motion = self._named(number)
-        reason = (
-            'a session begins with rests in many attitudes'
-            if must
-            else f'it gains most per second for {", ".join(missing[:3])}'
-        )
+        candidates = CandidateMotions(self.problem, self._posterior, place)
+        if is_mandatory:
+            number = self._first.pop(0)
+            reason = 'a session begins with rests in many attitudes'
+        else:
+            number = candidates.best
+            reason = f'it gains most per second for {", ".join(missing[:3])}'
+            if self._visited and candidates.hopeless(number):
+                return Decision(why=STUCK)
+        self._posterior.take(candidates.information[number], float(candidates.seconds[number]))
+        motion = self._visit(number)
         return Decision(motion, reason, motion.seconds_from(position))
 
     def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
@@ -347,11 +386,13 @@ class Planner:
             return None
         library = self.problem.library
         limits = library.limits
-        room = np.stack([position - limits.lower, limits.upper - position])
-        away = np.where(room[1] >= room[0], 1.0, -1.0) * np.clip(room.max(axis=0), 0.0, reach)
+        room_below = position - limits.lower
+        room_above = limits.upper - position
+        side = np.where(room_above >= room_below, 1.0, -1.0)
+        excursion = side * np.clip(np.maximum(room_below, room_above), 0.0, reach)
         segments = (
             MotionBuilder(len(position), limits=limits, start=position)
-            .move_to(position + away)
+            .move_to(position + excursion)
             .move_to(position)
             .segments
         )
@@ -366,20 +407,20 @@ class Planner:
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
         """
-        Return the move that turns endless joints back to the middle of their range.
+        Return the move that turns wound joints back to the middle of their range, None for none.
 
-        The joints have restricted turns. The result is None within half a turn.
+        Endless joints of the table to which the present limits give a range, more than half a turn
+        from its middle.
         """
         library = self.problem.library
         limits = library.limits
-        declared = limits_of(library.table).endless
-        middle = np.where(declared & ~limits.endless, 0.5 * (limits.lower + limits.upper), position)
-        far = np.abs(position - middle) > np.pi
-        if not np.any(far):
+        is_restricted = limits_of(library.table).endless & ~limits.endless
+        middle = np.where(is_restricted, 0.5 * (limits.lower + limits.upper), position)
+        is_wound = np.abs(position - middle) > np.pi
+        if not np.any(is_wound):
             return None
-        return PlannedMotion(
-            MotionKind.MOVE, library.names, np.where(far, middle, position), (), 'unwinding', limits
-        )
+        target = np.where(is_wound, middle, position)
+        return PlannedMotion(MotionKind.MOVE, library.names, target, (), 'unwinding', limits)
 
     def plan(
         self,
@@ -388,11 +429,23 @@ class Planner:
         with_bound: bool = True,
         longest: float = np.inf,
     ) -> Plan:
-        """Return a whole plan from the present position (default: home)."""
+        """
+        Return a plan from the present position to the goal.
+
+        Parameters
+        ----------
+        position : ndarray, shape (n_joints,), optional
+            Default: home.
+        with_bound : bool
+            Whether to work out the lower bound; a plan that is much longer is searched again.
+        longest : float
+            Time at most, s.
+
+        """
         problem = self.problem
         start = problem.library.spread[0] if position is None else np.asarray(position, float)
         place = problem.place_near(start)
-        first = () if problem.known is not None else problem.first_rests(place)
+        first = () if problem.known_information is not None else problem.first_rests(place)
         self.within(longest)
         sequence = self._sequence(place, first, longest)
         bound = float('nan')
@@ -402,19 +455,21 @@ class Planner:
             factor = problem.variance_factor(windows)
             relaxed = problem.relaxation(factor=factor)
             bound = problem.lower_bound(factor=factor, relaxed=relaxed)
-            # The limits of the relaxed plan count more: a second attempt.
+            # A second search, in which the parameters that limit the relaxed plan count more.
             if seconds > MAX_BOUND_RATIO * bound:
                 weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
                 problem.goal = WithinTolerances(problem.coordinates, weights)
-                other = self._sequence(place, first, longest)
+                second = self._sequence(place, first, longest)
                 problem.goal = goal
-                windows, _, less = problem.timed(other, place)
-                if less < seconds and remaining(problem, other, place) == 0.0:
-                    sequence = other
+                windows, _, second_seconds = problem.timed(second, place)
+                reaches_goal = remaining_distance(problem, second, place) == 0.0
+                if second_seconds < seconds and reaches_goal:
+                    sequence = second
                     bound = problem.lower_bound(factor=problem.variance_factor(windows))
         return self._plan_of(sequence, start, place, bound)
 
-    def _sequence(self, place, first, longest):
+    def _sequence(self, place: int, first: Sequence[int], longest: float) -> list[int]:
+        """Return the motions of the greedy search from a place, without needless ones."""
         sequence = greedy(self.problem, place, first=first, longest=longest)
         return shortened_plan(self.problem, sequence, place, fixed=len(first))
 
@@ -423,24 +478,29 @@ class Planner:
         if isinstance(self.problem.goal, ToldApart) and np.isfinite(seconds):
             self.problem.goal.leave_out_of_reach(self.problem.best_covariance(seconds))
 
-    def _plan_of(self, sequence, start, place, bound):
-        """Return the Plan of a sequence of motions, with its covariance after each of them."""
+    def _plan_of(
+        self, sequence: Sequence[int], start: np.ndarray, place: int, bound: float
+    ) -> Plan:
+        """
+        Return the Plan of a sequence of motions, with its covariance after each of them.
+
+        `start`: position of the joints, at the place `place`; `bound`: lower bound of the time, s.
+        """
         problem = self.problem
         coordinates = problem.coordinates
-        covariance, _ = problem.covariance_after(sequence, place, cautious=False)
-        cautious, _ = problem.covariance_after(sequence, place, cautious=True)
         covariances = []
         ends = []
         for count in range(len(sequence) + 1):
-            covariance_then, seconds = problem.covariance_after(sequence[:count], place)
-            covariances.append(covariance_then)
+            covariance, seconds = problem.covariance_after(sequence[:count], place)
+            covariances.append(covariance)
             ends.append(seconds)
+        cautious, _ = problem.covariance_after(sequence, place, cautious=True)
         self._visited.clear()
         return Plan(
             coordinates.model,
-            tuple(self._named(number) for number in sequence),
+            tuple(self._visit(number) for number in sequence),
             np.array(ends[1:]),
-            coordinates.sd(covariance),
+            coordinates.sd(covariances[-1]),
             coordinates.tolerances,
             coordinates.wanted,
             coordinates.excess(np.array(covariances)),
@@ -450,13 +510,19 @@ class Planner:
             problem.goal.words,
         )
 
-    def _named(self, number: int) -> PlannedMotion:
-        """Return a motion of the repertoire; a rest where there was one already is a return."""
+    def _visit(self, number: int) -> PlannedMotion:
+        """
+        Return a motion of the library; a rest at a place with an earlier rest is a return.
+
+        The place of a rest is stored as visited.
+        """
         motion = self.problem.motions[number]
         place = int(self.problem.library.place_of[number])
-        if motion.kind is MotionKind.POSE:
-            motion = replace(motion, kind=MotionKind.RETURN) if place in self._visited else motion
-            self._visited.add(place)
+        if motion.kind is not MotionKind.POSE:
+            return motion
+        if place in self._visited:
+            motion = replace(motion, kind=MotionKind.RETURN)
+        self._visited.add(place)
         return motion
 
 
@@ -492,16 +558,17 @@ def make_planner(
 
     """
     model = choose_model(options, table)
-    values = (
-        None if calibration is None else model.start_from(calibration.model, calibration.values)
-    )
+    values = None
+    if calibration is not None:
+        values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, tolerances or options.tolerances), values)
-    step = table.joint_noise_rad or 0.0
-    beside = {
-        sensor: replace(own, reference=ReferenceNoise.of_steps(step, sensor))
-        for sensor, own in noise.items()
-    }
-    planner = Planner(PlanningProblem(MotionLibrary(table, limits), coordinates, beside, rate=rate))
+    encoder_step = table.joint_noise_rad or 0.0
+    with_encoders = {}
+    for sensor, sensor_noise in noise.items():
+        reference = ReferenceNoise.of_steps(encoder_step, sensor)
+        with_encoders[sensor] = replace(sensor_noise, reference=reference)
+    library = MotionLibrary(table, limits)
+    planner = Planner(PlanningProblem(library, coordinates, with_encoders, rate=rate))
     if calibration is not None:
         planner.take(calibration)
     return planner
@@ -559,16 +626,15 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so.
     """
     begins = [0.0, *plan.ends.tolist()]
-    of_joints: dict[str, Any] = {}
+    only_with_joints: dict[str, Any] = {}
     if plan.start is not None:
-        of_joints = {'probability': PROBABILITY, 'joints': list(plan.moved_joints)}
+        only_with_joints = {'probability': PROBABILITY, 'joints': list(plan.moved_joints)}
+    bound = None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3)
     return {
         'format': PLAN_FORMAT,
         'seconds': round(plan.seconds, 3),
-        'lower_bound_seconds': (
-            None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3)
-        ),
-        **of_joints,
+        'lower_bound_seconds': bound,
+        **only_with_joints,
         'motions': [
             {
                 'kind': str(motion.kind),
@@ -594,7 +660,7 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _mean_sd(noise, n_samples):
+def _mean_sd(noise: NoiseModel, n_samples: float) -> float:
     """Return the sd of a mean of samples: sqrt(white variance / n + variances of the biases)."""
     wander = sum(process.sd**2 for process in noise.bias_processes)
     return float(np.sqrt(noise.low_variance.mean() / n_samples + wander))

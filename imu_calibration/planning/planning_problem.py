@@ -48,7 +48,7 @@ PROBABILITY = 0.95
 COMMON_SHARES = (0.5, 0.9)
 """Shares of the biases' covariance that are tried as common to a session in the lower bound."""
 ROUNDS_OF_LENGTH = 3
-"""Lengths of session that are tried for each of them."""
+"""Lengths of session that are tried for each share."""
 
 
 class PlanningProblem:
@@ -58,7 +58,9 @@ class PlanningProblem:
     Parameters
     ----------
     library : MotionLibrary
+        Motions to choose from, each from rest to rest at one of its places.
     coordinates : Coordinates
+        The parameters as ``values = point + units * (basis @ z)``.
     noise : dict
         Sensor -> NoiseModel of single samples.
     rate : float
@@ -78,11 +80,11 @@ class PlanningProblem:
         self.coordinates = coordinates
         self.noise = noise
         self.rate = rate
-        self.known: np.ndarray | None = None
+        self.known_information: np.ndarray | None = None
         """Information about z of an earlier calibration, in addition to the prior."""
         self.goal: Goal = WithinTolerances(coordinates)
-        self._of_moves: dict[int, np.ndarray] = {}
-        """Place -> information in the moves to all places."""
+        self._information_of_moves: dict[int, np.ndarray] = {}
+        """Place -> information in the move to each place, shape (n_places, m, m)."""
         self.predictor = WindowPredictor(library.table, coordinates, noise, rate=rate)
 
     @property
@@ -92,7 +94,7 @@ class PlanningProblem:
 
     @cached_property
     def seconds(self) -> np.ndarray:
-        """Length of each motion without the way to it, s, shape (k,)."""
+        """Length of each motion without the move to its place, s, shape (k,)."""
         return np.array([motion.seconds for motion in self.motions])
 
     @cached_property
@@ -107,46 +109,49 @@ class PlanningProblem:
         return np.array([posterior.information_of(windows) for windows in self.windows])
 
     @cached_property
-    def ways(self) -> dict[tuple[int, int], tuple[Segment, ...]]:
-        """(place, place) -> the move from one to the other."""
+    def moves(self) -> dict[tuple[int, int], tuple[Segment, ...]]:
+        """(place, other place) -> segments of the move from one to the other."""
         places = self.library.places
-        ways = {}
+        moves = {}
         for a, b in product(range(len(places)), repeat=2):
             builder = MotionBuilder(len(places[a]), limits=self.library.limits, start=places[a])
-            ways[a, b] = builder.move_to(places[b]).segments
-        return ways
+            moves[a, b] = builder.move_to(places[b]).segments
+        return moves
 
     @cached_property
-    def way_windows(self) -> dict[tuple[int, int], list[PlannedWindow]]:
-        """(place, place) -> the windows of that move."""
-        return dict(zip(self.ways, self.predictor.predict(list(self.ways.values())), strict=True))
+    def move_windows(self) -> dict[tuple[int, int], list[PlannedWindow]]:
+        """(place, other place) -> the windows of the move from one to the other."""
+        return dict(zip(self.moves, self.predictor.predict(list(self.moves.values())), strict=True))
 
     @cached_property
-    def way_seconds(self) -> np.ndarray:
-        """Length of each move, s, shape (n_places, n_places)."""
-        seconds = np.zeros((len(self.library.places),) * 2)
-        for places, way in self.ways.items():
-            seconds[places] = sum(segment.duration for segment in way)
+    def move_seconds(self) -> np.ndarray:
+        """Duration of the move from place i to place j, s, shape (n_places, n_places)."""
+        n_places = len(self.library.places)
+        seconds = np.zeros((n_places, n_places))
+        for (start, end), segments in self.moves.items():
+            seconds[start, end] = sum(segment.duration for segment in segments)
         return seconds
 
-    def way_information(self, place: int) -> np.ndarray:
+    def move_information(self, place: int) -> np.ndarray:
         """
         Return the information about z and the biases in the move from a place to each motion.
 
         Shape (k, m, m).
         """
-        if place not in self._of_moves:
+        if place not in self._information_of_moves:
             posterior = self.posterior()
-            of_moves = []
+            information = []
             for target in range(len(self.library.places)):
-                of_moves.append(posterior.information_of(self.way_windows[place, target]))
-            self._of_moves[place] = np.array(of_moves)
-        return self._of_moves[place][self.library.place_of]
+                information.append(posterior.information_of(self.move_windows[place, target]))
+            self._information_of_moves[place] = np.array(information)
+        return self._information_of_moves[place][self.library.place_of]
 
     @property
     def prior(self) -> np.ndarray:
         """Information about z before any motion, shape (n, n)."""
-        return self.coordinates.prior_information + (0.0 if self.known is None else self.known)
+        if self.known_information is None:
+            return self.coordinates.prior_information
+        return self.coordinates.prior_information + self.known_information
 
     def posterior(self) -> Posterior:
         """Return the posterior before any motion."""
@@ -156,17 +161,19 @@ class PlanningProblem:
         """
         Return the number of the place nearest to a position, without whole turns of endless joints.
         """
-        away = self.library.places - position
-        turns = np.where(self.library.limits.endless, np.round(away / (2 * np.pi)), 0.0)
-        return int(np.argmin(np.abs(away - 2 * np.pi * turns).sum(axis=1)))
+        offset = self.library.places - position
+        turns = np.where(self.library.limits.endless, np.round(offset / (2 * np.pi)), 0.0)
+        return int(np.argmin(np.abs(offset - 2 * np.pi * turns).sum(axis=1)))
 
     def first_rests(self, place: int) -> list[int]:
         """
-        Return the first rests of a session, in widely different attitudes.
+        Return the numbers of the motions at rest with which a session from a place begins.
 
-        Each place is the nearest one, and the first rest is longer.
+        They are in widely different attitudes; the next place is always the nearest one, and the
+        first rest is longer.
         """
-        # Motions at rest of each place; places are in the order of their distance in attitude.
+        # Place -> its motions at rest. The library has the places with the largest differences in
+        # attitude first.
         rests_at: dict[int, list[int]] = {}
         for number, motion in enumerate(self.motions):
             if motion.kind is MotionKind.POSE:
@@ -177,7 +184,7 @@ class PlanningProblem:
         while len(chosen) < LEAST_RESTS and (unvisited or len(chosen) > 1):
             if not unvisited:  # a chain with few attitudes returns to them
                 unvisited = [at for at in dict.fromkeys(visited) if at != place]
-            place = min(unvisited, key=lambda at: self.way_seconds[place, at])
+            place = min(unvisited, key=lambda target: self.move_seconds[place, target])
             unvisited.remove(place)
             visited.append(place)
             rests = rests_at[place]
@@ -188,184 +195,204 @@ class PlanningProblem:
 
     def variance_factor(self, windows: Sequence[PlannedWindow]) -> float:
         """
-        Return the factor on the noise variance that its estimate exceeds on none of six axes.
+        Return a factor that (estimated / true noise variance) exceeds on none of six axes.
 
-        With probability PROBABILITY.
+        With probability P = PROBABILITY. The variance is estimated from the windows at rest, with
+        BATCH_DOF degrees of freedom each::
 
-        ``chi2_isf((1 - P) / 6, nu) / nu`` with nu degrees of freedom for each window at rest,
-        weighted by its samples. Where something is known, the noise was estimated from the rests of
-        a whole session already. Goals of separation contain a probability.
+            factor = chi2_isf((1 - P) / 6, nu) / nu
+            nu     = BATCH_DOF * n_rests,  n_rests = (sum samples)^2 / sum samples^2
+
+        After an earlier calibration the noise was estimated from LEAST_RESTS more rests. Goals of
+        separation contain a probability already: 1.
         """
         if not isinstance(self.goal, WithinTolerances):
             return 1.0
-        counts = np.array([window.samples for window in windows if window.kind == 'static'])
-        # Rests of equal length with the same variance of the estimate.
-        rests = counts.sum() ** 2 / (counts**2).sum() if len(counts) else 1.0
-        if self.known is not None:
-            rests += LEAST_RESTS
-        return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * rests) / (BATCH_DOF * rests))
+        samples = np.array([window.samples for window in windows if window.kind == 'static'])
+        # Number of rests of equal length with the same variance of the estimate.
+        n_rests = samples.sum() ** 2 / (samples**2).sum() if len(samples) else 1.0
+        if self.known_information is not None:
+            n_rests += LEAST_RESTS
+        return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * n_rests) / (BATCH_DOF * n_rests))
 
     def least_session(self) -> float:
-        """
-        Return the least time of the first rests and of the ways between them, s.
-
-        These are the rests with which a session begins.
-        """
+        """Return the least time of the first rests of a session and the moves between them, s."""
         rests = self.first_rests(0)
         if len(rests) <= 1:
             return 0.0
-        away = self.way_seconds[~np.eye(len(self.way_seconds), dtype=bool)]
-        return float(self.seconds[rests].sum() + (len(rests) - 1) * away.min(initial=np.inf))
+        to_other_places = self.move_seconds[~np.eye(len(self.move_seconds), dtype=bool)]
+        shortest_move = to_other_places.min(initial=np.inf)
+        return float(self.seconds[rests].sum() + (len(rests) - 1) * shortest_move)
 
     def lower_bound(self, *, factor: float = 1.0, relaxed: Relaxation | None = None) -> float:
         """
         Return a time below which no plan of these motions meets the tolerances, s.
 
-        The plans are made of these motions and the moves between their places.
+        The plans are made of these motions and the moves between their places. NaN where a
+        tolerance is out of reach.
 
-        With the variance of the noise within windows larger by `factor`. NaN where a tolerance is
-        out of reach. `relaxed` is the relaxation for the same arguments where it is available
-        already.
+        After an earlier calibration it is the time of the relaxed plan. Otherwise it is the largest
+        of this time, the time that the biases need by themselves, that of the first rests, and
+        bounds with a share of the bias wander that is common to a session of at most T: such a
+        share limits the biases for any amount of data. With value(T) of the relaxation for
+        sessions of T, every plan needs at least ``min(T, value(T))``; a few T are tried.
 
-        Without prior information on the biases, a share of their wander is common to a session of
-        at most T, which limits their parameters for any amount of data: every plan needs at least
-        ``min(T, value(T))``, the value that of the relaxation for sessions of T. The largest bound
-        over T is used; without any T the share is zero.
+        Parameters
+        ----------
+        factor : float
+            On the variance of the noise within windows.
+        relaxed : Relaxation, optional
+            The relaxation for this factor, where it is available already.
+
         """
-        best = (relaxed or self.relaxation(factor=factor)).seconds
-        if self.known is not None or not np.isfinite(best):
-            return best
-        floor = self._bias_floor(factor)
-        if not np.isfinite(floor):
+        bound = (relaxed or self.relaxation(factor=factor)).seconds
+        if self.known_information is not None or not np.isfinite(bound):
+            return bound
+        bias_seconds = self._bias_seconds(factor)
+        if not np.isfinite(bias_seconds):
             return float('nan')
-        for share in COMMON_SHARES if floor > 0.3 * best else ():
-            seconds = max(best, floor)
+        # The common share matters only where the biases determine the time.
+        shares = COMMON_SHARES if bias_seconds > 0.3 * bound else ()
+        for share in shares:
+            session = max(bound, bias_seconds)
             for _ in range(ROUNDS_OF_LENGTH):
-                value = self.relaxation(common=(share, seconds), factor=factor).seconds
-                best = max(best, min(seconds, value))
-                if value < 1.05 * seconds:
+                value = self.relaxation(common=(share, session), factor=factor).seconds
+                bound = max(bound, min(session, value))
+                # The best session has value(T) = T: the next one is the geometric mean of both, at
+                # most three times longer.
+                if value < 1.05 * session:
                     break
-                seconds = float(np.sqrt(seconds * min(value, 9.0 * seconds)))
-        return max(best, floor, self.least_session())
+                session = float(np.sqrt(session * min(value, 9.0 * session)))
+        return max(bound, bias_seconds, self.least_session())
 
-    def _bias_floor(self, factor: float) -> float:
+    def _bias_seconds(self, factor: float) -> float:
         """
-        Return the observation time that the biases alone need, s.
+        Return the least time of continuous observation from which each bias meets its tolerance, s.
 
-        Infinite if they are out of reach.
+        Infinite if one does not. `factor`: on the variance of the noise within windows.
         """
         coordinates = self.coordinates
         lengths = np.geomspace(0.01, MAX_REACHABLE_SECONDS, 2000)
-        floor = 0.0
+        seconds = 0.0
         for sensor in SENSORS:
             biases = coordinates.model.part(sensor, Role.OFFSET)
             for k, parameter in enumerate(range(biases.start, biases.stop)):
-                # The observations must have at most this variance: 1/wanted = 1/prior + 1/room.
+                # Largest variance of the observations: 1 / tolerated = 1 / prior + 1 / largest.
                 prior = coordinates.prior_sd[parameter] ** 2
-                wanted = coordinates.tolerances[parameter] ** 2
-                room = 1.0 / (1.0 / wanted - 1.0 / prior) if wanted < prior else np.inf
+                tolerated = coordinates.tolerances[parameter] ** 2
+                largest = 1.0 / (1.0 / tolerated - 1.0 / prior) if tolerated < prior else np.inf
                 white = factor * self.noise[sensor].low_variance[k % 3] / self.rate
-                enough = least_bias_variance(self.noise[sensor], white, lengths) <= room
-                if not enough.any():
+                suffices = least_bias_variance(self.noise[sensor], white, lengths) <= largest
+                if not suffices.any():
                     return np.inf
                 # The last length that is too short.
-                floor = max(floor, float(lengths[max(int(np.argmax(enough)) - 1, 0)]))
-        return floor
+                last_too_short = max(int(np.argmax(suffices)) - 1, 0)
+                seconds = max(seconds, float(lengths[last_too_short]))
+        return seconds
 
     def relaxation(
         self, *, common: tuple[float, float] = (0.0, 0.0), factor: float = 1.0
     ) -> Relaxation:
         """
-        Return the relaxed plan.
+        Return the relaxed plan: fractional visits of motions and moves, with additive information.
 
-        `common`: (share of the biases' covariance, seconds of the longest session that counts).
+        `common`: (share of the biases' covariance that is common to a session, seconds of the
+        longest session); `factor`: on the variance of the noise within windows.
         """
-        share, seconds = common
-        edges = [key for key, windows in self.way_windows.items() if windows]
-        own = np.flatnonzero(self.seconds > 0)
-        visits = [self.windows[number] for number in own]
-        visits += [self.way_windows[key] for key in edges]
-        most = np.zeros((len(visits), *self.coordinates.prior_information.shape))
+        share, session = common
+        moves = [key for key, windows in self.move_windows.items() if windows]
+        motions = np.flatnonzero(self.seconds > 0)
+        visits = [self.windows[number] for number in motions]
+        visits += [self.move_windows[key] for key in moves]
+        # Upper bound of the information of each visit.
+        information = np.zeros((len(visits), *self.coordinates.prior_information.shape))
         for number, windows in enumerate(visits):
             for window in windows:
-                most[number] += additive_bound(window, self.noise, share=1.0 - share, factor=factor)
-        cost = np.concatenate([self.seconds[own], [self.way_seconds[key] for key in edges]])
-        prior, asked = self.prior, self.coordinates.asked
+                information[number] += additive_bound(
+                    window, self.noise, share=1.0 - share, factor=factor
+                )
+        seconds = np.concatenate([self.seconds[motions], [self.move_seconds[key] for key in moves]])
+        prior = self.prior
+        rows = self.coordinates.requested_rows
         if share:
-            prior, asked = self._with_common(prior, asked, share, seconds)
-        return relax(most, cost, prior, asked=asked)
+            prior, rows = self._with_common_offset(prior, rows, share, session)
+        return relax(information, seconds, prior, rows=rows)
 
-    def _with_common(self, prior, asked, share, seconds):
+    def _with_common_offset(
+        self, prior: np.ndarray, rows: np.ndarray, share: float, session: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (prior information, requested rows) with one coordinate b for two offsets.
+        Return (prior information, requested rows) for biases with an offset common to a session.
 
-        A bias and the offset common to the session are this one coordinate b.
+        Windows observe only the sum b of a bias and the offset, which takes the place of the bias
+        among the coordinates z. With the prior variances P of the bias and P' = P + Q of b::
 
-        With P and P' the prior variances of the bias and of b, ``var(bias) = (1 / P + 1 / (P' -
-        P))^-1 + (P / P')^2 var(b)``.
+            var(bias) = P Q / P' + (P / P')^2 var(b),   Q = share * common_variance
+
+        The tolerance 1 of the bias is thus a tolerance ``(1 - P Q / P') (P' / P)^2`` on var(b), by
+        whose root its row is divided.
         """
         prior = prior.copy()
-        asked = asked.copy()
-        model = self.coordinates.model
+        rows = rows.copy()
+        coordinates = self.coordinates
+        n_params = len(coordinates.model.param_names)
         for sensor in SENSORS:
-            for parameter in range(
-                *model.part(sensor, Role.OFFSET).indices(len(model.param_names))
-            ):
-                place = int(np.argmax(np.abs(self.coordinates.basis[parameter])))
-                before = 1.0 / prior[place, place]
+            biases = coordinates.model.part(sensor, Role.OFFSET)
+            for parameter in range(*biases.indices(n_params)):
+                place = int(np.argmax(np.abs(coordinates.basis[parameter])))
+                bias = 1.0 / prior[place, place]
                 offset = (
                     share
-                    * common_variance(self.noise[sensor], seconds)
-                    / self.coordinates.units[parameter] ** 2
+                    * common_variance(self.noise[sensor], session)
+                    / coordinates.units[parameter] ** 2
                 )
-                after = before + offset
-                room = (1.0 - before * offset / after) * (after / before) ** 2
-                prior[place, place] = 1.0 / after
-                # Without any margin a small number is used: the value then exceeds any session of
-                # interest.
-                asked[np.abs(asked[:, place]) > 0.5] /= np.sqrt(max(room, 1e-4))
-        return prior, asked
+                total = bias + offset
+                tolerated = (1.0 - bias * offset / total) * (total / bias) ** 2
+                prior[place, place] = 1.0 / total
+                # Without any margin a small number is used: the value of the relaxation then
+                # exceeds any session of interest.
+                rows[np.abs(rows[:, place]) > 0.5] /= np.sqrt(max(tolerated, 1e-4))
+        return prior, rows
 
     def timed(
         self, sequence: Sequence[int], start: int
     ) -> tuple[list[PlannedWindow], np.ndarray, float]:
         """
-        Return (windows, their middles, total time) of motions one after the other from a place.
+        Return (windows, their middles since the beginning, total time) of consecutive motions.
 
-        With the ways between them.
+        From the place `start`, with the moves between the places of the motions; times in s.
         """
         windows = []
-        times = []
+        middles = []
         now = 0.0
         place = start
         for number in sequence:
             target = int(self.library.place_of[number])
-            way = (self.way_windows[place, target], self.way_seconds[place, target])
-            for part, seconds in (way, (self.windows[number], self.seconds[number])):
-                windows += part
-                times += [now + window.middle for window in part]
+            move = (self.move_windows[place, target], self.move_seconds[place, target])
+            motion = (self.windows[number], self.seconds[number])
+            for new_windows, seconds in (move, motion):
+                windows += new_windows
+                middles += [now + window.middle for window in new_windows]
                 now += seconds
             place = target
-        return windows, np.array(times), float(now)
+        return windows, np.array(middles), float(now)
 
     def covariance_after(
         self, sequence: Sequence[int], start: int, *, cautious: bool = False
     ) -> tuple[np.ndarray, float]:
         """
-        Return (covariance of z, total time) after motions one after the other from a place.
+        Return (covariance of z, total time) after consecutive motions from a place.
 
         `cautious`: with `variance_factor`.
         """
-        windows, times, seconds = self.timed(sequence, start)
-        total = self.prior
+        windows, middles, seconds = self.timed(sequence, start)
+        information = self.prior
         if windows:
-            total = total + exact_information(
-                windows,
-                times,
-                self.noise,
-                factor=self.variance_factor(windows) if cautious else 1.0,
+            factor = self.variance_factor(windows) if cautious else 1.0
+            information = information + exact_information(
+                windows, middles, self.noise, factor=factor
             )
-        return np.linalg.inv(total), seconds
+        return np.linalg.inv(information), seconds
 
     def best_covariance(self, seconds: float) -> np.ndarray:
         """
@@ -375,19 +402,16 @@ class PlanningProblem:
 
         Every motion fills the whole time at once, and the biases are independent between windows.
         """
-        moves = [
-            (windows, float(self.way_seconds[key]))
-            for key, windows in self.way_windows.items()
-            if windows
-        ]
-        everything = [*zip(self.windows, self.seconds.tolist(), strict=True), *moves]
-        total = self.prior
-        for windows, length in everything:
+        visits = list(zip(self.windows, self.seconds.tolist(), strict=True))
+        for key, windows in self.move_windows.items():
+            visits.append((windows, float(self.move_seconds[key])))
+        information = self.prior
+        for windows, length in visits:
             if windows:
-                total = total + sum(additive_bound(window, self.noise) for window in windows) * max(
-                    seconds / length, 1.0
-                )
-        return np.linalg.inv(total)
+                per_visit = sum(additive_bound(window, self.noise) for window in windows)
+                n_visits = max(seconds / length, 1.0)
+                information = information + per_visit * n_visits
+        return np.linalg.inv(information)
 
 
 def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
@@ -407,16 +431,15 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
         'accelerometer': (noise.accel_density, noise.accel_instability, noise.accel_resolution),
         'gyroscope': (noise.gyro_density, noise.gyro_instability, noise.gyro_resolution),
     }
-    found = {}
+    noise_of = {}
     for sensor, (density, instability, resolution) in figures.items():
-        found[sensor] = NoiseModel(
-            np.full(3, density**2 * rate + resolution**2 / 12),
-            np.ones(3),
-            bias_processes=(
-                (BiasProcess(instability, noise.correlation_time),) if instability > 0 else ()
-            ),
-        )
-    return found
+        processes = ()
+        if instability > 0:
+            processes = (BiasProcess(instability, noise.correlation_time),)
+        # White noise of a sample, and the variance of rounding to the resolution.
+        variance = np.full(3, density**2 * rate + resolution**2 / 12)
+        noise_of[sensor] = NoiseModel(variance, np.ones(3), bias_processes=processes)
+    return noise_of
 
 
 def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:

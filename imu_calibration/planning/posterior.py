@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -37,106 +37,125 @@ class Relaxation:
     seconds: float
     """Lower bound on the time of every plan, s."""
     weights: np.ndarray
-    """How much each parameter limits the relaxed plan, sum 1, shape (p,)."""
+    """Weight of each parameter in the certificate: how much it limits the plan, sum 1, (p,)."""
 
 
 def relax(
-    information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, asked: np.ndarray
+    information: np.ndarray, seconds: np.ndarray, prior: np.ndarray, *, rows: np.ndarray
 ) -> Relaxation:
     """
     Return the relaxed plan with the best certificate found; NaN where a tolerance is out of reach.
 
+    The relaxed plan minimises the time over real numbers of visits x_i >= 0 of motions with
+    information M_i, such that every parameter meets its tolerance 1::
+
+        min_x sum_i x_i seconds_i  with  e_p' C e_p <= 1,  C = (prior + sum_i x_i M_i)^-1
+
     Visits and weights are improved by turns with multiplicative steps: visits of motions that are
     worth more than they cost grow (the algorithm of A-optimal design), and so do the weights of
-    parameters with the largest excess over tolerance.
+    parameters with the largest excess over tolerance. With weights w and the price matrix
+    ``K = C (sum_p w_p e_p e_p') C``, the certificate (dual value) that no plan needs less is::
+
+        (sum_p w_p (2 e_p' C e_p - 1) - tr(prior K)) / max_i (tr(M_i K) / seconds_i)
 
     Parameters
     ----------
     information : ndarray, shape (k, n, n)
-        Most that one visit adds.
+        M_i, the most that one visit adds.
     seconds : ndarray, shape (k,)
-        Cost.
-    known : ndarray, shape (n, n)
+        Time of one visit.
+    prior : ndarray, shape (n, n)
         Information to start with.
-    asked : ndarray, shape (p, n)
-        Rows e_i: parameters in tolerances.
+    rows : ndarray, shape (p, n)
+        Rows e_p: parameters in tolerances.
 
     """
-    weights = np.full(len(asked), 1.0 / len(asked))
-    if _worst(known, asked) <= 1.0:
+    weights = np.full(len(rows), 1.0 / len(rows))
+    if _largest_variance(prior, rows) <= 1.0:
         return Relaxation(0.0, weights)
     per_second = np.sum(information / seconds[:, None, None], axis=0)
-    if _worst(known + MAX_REACHABLE_SECONDS * per_second, asked) > 1.0:
+    if _largest_variance(prior + MAX_REACHABLE_SECONDS * per_second, rows) > 1.0:
         return Relaxation(np.nan, weights)
-    flat = used = information.reshape(len(seconds), -1)
+    # M_i of all motions, and of the useful ones, whose indexes are `kept`; one row each.
+    flat = information.reshape(len(seconds), -1)
+    flat_kept = flat
     kept = np.arange(len(seconds))
-    root = np.linalg.cholesky(known)
-    rows = scipy.linalg.solve_triangular(root, asked.T, lower=True).T
-    share = 1.0 / len(seconds) / seconds
+    root = np.linalg.cholesky(prior)
+    whitened_rows = scipy.linalg.solve_triangular(root, rows.T, lower=True).T
+    # Visits up to a common factor, at first with equal times.
+    visits = 1.0 / len(seconds) / seconds
     best = Relaxation(0.0, weights)
     for number in range(MAX_WEIGHT_STEPS):
-        direction = np.tensordot(share[kept], used, 1).reshape(known.shape)
-        scale = _scale(direction, root, rows)
-        # With C the covariance and w the weights: variance_p = e_p' C e_p, and the price matrix
-        # C (sum_p w_p e_p e_p') C; worth of a visit: tr(information prices) per second.
+        direction = np.tensordot(visits[kept], flat_kept, 1).reshape(prior.shape)
+        scale = _scale(direction, root, whitened_rows)
         # Nearly singular in unreachable directions.
-        covariance = inverse_normal(known + scale * direction)
-        columns_asked = covariance @ asked.T
-        variance = np.einsum('pn,np->p', asked, columns_asked)
-        prices = (columns_asked * weights) @ columns_asked.T
+        covariance = inverse_normal(prior + scale * direction)
+        columns_of_rows = covariance @ rows.T
+        variance = np.einsum('pn,np->p', rows, columns_of_rows)
+        prices = (columns_of_rows * weights) @ columns_of_rows.T
+        # Worth of a second of each motion: tr(M_i K) / seconds_i.
         worth = np.zeros(len(seconds))
-        worth[kept] = used @ prices.ravel() / seconds[kept]
-        relaxed = scale * float(share @ seconds)
+        worth[kept] = flat_kept @ prices.ravel() / seconds[kept]
+        plan_seconds = scale * float(visits @ seconds)
         if number % 25 == 0 or number == MAX_WEIGHT_STEPS - 1:
             # The certificate needs the worth of all motions, the steps only of the useful ones.
             worth = flat @ prices.ravel() / seconds
             factor = 1.0 / worth.max()
-            bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
+            bound = factor * (weights @ (2 * variance - 1) - np.sum(prior * prices))
             if bound > best.seconds:
                 best = Relaxation(float(bound), weights)
-            if relaxed < CERTIFICATE_RATIO * best.seconds:
+            if plan_seconds < CERTIFICATE_RATIO * best.seconds:
                 break
-            is_visited = share * seconds > 1e-4 * (share @ seconds)
+            is_visited = visits * seconds > 1e-4 * (visits @ seconds)
             kept = np.flatnonzero((worth > 0.3 * worth.max()) | is_visited)
-            used = flat[kept]
-        spent = share[kept] * seconds[kept]
+            flat_kept = flat[kept]
+        # Step of the visits, relative to the mean worth of the time spent; then of the weights.
+        spent = visits[kept] * seconds[kept]
         mean_worth = worth[kept] @ spent / spent.sum()
-        share[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / mean_worth)
-        share = np.where(np.isin(np.arange(len(share)), kept) | (number <= 50), share, 0.0)
+        visits[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / mean_worth)
+        # Early steps keep the visits of the other motions, which may become useful again.
+        visits = np.where(np.isin(np.arange(len(visits)), kept) | (number <= 50), visits, 0.0)
         weights = weights * variance / variance.max()
         weights /= weights.sum()
     return best
 
 
-def _worst(information, asked):
-    return float(np.einsum('pn,pn->p', asked @ np.linalg.inv(information), asked).max())
+def _largest_variance(information: np.ndarray, rows: np.ndarray) -> float:
+    """Return the largest ``e_p' M^-1 e_p`` of information M, (n, n), and rows e_p, (p, n)."""
+    return float(np.einsum('pn,pn->p', rows @ np.linalg.inv(information), rows).max())
 
 
-def _scale(direction, root, rows):
+def _scale(direction: np.ndarray, root: np.ndarray, whitened_rows: np.ndarray) -> float:
     """
-    Return how much of `direction` must be added to ``root @ root.T``.
+    Return the factor s of `direction` at which the worst parameter meets its tolerance.
 
-    With this amount the worst parameter meets its tolerance.
+    With prior information R R' (`root` R), direction D, and rows e_p = R f_p (`whitened_rows` f_p),
+    by the eigenvalues l_j and eigenvectors v_j of R^-1 D R'^-1::
+
+        max_p e_p' (R R' + s D)^-1 e_p = max_p sum_j (f_p' v_j)^2 / (1 + s l_j) = 1
+
+    It decreases with s, whose logarithm is found by bisection.
     """
-    inner = scipy.linalg.solve_triangular(
-        root, scipy.linalg.solve_triangular(root, direction, lower=True).T, lower=True
-    )
-    values, vectors = scipy.linalg.eigh(0.5 * (inner + inner.T))
-    squares = (rows @ vectors) ** 2
-    low, high = -30.0, 60.0
+    half_whitened = scipy.linalg.solve_triangular(root, direction, lower=True)
+    whitened = scipy.linalg.solve_triangular(root, half_whitened.T, lower=True)
+    values, vectors = scipy.linalg.eigh(0.5 * (whitened + whitened.T))
+    squares = (whitened_rows @ vectors) ** 2
+    low = -30.0
+    high = 60.0
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
-        enough = (squares / (1 + np.exp(middle) * np.maximum(values, 0.0))).sum(axis=1).max() <= 1.0
-        low, high = (low, middle) if enough else (middle, high)
+        variance = (squares / (1 + np.exp(middle) * np.maximum(values, 0.0))).sum(axis=1)
+        if variance.max() <= 1.0:
+            high = middle
+        else:
+            low = middle
     return float(np.exp(high))
 
 
 SAMPLING = 16.0
 """Instants per second at which columns are evaluated: a turn at 300 deg/s has 19."""
 LEAST_INSTANTS = 4
-"""
-Instants of a rest, where columns are all one and the bias wanders, and of the shortest motion.
-"""
+"""Instants of a rest, where only the bias changes, and of the shortest motion."""
 BELIEF_BLOCK_ROWS = 8192
 """Instants whose columns are held in memory at a time."""
 WINDOWS = {'rest': 'static', 'spin': 'spin'}
@@ -183,6 +202,8 @@ class _Cut:
 
 WINDOW_SETTINGS = WindowSettings()
 """How the calibration will cut windows."""
+WanderOf = Callable[[str, int, float], tuple[np.ndarray, np.ndarray]]
+"""`WindowPredictor._wander` with a cache."""
 
 
 class WindowPredictor:
@@ -219,16 +240,19 @@ class WindowPredictor:
 
         # The columns of several windows at a time, which limits the memory.
         blocks = np.cumsum([len(cut.motion) for cut in cuts]) // BELIEF_BLOCK_ROWS
-        # Many motions last equally long, at least a move and its way back.
-        wander = cache(self._wander)
+        # Many motions last equally long, at least a move and its reverse.
+        wander_of = cache(self._wander)
         windows = []
         for block in np.unique(blocks):
-            windows += self._windows([cuts[k] for k in np.flatnonzero(blocks == block)], wander)
+            cuts_of_block = [cuts[k] for k in np.flatnonzero(blocks == block)]
+            windows += self._windows(cuts_of_block, wander_of)
 
+        # Windows of each motion.
         ends = np.cumsum(n_cuts)
         return [windows[end - n : end] for end, n in zip(ends, n_cuts)]
 
-    def _windows(self, cuts, wander):
+    def _windows(self, cuts: Sequence[_Cut], wander_of: WanderOf) -> list[PlannedWindow]:
+        """Return the PlannedWindow of each cut, with the columns of all computed at once."""
         motion = JointMotion.concatenate(cut.motion for cut in cuts)
         ends = np.cumsum([len(cut.motion) for cut in cuts])
         model = self.coordinates.folded
@@ -241,41 +265,56 @@ class WindowPredictor:
         for cut, end in zip(cuts, ends):
             rows = slice(end - len(cut.motion), end)
             designs_of_cut = {sensor: designs[sensor][rows] for sensor in SENSORS}
-            windows.append(self._window(cut, designs_of_cut, wander))
+            windows.append(self._window(cut, designs_of_cut, wander_of))
         return windows
 
-    def _cut(self, segments) -> Iterator[_Cut]:
+    def _cut(self, segments: Sequence[Segment]) -> Iterator[_Cut]:
         """Yield the windows into which the calibration will cut a motion."""
         begin = 0.0
         for segment in segments:
             kind = WINDOWS.get(segment.kind, 'dynamic')
+            # Rests and spins begin after the vibrations have decayed.
             lost = 0.0 if kind == 'dynamic' else WINDOW_SETTINGS.settling
             seconds = segment.duration - lost
             if seconds >= getattr(WINDOW_SETTINGS, f'{kind}_minimum'):
-                count = LEAST_INSTANTS
+                n_instants = LEAST_INSTANTS
                 if kind != 'static':
-                    count = max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
-                time = lost + (np.arange(count) + 0.5) / count * seconds
+                    n_instants = max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
+                time = lost + (np.arange(n_instants) + 0.5) / n_instants * seconds
                 motion = Profile('', (segment,)).at(time)
                 middle = begin + lost + seconds / 2
                 yield _Cut(motion, kind, middle, segment.duration, seconds)
             begin += segment.duration
 
-    def _wander(self, sensor, count, seconds):
+    def _wander(self, sensor: str, count: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (variances, directions) of the changes of the bias after the middle of a window.
+        Return (eigenvalues, eigenvectors) of the covariance of the bias in a half of a window.
 
-        Given its value in the middle, the bias before is independent of the bias after, with the
-        mirrored covariance.
+        Of its changes since the middle of the window, at the later half of `count` instants in
+        `seconds`, shapes (count // 2,) and (count // 2, count // 2). Given the bias in the middle,
+        the changes before are independent of those after, with the mirrored covariance.
         """
         half = count // 2
         after_middle = ((np.arange(count - half, count) + 0.5) / count - 0.5) * seconds
         return np.linalg.eigh(self.noise[sensor].wander_within(after_middle))
 
-    def _window(self, cut, designs, wander_of):
-        samples = cut.seconds * self.rate
+    def _window(
+        self, cut: _Cut, designs: dict[str, np.ndarray], wander_of: WanderOf
+    ) -> PlannedWindow:
+        """
+        Return the means of a window and the information of its samples about them.
+
+        `designs`: sensor -> columns of the model at the instants, (count, n_columns). The samples
+        of an axis are ``1 bias + design @ slope @ z`` plus white noise and the wander of the bias
+        since the middle, with weights W (inverse variances) in the directions of the wander::
+
+            var(mean) = 1 / (1' W 1),  mean = var(mean) 1' W rows,
+            within    = sum (rows - 1 mean)' W (rows - 1 mean)
+        """
+        n_samples = cut.seconds * self.rate
         count = len(cut.motion)
-        means, variance = {}, {}
+        means = {}
+        variance = {}
         within = np.zeros((self.coordinates.size,) * 2)
         for sensor, design in designs.items():
             slope = self.coordinates.slopes[sensor]
@@ -283,26 +322,28 @@ class WindowPredictor:
             means[sensor] = np.empty((3, slope.shape[2]))
             variance[sensor] = np.empty(3)
             reference = noise.reference.variance([cut.kind], np.array([cut.seconds]))[0]
-            # In the directions of the wander its values are independent, before and after the
-            # middle: the rows are weighted by the sum of both variances.
-            after, turned = wander_of(sensor, count, cut.seconds)
-            wander = np.concatenate([after, np.zeros(count % 2), after])
+            # Both halves are turned into the directions of the wander, where its values are
+            # independent; an instant in the middle has no wander.
+            half_wander, directions = wander_of(sensor, count, cut.seconds)
+            half = len(half_wander)
+            wander = np.concatenate([half_wander, np.zeros(count % 2), half_wander])
             early, centre, late = np.split(
-                np.column_stack([np.ones(count), design]), [len(after), count - len(after)]
+                np.column_stack([np.ones(count), design]), [half, count - half]
             )
             # Without the copy numpy multiplies reversed rows without BLAS.
-            rows = np.concatenate([turned.T @ early[::-1].copy(), centre, turned.T @ late])
+            rows = np.concatenate([directions.T @ early[::-1].copy(), centre, directions.T @ late])
             ones = rows[:, 0]
             rows = rows[:, 1:]
             for axis in range(3):
-                weight = 1 / (noise.low_variance[axis] * count / samples + wander)
-                variance[sensor][axis] = 1 / (weight @ ones**2)
-                mean = variance[sensor][axis] * ((weight * ones) @ rows)
+                # An instant has the white noise of the mean of its share of the samples.
+                weight = 1 / (noise.low_variance[axis] * count / n_samples + wander)
+                mean_variance = 1 / (weight @ ones**2)
+                mean = mean_variance * ((weight * ones) @ rows)
                 centred = (rows - np.outer(ones, mean)) @ slope[:, axis]
-                variance[sensor][axis] += reference
+                variance[sensor][axis] = mean_variance + reference
                 means[sensor][axis] = mean @ slope[:, axis]
                 within += centred.T @ (centred * weight[:, None])
-        return PlannedWindow(cut.kind, cut.middle, cut.length, samples, means, variance, within)
+        return PlannedWindow(cut.kind, cut.middle, cut.length, n_samples, means, variance, within)
 
 
 class Posterior:
@@ -311,7 +352,8 @@ class Posterior:
 
     Between motions the processes decay, ``u <- exp(-dt / time) u + noise``, so that early
     observations of a bias contain little information on its present value: a dwell saturates, a
-    return does not. They are constant within one motion.
+    return does not. They are constant within one motion. The state has m elements: the n
+    coordinates, then for each sensor and process the values of its three axes.
 
     Parameters
     ----------
@@ -329,16 +371,20 @@ class Posterior:
         for sensor in SENSORS:
             for process in noise[sensor].bias_processes:
                 processes += [process, process, process]  # one for each axis
-        self._power = np.array([process.sd**2 for process in processes])
+        self._variances = np.array([process.sd**2 for process in processes])
+        """Stationary variance of each process and axis."""
         self._times = np.array([process.time for process in processes])
-        total = self.size + len(processes)
-        self.covariance = np.zeros((total, total))
+        """Correlation time of each process and axis, s."""
+        n_state = self.size + len(processes)
+        self.covariance = np.zeros((n_state, n_state))
+        """Covariance of the state at the time of the last motion, shape (m, m)."""
         self.covariance[: self.size, : self.size] = np.linalg.inv(information)
-        self.covariance[self.size :, self.size :] = np.diag(self._power)
-        self._last = 0.0
+        self.covariance[self.size :, self.size :] = np.diag(self._variances)
+        self._last_seconds = 0.0
+        """Length of the last motion, s."""
 
     @property
-    def known(self) -> np.ndarray:
+    def covariance_z(self) -> np.ndarray:
         """Covariance of z, shape (n, n)."""
         return self.covariance[: self.size, : self.size]
 
@@ -346,24 +392,25 @@ class Posterior:
         """
         Return the information about z and the biases in the windows of a motion, shape (m, m).
         """
-        total = np.zeros_like(self.covariance)
+        information = np.zeros_like(self.covariance)
         for window in windows:
-            first = self.size
-            total[: self.size, : self.size] += window.within
+            first_process = self.size
+            information[: self.size, : self.size] += window.within
             for sensor in SENSORS:
                 noise = self.noise[sensor]
-                rows = np.zeros((3, len(total)))
+                # The mean of an axis is linear in z and has the sum of the axis' processes.
+                rows = np.zeros((3, len(information)))
                 rows[:, : self.size] = window.means[sensor]
                 for number in range(3 * len(noise.bias_processes)):
-                    rows[number % 3, first + number] = 1.0
-                first += 3 * len(noise.bias_processes)
+                    rows[number % 3, first_process + number] = 1.0
+                first_process += 3 * len(noise.bias_processes)
                 variance = window.variance[sensor] + noise.offset_sd**2
-                total += rows.T @ (rows / variance[:, None])
-        return total
+                information += rows.T @ (rows / variance[:, None])
+        return information
 
     def after(self, information: np.ndarray, seconds: np.ndarray) -> np.ndarray:
         """
-        Return the covariances after each of several motions.
+        Return the covariances of the state after each of several motions, of which one is next.
 
         Parameters
         ----------
@@ -377,22 +424,29 @@ class Posterior:
         ndarray, shape (k, m, m)
 
         """
-        # Many motions last equally long.
-        steps, motion = np.unique(0.5 * (self._last + seconds), return_inverse=True)
-        return np.linalg.inv(np.linalg.inv(self._forgotten(steps))[motion] + information)
+        # From middle to middle of the motions. Many of them last equally long.
+        steps, step_of_motion = np.unique(0.5 * (self._last_seconds + seconds), return_inverse=True)
+        prior = np.linalg.inv(self._predicted(steps))[step_of_motion]
+        return np.linalg.inv(prior + information)
 
     def take(self, information: np.ndarray, seconds: float) -> None:
-        """Advance by a chosen motion."""
+        """Advance by a chosen motion of this information and length, s."""
         self.covariance = self.after(information[None], np.array([seconds]))[0]
-        self._last = seconds
+        self._last_seconds = seconds
 
-    def _forgotten(self, steps):
+    def _predicted(self, steps: np.ndarray) -> np.ndarray:
+        """
+        Return the covariances of the state after times without a motion, shape (k, m, m).
+
+        The biases decay by ``d = exp(-step / time)`` and gain the variance ``(1 - d^2) sd^2``; z is
+        constant. `steps`: times in s, shape (k,).
+        """
         decay = np.ones((len(steps), len(self.covariance)))
         decay[:, self.size :] = np.exp(-steps[:, None] / self._times)
-        spread = decay[:, :, None] * self.covariance * decay[:, None, :]
-        at = np.arange(self.size, len(self.covariance))
-        spread[:, at, at] += (1 - decay[:, at] ** 2) * self._power
-        return spread
+        predicted = decay[:, :, None] * self.covariance * decay[:, None, :]
+        biases = np.arange(self.size, len(self.covariance))
+        predicted[:, biases, biases] += (1 - decay[:, biases] ** 2) * self._variances
+        return predicted
 
 
 def exact_information(
@@ -403,9 +457,9 @@ def exact_information(
     factor: float = 1.0,
 ) -> np.ndarray:
     """
-    Return the information about z of the windows of a whole plan, as the calibration weighs them.
+    Return the information about z in all windows of a plan, with the weights of the calibration.
 
-    Shape (n, n).
+    Shape (n, n). The biases at the middles of the windows are correlated by their processes.
 
     Parameters
     ----------
@@ -418,32 +472,30 @@ def exact_information(
         On the variance of the noise within windows.
 
     """
-    total = np.sum([window.within for window in windows], axis=0) / factor
+    information = np.sum([window.within for window in windows], axis=0) / factor
     for sensor in SENSORS:
         model = noise[sensor]
-        variance = (
-            factor * np.stack([window.variance[sensor] for window in windows]) + model.offset_sd**2
-        )
+        variance = np.stack([window.variance[sensor] for window in windows])
         whitening = Whitening(
-            variance, times, [np.arange(len(times))], processes=model.bias_processes
+            factor * variance + model.offset_sd**2,
+            times,
+            [np.arange(len(times))],
+            processes=model.bias_processes,
         )
-        rows = whitening(np.stack([window.means[sensor] for window in windows])).reshape(
-            -1, len(total)
-        )
-        total = total + rows.T @ rows
-    return total
+        means = np.stack([window.means[sensor] for window in windows])
+        rows = whitening(means).reshape(-1, len(information))
+        information = information + rows.T @ rows
+    return information
 
 
 def additive_bound(
     window: PlannedWindow, noise: dict[str, NoiseModel], *, share: float = 1.0, factor: float = 1.0
 ) -> np.ndarray:
     """
-    Return an information matrix that bounds from above what a window adds in any plan.
+    Return an upper bound of the information about z that a window adds in any plan, (n, n).
 
-    Shape (n, n).
-
-    For the given share of the covariance of the bias processes, the remainder is `common_variance`;
-    `factor` as in `exact_information`.
+    With `share` of the covariance of the bias processes, whose remainder is that of an offset
+    common to the session (`common_variance`); `factor` as in `exact_information`.
 
     The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an
     Ornstein-Uhlenbeck process seen at the middles of the windows, whose inverse is tridiagonal. Its
@@ -452,24 +504,24 @@ def additive_bound(
     is at least half the window's own length. A larger covariance is less information: with each G_j
     at its bound the means are independent, and information adds up.
     """
-    total = window.within / factor
+    information = window.within / factor
     for sensor in SENSORS:
         model = noise[sensor]
-        floor = share * sum(
+        least_variance = share * sum(
             process.sd**2 * np.tanh(window.length / (4 * process.time))
             for process in model.bias_processes
         )
-        variance = factor * window.variance[sensor] + model.offset_sd**2 + floor
+        variance = factor * window.variance[sensor] + model.offset_sd**2 + least_variance
         rows = window.means[sensor]
-        total += rows.T @ (rows / variance[:, None])
-    return total
+        information += rows.T @ (rows / variance[:, None])
+    return information
 
 
 def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarray | float:
     """
-    Return c such that the bias covariance is at least ``c 1 1'``.
+    Return c such that the covariance of the biases at any instants is at least ``c 1 1'``.
 
-    It is the covariance of the bias processes seen at any instants within so many seconds.
+    The instants are within `seconds`; the wander thus contains a constant of variance c.
 
     ``1' G^-1 1`` is the information about a constant with the process, at most ``(T + 2 time) / (2
     time sd^2)``, that of observing it all the time; of several processes the inverses add up.
@@ -482,9 +534,9 @@ def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarra
 
 def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) -> np.ndarray:
     """
-    Return the variance of a constant bias from continuous observation.
+    Return the least variance of a constant bias, estimated from continuous observation.
 
-    With white noise and the bias processes, shape of `seconds`.
+    With white noise and the bias processes, for each length T in `seconds`, shape (k,).
 
     For one process, ``integral(S exp(-|t - s| / time) h(s)) + white h(t) = 1`` is solved by ``h = a
     + b cosh(k (t - T / 2))`` with ``k^2 = 1 / time^2 + 2 S / (time white)``, and the variance is
@@ -495,19 +547,20 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
     ----------
     white : float
         Variance of the mean over one second.
-    seconds : ndarray
+    seconds : ndarray, shape (k,)
 
     """
     seconds = np.asarray(seconds, float)
-    best = white / seconds
+    least = white / seconds
     for chosen in noise.bias_processes:
         k = np.sqrt(1 / chosen.time**2 + 2 * chosen.sd**2 / (chosen.time * white))
         level = 1 / (chosen.time * k) ** 2
         steep = np.tanh(k * seconds / 2)
+        # The integral of h.
         information = (
             level * seconds + 2 * (1 - level) * steep / (k * (1 + k * chosen.time * steep))
         ) / white
-        others = tuple(process for process in noise.bias_processes if process is not chosen)
-        rest = common_variance(replace(noise, bias_processes=others), seconds)
-        best = np.maximum(best, 1 / information + rest)
-    return best
+        further = tuple(process for process in noise.bias_processes if process is not chosen)
+        further_variance = common_variance(replace(noise, bias_processes=further), seconds)
+        least = np.maximum(least, 1 / information + further_variance)
+    return least

@@ -296,7 +296,7 @@ def test_squares_and_asymmetries_of_a_gyroscope_are_told_apart_by_other_speeds(t
         model, values, np.diag(model.prior()[1] ** 2), ('weak',) * len(values)
     )
     separator = make_separator(table, calibration, pair, noise=NOISE)
-    before = separator.problem.goal.missing(separator.problem.posterior().known)
+    before = separator.problem.goal.missing(separator.problem.posterior().covariance_z)
     assert 0 < separator.plan(longest=6.0).seconds <= 6.0
     plan = separator.plan(longest=180.0)
     assert (

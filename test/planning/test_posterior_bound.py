@@ -74,7 +74,7 @@ def test_the_certificate_of_a_problem_with_a_known_answer():
     information = (
         np.array([np.diag([1.0, 0.0]), np.diag([0.0, 1.0])]) / np.array([4.0, 9.0])[:, None, None]
     )
-    found = relax(information, np.array([2.0, 3.0]), 1e-9 * np.eye(2), asked=np.eye(2))
+    found = relax(information, np.array([2.0, 3.0]), 1e-9 * np.eye(2), rows=np.eye(2))
     assert 0.97 * 35.0 < found.seconds <= 35.0 + 1e-6
 
 
