@@ -61,8 +61,8 @@ def sensor_of_label(label: str) -> str:
     return ''
 
 
-def _with_serial_column(lines):
-    """Return lines whose time of arrival is a column, where a serial monitor printed it."""
+def _with_serial_column(lines: Sequence[str]) -> list[str]:
+    """Return lines with the time of arrival as first column, where a serial monitor printed it."""
     stamped = [SERIAL_STAMP.fullmatch(line) for line in lines[:MOST_LINES]]
     if not _are_most(stamped):
         return list(lines)
@@ -82,8 +82,8 @@ def _with_serial_column(lines):
     return plain
 
 
-def _with_header_of_labels(lines):
-    """Return numbers below a header, where each cell has a label."""
+def _with_header_of_labels(lines: list[str]) -> list[str]:
+    """Return numbers below a header with the most frequent labels, where each cell has a label."""
     labels = [_labels(line) for line in lines[:MOST_LINES]]
     if not _are_most(labels):
         return lines
@@ -95,26 +95,27 @@ def _with_header_of_labels(lines):
     return plain
 
 
-def _labels(line):
+def _labels(line: str) -> tuple[str, ...]:
     """Return the labels of a line of labelled numbers; () for another line."""
-    found = LABELLED_CELL.findall(line)
-    if len(found) < LEAST_CELLS or LABELLED_CELL.sub('', line).strip():
+    cells = LABELLED_CELL.findall(line)
+    if len(cells) < LEAST_CELLS or LABELLED_CELL.sub('', line).strip():
         return ()
-    return tuple(label for label, _ in found)
+    return tuple(label for label, _ in cells)
 
 
-def _with_header_of_echo(lines):
+def _with_header_of_echo(lines: list[str]) -> list[str]:
     """Return messages below the names of their fields, where `ros2 topic echo` printed them."""
-    messages = []
+    are_messages = []
     for line in lines[:MOST_LINES]:
         cells = line.split(',')
-        stamped = len(cells) == CELLS_OF_ECHO and cells[0].isdecimal() and cells[1].isdecimal()
-        messages.append(stamped)
-    if not _are_most(messages):
+        has_stamp = len(cells) == CELLS_OF_ECHO and cells[0].isdecimal() and cells[1].isdecimal()
+        are_messages.append(has_stamp)
+    if not _are_most(are_messages):
         return lines
     return [','.join(ECHO_NAMES), *lines]
 
 
-def _are_most(found):
-    """Return whether most lines have a decoration."""
-    return bool(found) and sum(map(bool, found)) >= LEAST_DECORATED_SHARE * len(found)
+def _are_most(decorations: Sequence) -> bool:
+    """Return whether most lines have a decoration: a true element."""
+    n_decorated = sum(map(bool, decorations))
+    return bool(decorations) and n_decorated >= LEAST_DECORATED_SHARE * len(decorations)

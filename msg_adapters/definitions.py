@@ -237,7 +237,8 @@ def deserializer(
             idl_texts = [section.split('\n', 1)[1] for section in sections]
         for idl in idl_texts:
             types.update(get_types_from_idl(idl))
-    _require_bounded_size(types, message_type)
+    # A message of few bytes could otherwise fill the memory.
+    _ElementCounter(types, message_type).count_in_type(message_type)
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
@@ -274,18 +275,14 @@ def _standard(message: Any, message_type: str) -> Any:
     return store.types[message_type](*fields)
 
 
-def _require_bounded_size(types: dict[str, Any], message_type: str) -> None:
-    """
-    Refuse a type with too many elements, recursion, or sequences of an empty type.
-
-    A message of few bytes would fill the memory. `types`: message type -> its entry of rosbags,
-    which ends in the list of (name, description) of its fields.
-    """
-    _ElementCounter(types, message_type).count_in_type(message_type)
-
-
 class _ElementCounter:
-    """Counts the smallest numbers of elements that messages have, from the fields of their type."""
+    """
+    Counts the elements of a message type, with one item of each sequence.
+
+    Raises ValueError for too many elements, recursion, or sequences of an empty type. `types`:
+    message type -> its entry of rosbags, which ends in the list of (name, description) of its
+    fields; for descriptions see `_standard`.
+    """
 
     def __init__(self, types: dict[str, Any], message_type: str):
         self.types = types
