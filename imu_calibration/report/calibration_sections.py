@@ -18,7 +18,7 @@ from imu_calibration.core.units import for_people
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import harmed
 from imu_calibration.document.trust import usage
-from imu_calibration.effects.base import PREFIXES, UNITS
+from imu_calibration.effects.base import PREFIXES, UNITS, Effect
 from imu_calibration.report.figures import (
     AFTER,
     AXIS_COLOURS,
@@ -41,9 +41,9 @@ ROW = 0.155
 
 
 def observability_section(result: CalibrationResult) -> dict[str, Any]:
-    """Return figures and weak directions."""
+    """Return figures of the standard deviations, correlations and singular values."""
     calibration = result.calibration
-    live = calibration.sd > 0
+    live = calibration.sd > 0  # estimated, or at least uncertain
     figures = {
         'bars': draw(
             'bars',
@@ -73,18 +73,18 @@ def observability_section(result: CalibrationResult) -> dict[str, Any]:
 
 
 def strongest(calibration: Calibration, live: np.ndarray) -> list[tuple[str, str, float]]:
-    """Return the five strongest correlations as (name, name, value)."""
+    """Return the five strongest correlations of the `live` parameters as (name, name, value)."""
     correlation, names = _correlation(calibration, live)
     rows, columns = np.triu_indices(len(names), 1)
     order = np.argsort(-np.abs(correlation[rows, columns]), kind='stable')[:5]
     return [(names[rows[k]], names[columns[k]], correlation[rows[k], columns[k]]) for k in order]
 
 
-def _correlation(calibration, live):
+def _correlation(calibration: Calibration, live: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Return (correlation, names) of the n parameters that are `live`, shapes (n, n) and (n,)."""
     sd = calibration.sd[live]
-    return calibration.covariance[np.ix_(live, live)] / np.outer(sd, sd), list(
-        compress(calibration.param_names, live)
-    )
+    correlation = calibration.covariance[np.ix_(live, live)] / np.outer(sd, sd)
+    return correlation, list(compress(calibration.param_names, live))
 
 
 def short_name(name: str) -> str:
@@ -95,7 +95,7 @@ def short_name(name: str) -> str:
 
 
 def _bars(figure, result, live):
-    """One bar per parameter on a logarithmic axis, one at the tolerance."""
+    """Draw sd / tolerance of each `live` parameter as a bar on a logarithmic axis."""
     calibration = result.calibration
     share = (calibration.sd / result.tolerances)[live]
     names = list(compress(calibration.param_names, live))
@@ -126,7 +126,7 @@ def _bars(figure, result, live):
 
 
 def _stems(figure, values):
-    """Descending stems on a logarithmic axis."""
+    """Draw singular values, descending, as stems on a logarithmic axis; grey below one."""
     values = np.maximum(values, 1e-3)
     axes = figure.subplots()
     place = np.arange(1, len(values) + 1)
@@ -145,7 +145,7 @@ def _stems(figure, values):
 
 
 def _heat_map(figure, matrix, names):
-    """Heat map with lines between the effects."""
+    """Draw the correlations of named parameters, with lines between the effects."""
     axes = figure.subplots()
     image = axes.imshow(matrix, cmap='RdBu_r', vmin=-1, vmax=1, interpolation='nearest')
     groups = [short_name(name.rpartition('.')[0] + '.').strip() for name in names]
@@ -206,17 +206,19 @@ def budget_section(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _effects(result):
+def _effects(result: CalibrationResult) -> list[tuple[Effect, slice]]:
+    """Return (effect, slice of its parameters) of each effect that was estimated."""
     model = result.calibration.model
-    found = []
-    for e in model.effects:
-        if np.any(result.calibration.sd[model.slices[e.key]] > 0):
-            found.append((e, model.slices[e.key]))
-    return found
+    effects = []
+    for effect in model.effects:
+        part = model.slices[effect.key]
+        if np.any(result.calibration.sd[part] > 0):
+            effects.append((effect, part))
+    return effects
 
 
 def _dots(figure, result, budget):
-    """One line per effect, one dot per cause, in tolerances."""
+    """Draw a line per effect with a dot per cause: its largest sd / tolerance."""
     axes = figure.subplots()
     effects = _effects(result)
     place = np.arange(len(effects))[::-1]
@@ -261,11 +263,10 @@ have no reading at 1 g.
 """
 
 
-WITHIN_DEG, STILL_DEG_S = 5.0, 0.2
-"""
-Windows within this angle of a sensor axis are used; slower windows are at rest, faster ones are
-grouped by rate rounded to 1 deg/s.
-"""
+WITHIN_DEG = 5.0
+"""Windows within this angle between force and a sensor axis are used."""
+STILL_DEG_S = 0.2
+"""Slower windows are at rest, faster ones are grouped by rate rounded to 1 deg/s."""
 
 
 @dataclass(frozen=True)
@@ -328,15 +329,16 @@ def axis_readings(
     reference = np.asarray(reference, float).reshape(-1, 3) / gravity
     rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
     rate_deg_s = np.where(rate_deg_s < STILL_DEG_S, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
+    # The sensor axis nearest to the vertical in each window, and the force along it.
     size = np.linalg.norm(reference, axis=1)
     axis = np.argmax(np.abs(reference), axis=1)
     along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
-    near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
+    is_near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
     lines = []
-    # By rate; in each position +g before -g.
-    positions = zip(rate_deg_s[near], -np.sign(along[near]), axis[near])
+    # Windows with one rate, sign and axis are averaged; by rate, then +g before -g.
+    positions = zip(rate_deg_s[is_near], -np.sign(along[is_near]), axis[is_near])
     for line_rate, minus_sign, line_axis in sorted(set(positions)):
-        chosen = near & (rate_deg_s == line_rate) & (axis == line_axis)
+        chosen = is_near & (rate_deg_s == line_rate) & (axis == line_axis)
         chosen &= np.sign(along) == -minus_sign
         mean_reference = np.mean(reference[chosen], axis=0)
         mean_measured = np.mean(measured[chosen], axis=0)
@@ -448,16 +450,16 @@ def draw_windows(errors: WindowErrors, sensor: str) -> Drawn:
 
 
 def _windows(figure, errors, sensor):
-    """Two panels over time: raw, and corrected with the expected residual from noise."""
+    """Draw errors over time, raw above, corrected below with the expected sd from noise."""
     factor, unit = for_people(UNITS[sensor])
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.25])
     _points(upper, errors.time, errors.before[sensor] * factor, hollow=True)
-    floor = 2 * errors.floor[sensor].max(axis=1) * factor
+    two_sd = 2 * errors.floor[sensor].max(axis=1) * factor
     order = np.argsort(errors.time)
     lower.fill_between(
         errors.time[order],
-        -floor[order],
-        floor[order],
+        -two_sd[order],
+        two_sd[order],
         step='mid',
         color='#dfe5ec',
         lw=0,
@@ -473,6 +475,7 @@ def _windows(figure, errors, sensor):
 
 
 def _points(axes, time, values, hollow=False):
+    """Draw the three axes of values, (n, 3), over time with their markers."""
     for (name, colour), column in zip(AXIS_COLOURS.items(), values.T):
         axes.plot(
             time,
@@ -491,9 +494,8 @@ def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np
     """
     Return sensor -> (lags in s, autocorrelation (n_lags, 3), two-sided 95 % bound of white noise).
 
-    From the kept moving windows.
-
-    The mean of each window is subtracted from its residual; windows are weighted by their length.
+    From the residuals of the longer moving windows, with the mean of each window subtracted. The
+    sums of products at each lag are added over the windows and divided by those at lag 0.
     """
     windows = [w for w in result.gathered.kept if len(w) >= 100]
     if not windows:
@@ -504,25 +506,27 @@ def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np
     n_lags = max(2, min(int(LAG_SECONDS / period), int(typical) // 2))
     sums = {sensor: np.zeros((n_lags, 3)) for sensor in result.calibration.sensors}
     for window in windows:
-        for sensor, rest in result.residuals_of(window).items():
+        for sensor, residual in result.residuals_of(window).items():
             if sensor in sums:
-                sums[sensor] += _lagged(rest - rest.mean(axis=0), n_lags)
+                sums[sensor] += _lagged_products(residual - residual.mean(axis=0), n_lags)
     bound = 1.96 / np.sqrt(sum(len(w) for w in windows))
-    return {
-        sensor: (np.arange(n_lags) * period, total / np.where(total[0] > 0, total[0], 1.0), bound)
-        for sensor, total in sums.items()
-    }
+    lags = np.arange(n_lags) * period
+    traces = {}
+    for sensor, products in sums.items():
+        power = np.where(products[0] > 0, products[0], 1.0)
+        traces[sensor] = (lags, products / power, bound)
+    return traces
 
 
-def _lagged(rest, n_lags):
-    """Return sums of products at each lag, shape (n_lags, 3), by FFT."""
-    size = 2 ** int(np.ceil(np.log2(2 * len(rest))))
-    spectrum = np.fft.rfft(rest, size, axis=0)
+def _lagged_products(residual: np.ndarray, n_lags: int) -> np.ndarray:
+    """Return ``sum_t r(t) r(t + lag)`` of a residual (n, 3) at each lag, (n_lags, 3), by FFT."""
+    size = 2 ** int(np.ceil(np.log2(2 * len(residual))))  # with zeros, so that no lag wraps
+    spectrum = np.fft.rfft(residual, size, axis=0)
     return np.fft.irfft(np.abs(spectrum) ** 2, size, axis=0)[:n_lags]
 
 
 def _autocorrelations(figure, traces):
-    """One panel per sensor."""
+    """Draw the `autocorrelation` of each sensor in a panel."""
     panels = figure.subplots(1, len(traces), sharey=True, squeeze=False)[0]
     for axes, (sensor, (lags, values, bound)) in zip(panels, traces.items()):
         axes.axhspan(-bound, bound, color='#dfe5ec', lw=0, zorder=0.5)

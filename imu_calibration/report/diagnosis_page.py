@@ -51,6 +51,7 @@ def diagnosis_report(result: DiagnosisResult) -> str:
 
     """
     diagnosis = result.diagnosis
+    # Sensor -> significant residual variance that no finding explains.
     rests = {sensor: rest for sensor, rest in diagnosis.unexplained.items() if rest.significant}
     word = 'good'
     if any(rest.proposal is None for rest in rests.values()):
@@ -130,24 +131,24 @@ def draw_over_time(result: DiagnosisResult) -> Drawn:
     )
 
 
-def _causes(diagnosis):
+def _causes(diagnosis: Diagnosis) -> dict[str, str]:
     """Return sensor -> label of the variable of its first finding, or of its formula."""
-    pairs = []
+    pairs = []  # (sensor, kinds of variables)
     for rest in diagnosis.unexplained.values():
         if rest.proposal is not None:
             pairs.append((rest.proposal.sensor, _kinds_of(rest.proposal)))
     # Later entries replace earlier ones: the first finding of a sensor is the last entry.
     pairs += [(finding.gain.sensor, finding.against) for finding in reversed(diagnosis.findings)]
-    known = variables(diagnosis.traces, diagnosis.baseline.model.joint_names)
+    labels = variables(diagnosis.traces, diagnosis.baseline.model.joint_names)
     causes = {}
     for sensor, kinds in pairs:
         _, label, _ = cause_of(diagnosis, sensor, kinds)
-        if label in known:
+        if label in labels:  # not the prediction of the effect
             causes[sensor] = label
     return causes
 
 
-def _kinds_of(proposal):
+def _kinds_of(proposal: Proposal) -> tuple[str, ...]:
     """Return the kinds of variables that the effects of a formula depend on."""
     kinds: tuple[str, ...] = ()
     for effect in proposal.effects:
@@ -156,14 +157,23 @@ def _kinds_of(proposal):
 
 
 def explained_share(values: np.ndarray, signal: np.ndarray) -> float:
-    """Return the share of the variance of `signal` that its means over bins of `values` carry."""
-    count, means = _binned(np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1]), values, signal)
+    """
+    Return the share of the variance of `signal` that its means over bins of `values` explain.
+
+    The bins have equal numbers of values; 0 for a constant signal. Both arguments: shape (n,).
+    """
+    edges = np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1])
+    count, means = _binned(edges, values, signal)
     total = np.sum((signal - signal.mean()) ** 2)
     return float(np.sum(count * (means - signal.mean()) ** 2) / total) if total > 0 else 0.0
 
 
 def _binned(edges, values, *signals):
-    """Return the numbers of values between edges, and the mean of each signal there."""
+    """
+    Return (number of values in each bin, mean of each signal there), shape (BINS,) each.
+
+    `edges` between the bins, shape (BINS - 1,).
+    """
     index = np.searchsorted(edges, values)
     count = np.bincount(index, minlength=BINS)
     return count, *(np.bincount(index, signal, BINS) / np.maximum(count, 1) for signal in signals)
@@ -173,97 +183,104 @@ def cause_of(
     diagnosis: Diagnosis, sensor: str, against: Sequence[str]
 ) -> tuple[int, str, np.ndarray]:
     """
-    Return (axis, label, values).
+    Return (axis, label, values) for the plot of a residual against the cause of an effect.
 
-    The axis of a sensor that changes most, and the variable of some kinds that its change follows.
+    The axis of the sensor whose residual the effect changes most; and, among the variables whose
+    kind is in `against`, label and values of the one that explains most of this change. If it
+    explains less than `MIN_DRAWN_FIT`, the change itself takes its place.
     """
     traces = diagnosis.traces
-    signal = traces.before[sensor] - traces.after[sensor]
-    axis = int(np.argmax((signal**2).mean(axis=0)))
-    kinds = against if len(signal) >= FEW else ()  # bins of few poses have uncertain means
+    change = traces.before[sensor] - traces.after[sensor]
+    axis = int(np.argmax((change**2).mean(axis=0)))
+    kinds = against if len(change) >= FEW else ()  # bins of few poses have uncertain means
     best_share = 0.0
     best_label = ''
     best_values = None
     for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items():
         if kind in kinds:
-            share = explained_share(values, signal[:, axis])
+            share = explained_share(values, change[:, axis])
             if best_values is None or share > best_share:
                 best_share = share
                 best_label = label
                 best_values = values
     if best_values is None or best_share < MIN_DRAWN_FIT:
         factor, unit = for_people(UNITS[sensor])
-        return axis, f'prediction of the effect, {unit}', signal[:, axis] * factor
+        return axis, f'prediction of the effect, {unit}', change[:, axis] * factor
     return axis, best_label, best_values
 
 
 def _against_cause(figure, diagnosis, sensor, against):
-    """Two panels with one scale: before with the fitted curve, and after."""
+    """Draw the residual against its cause: before, with the fitted curve, and after."""
     traces = diagnosis.traces
     axis, label, values = cause_of(diagnosis, sensor, against)
     factor, unit = for_people(UNITS[sensor])
     before = traces.before[sensor][:, axis] * factor
     after = traces.after[sensor][:, axis] * factor
     left, right = figure.subplots(1, 2, sharey=True)
-    some = slice(None, None, max(1, len(values) // 2500))
+    drawn = slice(None, None, max(1, len(values) // 2500))
     for axes, residual, colour, title in (
         (left, before, BEFORE, 'before'),
         (right, after, AFTER, 'after'),
     ):
         axes.plot(
-            values[some],
-            residual[some],
+            values[drawn],
+            residual[drawn],
             '.',
             color=colour,
-            markersize=_marker(values, 4),
+            markersize=_marker_size(values, 4),
             alpha=0.5,
             mew=0,
         )
         axes.axhline(0, color=GREY, lw=0.6)
         axes.set(title=title, xlabel=label)
-    place, curve = _curve(values, before - after)
-    left.plot(place, curve, color=INK, lw=1.8, label='fitted effect')
+    middles, curve = _curve(values, before - after)
+    left.plot(middles, curve, color=INK, lw=1.8, label='fitted effect')
     left.legend(loc='best')
     limit = 1.1 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.998))
     left.set(ylabel=f'{sensor} {"xyz"[axis]} residual, {unit}', ylim=(-limit, limit))
 
 
-def _marker(values, many):
-    return 9 if len(values) < FEW else many
+def _marker_size(values, usual):
+    """Return the size of markers: larger than usual for few values."""
+    return 9 if len(values) < FEW else usual
 
 
-def _curve(values, signal):
+def _curve(values: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return means of the fitted signal over bins of equal width of the cause.
+    Return means of (values of the cause, fitted signal) over bins of equal width of the cause.
 
-    Where a bin holds enough to have a mean.
+    Only bins with enough values. Of few values no means, but all of them in ascending order.
     """
     if len(values) < FEW:
         order = np.argsort(values)
         return values[order], signal[order]
-    count, *means = _binned(
-        np.linspace(values.min(), values.max(), BINS + 1)[1:-1], values, values, signal
-    )
-    return tuple(mean[count >= max(3, 0.002 * len(values))] for mean in means)
+    edges = np.linspace(values.min(), values.max(), BINS + 1)[1:-1]
+    count, mean_values, mean_signal = _binned(edges, values, values, signal)
+    enough = count >= max(3, 0.002 * len(values))
+    return mean_values[enough], mean_signal[enough]
 
 
 def _over_time(figure, traces, over):
-    """Size of the residual over time, before and after, one panel per sensor."""
+    """
+    Draw the size of the residual over time, before and after, in a panel per sensor.
+
+    `over`: text on the span of a residual.
+    """
     panels = figure.subplots(len(traces.before), 1, sharex=True, squeeze=False)[:, 0]
     for axes, sensor in zip(panels, traces.before):
         factor, unit = for_people(UNITS[sensor])
-        some = slice(None, None, max(1, len(traces.time) // 3000))
+        drawn = slice(None, None, max(1, len(traces.time) // 3000))
         for residual, colour, label in (
             (traces.before, BEFORE, 'before'),
             (traces.after, AFTER, 'after'),
         ):
             size = np.sqrt((residual[sensor] ** 2).sum(axis=1)) * factor
             axes.plot(
-                traces.time[some],
-                size[some],
+                traces.time[drawn],
+                size[drawn],
                 '.',
                 color=colour,
-                markersize=_marker(size, 3),
+                markersize=_marker_size(size, 3),
                 alpha=0.5,
                 mew=0,
                 label=label,
@@ -278,29 +295,31 @@ MOST_POINTS = 1200
 """Points of a chart against a variable."""
 HISTOGRAM_BINS = 40
 WHEN = ('before', 'after')
+"""Without and with the found effects in the model: fields of Traces."""
 
 
 def variables(traces: Traces, joint_names: Sequence[str]) -> dict[str, tuple[str, np.ndarray]]:
     """Return label -> (kind, values) of the variables of residual plots, in people's units."""
-    found = {'time, s': ('time', traces.time)}
+    listed = {'time, s': ('time', traces.time)}
     if traces.temperature_c is not None:
-        found['temperature, °C'] = ('temperature', traces.temperature_c)
+        listed['temperature, °C'] = ('temperature', traces.temperature_c)
     for k, axis in enumerate(AXES):
-        found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / STANDARD_GRAVITY)
-        found[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
-    found['speed, deg/s'] = ('speed', np.rad2deg(np.linalg.norm(traces.rate_s, axis=1)))
-    for name, angle in zip(joint_names, traces.position.T):  # by hand no joint is known
-        found[f'angle of {name}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * angle))))
-    return found
+        listed[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / STANDARD_GRAVITY)
+        listed[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
+    listed['speed, deg/s'] = ('speed', np.rad2deg(np.linalg.norm(traces.rate_s, axis=1)))
+    for name, angle in zip(joint_names, traces.position.T):  # by hand there are no joints
+        within_turn = np.angle(np.exp(1j * angle))
+        listed[f'angle of {name}, deg'] = ('angle', np.rad2deg(within_turn))
+    return listed
 
 
 def overlay_section(
     traces: Traces, joint_names: Sequence[str], causes: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """
-    Return for each sensor its name, table of bands and charts.
+    Return for each sensor its name, unit, table of frequency bands and rows of charts by axis.
 
-    Signals, differences, residuals, spectra and histograms by axis.
+    Rows: signals, differences, residuals, spectra and histograms.
 
     Parameters
     ----------
@@ -316,11 +335,19 @@ def overlay_section(
     ]
 
 
-def _sensor(traces, sensor, against, first):
+def _sensor(
+    traces: Traces, sensor: str, against: Mapping[str, np.ndarray], first: str
+) -> dict[str, Any]:
+    """
+    Return the content of `overlay_section` of one sensor.
+
+    `against`: label -> values of the variables; `first`: label of the variable shown first.
+    """
     factor, unit = for_people(UNITS[sensor])
     rows: list[dict[str, Any]] = []
 
     def row(title: str, chart: Callable[[int], dict[str, Any]], **more: Any) -> None:
+        """Add a row of three charts, ``chart(axis)`` each, to `rows`."""
         rows.append(
             {
                 'title': title,
@@ -353,15 +380,16 @@ def _sensor(traces, sensor, against, first):
         )
 
     def residuals(axis: int, points: slice = slice(None)) -> dict[str, np.ndarray]:
+        """Return 'before', 'after' -> residual of an axis in the units of the page."""
         return {when: getattr(traces, when)[sensor][points, axis] * factor for when in WHEN}
 
-    some = slice(None, None, -(-len(traces.time) // MOST_POINTS))
+    drawn = slice(None, None, -(-len(traces.time) // MOST_POINTS))
     row(
         f'Residual, {unit}, against',
         lambda k: _chart(
-            f'{sensor} {AXES[k]}', first, against[first][some], residuals(k, some), kind='points'
+            f'{sensor} {AXES[k]}', first, against[first][drawn], residuals(k, drawn), kind='points'
         ),
-        variables=json.dumps({label: _plain(values[some]) for label, values in against.items()}),
+        variables=json.dumps({label: _plain(values[drawn]) for label, values in against.items()}),
         first=first,
         labels=list(against),
     )
@@ -397,29 +425,42 @@ def histogram(residuals: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str
 
     The bins contain 99.9 % of each.
     """
-    limit = max(float(np.quantile(np.abs(own), 0.999)) for own in residuals.values()) or 1.0
+    limit = max(float(np.quantile(np.abs(each), 0.999)) for each in residuals.values()) or 1.0
     edges = np.linspace(-limit, limit, HISTOGRAM_BINS + 1)
-    return edges[:-1] + edges[1] / 2 - edges[0] / 2, {
-        name: np.histogram(own, edges)[0] for name, own in residuals.items()
-    }
+    middles = edges[:-1] + edges[1] / 2 - edges[0] / 2
+    return middles, {name: np.histogram(each, edges)[0] for name, each in residuals.items()}
 
 
 def _histogram(title, unit, residuals):
+    """Return the chart of the histograms of named residuals."""
     middles, counts = histogram(residuals)
     return _chart(title, f'residual, {unit}', middles, counts, kind='steps')
 
 
-def _chart(title, x, values, series, kind='line'):
+def _chart(
+    title: str,
+    x: str,
+    values: np.ndarray,
+    series: Mapping[str, np.ndarray],
+    kind: str = 'line',
+) -> dict[str, Any]:
+    """
+    Return the data of a chart for the script of the page.
+
+    `x`: label of the `values` on the horizontal axis; `series`: name -> values on the vertical
+    axis; `kind`: 'line', 'points', 'steps' or 'log' (both axes logarithmic).
+    """
     if kind == 'log':
-        series = {name: np.where(own > 0, own, np.nan) for name, own in series.items()}
+        series = {name: np.where(ys > 0, ys, np.nan) for name, ys in series.items()}
     return {
         'title': title,
         'x': x,
         'kind': kind,
         'names': list(series),
-        'data': [_plain(values), *(_plain(own) for own in series.values())],
+        'data': [_plain(values), *(_plain(ys) for ys in series.values())],
     }
 
 
-def _plain(values):
+def _plain(values: np.ndarray) -> list[float | None]:
+    """Return values with five digits for JSON, None for NaN and infinity."""
     return [float(f'{value:.5g}') if np.isfinite(value) else None for value in values]

@@ -96,9 +96,9 @@ class Drawn(str):
     @property
     def data(self) -> list[dict[str, Any]]:
         """
-        For each axes its title and labels, and 'lines'.
+        For each axes its title and labels, and 'lines': list of (label, x (n,), y (n,)).
 
-        List of (label, x (n,), y (n,)) as arrays in the units of the labels.
+        The arrays are in the units of the labels.
         """
         panels = []
         for axes in self.axes:
@@ -193,7 +193,7 @@ def _laid_out(figure):
 
 def _inside(svg, label):
     """
-    Return only the svg element.
+    Return only the svg element, with a label for screen readers.
 
     Without prologue, metadata and the identifiers that repeat from figure to figure.
     """
@@ -282,7 +282,7 @@ def lever_figure(calibration: Calibration) -> Drawn | None:
 
 
 def _views(figure, arms, cov):
-    """Three views: sensitive points with ellipses of two sd."""
+    """Draw the sensitive points, mm, (3, 3), with ellipses of two sd in three views."""
     limit = 1.25 * max(float(np.max(np.abs(arms))), 3 * float(np.sqrt(np.diag(cov).min())), 1e-3)
     for axes, (across, up) in zip(figure.subplots(1, 3), PLANES):
         axes.axhline(0, color=GREY, lw=0.6)
@@ -302,6 +302,7 @@ def _views(figure, arms, cov):
 
 
 def _point(axes, place, cov, name, colour):
+    """Draw a sensitive point in one view, with its arm, ellipse of two sd and name."""
     x, y = place
     axes.annotate(
         '',
@@ -310,15 +311,16 @@ def _point(axes, place, cov, name, colour):
         arrowprops={'arrowstyle': '-', 'color': colour, 'lw': 1.1, 'alpha': 0.55},
     )
     axes.plot(x, y, 'o', color=colour, markersize=5)
+    # Ellipse in its principal axes, then turned and moved to the point.
     values, vectors = np.linalg.eigh(cov)
     angle = np.linspace(0, 2 * np.pi, 61)
     ring = 2 * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
     axes.plot(*(np.array([[x], [y]]) + vectors @ ring), color=colour, lw=0.9)
-    away = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
+    name_offset = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
     axes.annotate(
         name,
         (x, y),
-        away,
+        name_offset,
         textcoords='offset points',
         color=colour,
         fontsize=10,

@@ -12,10 +12,12 @@ import numpy as np
 from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import Reference, attitudes_with_vertical, lever_matrix
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors, strapdown
+from imu_calibration.preprocessing.window import Window
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
 
 REST_RUN_SECONDS = 50.0
@@ -46,21 +48,22 @@ def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[
     """Return figures and end values of dead reckoning at rest and in motion, None without it."""
     if result.calibration.absent:  # it needs both sensors
         return {'rest': None, 'moving': None}
+    rest = None
     before = rest_growth(errors)
+    if before is not None:
+        rest = _content('rest', before, *expected_growth(result, errors))
     moving = motion_growth(result)
-    return {
-        'rest': (
-            None if before is None else _shown('rest', before, *expected_growth(result, errors))
-        ),
-        'moving': None if moving is None else _shown('moving', *moving, {}),
-    }
+    if moving is not None:
+        moving = _content('moving', *moving, {})
+    return {'rest': rest, 'moving': moving}
 
 
-def _shown(name, before, after, parts):
+def _content(name: str, before: Growth, after: Growth, parts: dict[str, Growth]) -> dict[str, Any]:
     """
-    Return the figure, and (velocity, position) at the end by part of the error.
+    Return the content of the page for runs at rest or in motion (`name`).
 
-    The pairs are given before, after and of each part of the error.
+    The figure, and the (velocity, position) errors at the end: before and after calibration, and of
+    each part of the expected error, if there are `parts`.
     """
     return {
         'figure': draw(
@@ -86,52 +89,46 @@ def rest_growth(errors: WindowErrors) -> Growth | None:
 
     None without poses.
 
-    Each run starts from the true attitude and feels the mean error that its window showed, as a
-    constant.
+    Each run starts from the true attitude, with constant readings: the true ones and the mean
+    errors of its window.
     """
     static = np.flatnonzero(errors.kind == 'static')[:MAX_RUNS]
     if not len(static):
         return None
     time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
-    runs = []
-    for force, force_error, rate_error in zip(
-        *(
-            part[static]
-            for part in (
-                errors.true['accelerometer'],
-                errors.before['accelerometer'],
-                errors.before['gyroscope'],
-            )
-        )
-    ):
+    velocities = []
+    positions = []
+    for k in static:
+        force = errors.true['accelerometer'][k]
         gravity = float(np.linalg.norm(force))
-        readings = (
-            np.tile(reading, (len(time), 1)) for reading in (force + force_error, rate_error)
+        velocity, position = strapdown(
+            time,
+            np.tile(force + errors.before['accelerometer'][k], (len(time), 1)),
+            np.tile(errors.before['gyroscope'][k], (len(time), 1)),
+            gravity=gravity,
+            mat_ns0=attitudes_with_vertical(force[None] / gravity)[0].T,
         )
-        runs.append(
-            strapdown(
-                time,
-                *readings,
-                gravity=gravity,
-                mat_ns0=attitudes_with_vertical(force[None] / gravity)[0].T,
-            )
-        )
-    return Growth(time, *(np.linalg.norm(run, axis=-1) for run in zip(*runs)))
+        velocities.append(np.linalg.norm(velocity, axis=-1))
+        positions.append(np.linalg.norm(position, axis=-1))
+    return Growth(time, np.array(velocities), np.array(positions))
 
 
 def expected_growth(
     result: CalibrationResult, errors: WindowErrors
 ) -> tuple[Growth, dict[str, Growth]]:
     """
-    Return the expected Growth (rms) at rest after calibration, and its parts.
+    Return the expected Growth (rms) at rest after calibration, and its parts by their label.
 
-    Parameters, instability, noise.
+    The parts are errors of the parameters, instability of the biases and noise. They are predicted,
+    because the mean of a short window has more noise than error of the calibration::
 
-    The mean of a short window shows its noise more than the calibration's errors, so that the
-    errors are predicted: a constant error d of the specific force gives ``d t``, ``d t^2 / 2``, one
-    w of the rate across the vertical ``g w t^2 / 2``, ``g w t^3 / 6``; white noise of density N
-    gives ``N t^(1/2)``, ``N t^(3/2) / 3^(1/2)`` and ``g N t^(3/2) / 3^(1/2)``, ``g N t^(5/2) /
-    20^(1/2)``.
+                                            velocity              position
+        constant force error d              d t                   d t^2 / 2
+        constant horizontal rate error w    g w t^2 / 2           g w t^3 / 6
+        white force noise of density N      N t^(1/2)             N t^(3/2) / 3^(1/2)
+        white rate noise of density N       g N t^(3/2) / 3^(1/2) g N t^(5/2) / 20^(1/2)
+
+    With all axes: three of the force, two horizontal ones of the rate.
     """
     static = np.flatnonzero(errors.kind == 'static')[:MAX_RUNS]
     time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
@@ -139,41 +136,46 @@ def expected_growth(
     gravity = float(np.median(np.linalg.norm(forces, axis=1)))
     uncertainty = Uncertainty(result.calibration)
     constants = np.array([_constant_variances(uncertainty, force) for force in forces])
-    scatter = [
-        float(np.max(result.calibration.noise(sensor)[1]))
-        for sensor in ('accelerometer', 'gyroscope')
-    ]
-    unstable = np.tile([3 * scatter[0] ** 2, 2 * scatter[1] ** 2], (len(static), 1))
-    density = [d * np.sqrt(n) for d, n in zip(noise_densities(result), (3, 2))]
+    force_sd = float(np.max(result.calibration.noise('accelerometer')[1]))
+    rate_sd = float(np.max(result.calibration.noise('gyroscope')[1]))
+    instabilities = np.tile([3 * force_sd**2, 2 * rate_sd**2], (len(static), 1))
+    force_density, rate_density = noise_densities(result)
+    force_density *= np.sqrt(3)
+    rate_density *= np.sqrt(2)
+    noise_velocity = np.hypot(
+        force_density * time**0.5, gravity * rate_density * time**1.5 / np.sqrt(3)
+    )
+    noise_position = np.hypot(
+        force_density * time**1.5 / np.sqrt(3), gravity * rate_density * time**2.5 / np.sqrt(20)
+    )
     parts = {
         'parameters': _constant_growth(time, constants, gravity),
-        'instability of the biases': _constant_growth(time, unstable, gravity),
-        'noise': Growth(
-            time,
-            np.hypot(density[0] * time**0.5, gravity * density[1] * time**1.5 / np.sqrt(3))[None],
-            np.hypot(
-                density[0] * time**1.5 / np.sqrt(3), gravity * density[1] * time**2.5 / np.sqrt(20)
-            )[None],
-        ),
+        'instability of the biases': _constant_growth(time, instabilities, gravity),
+        'noise': Growth(time, noise_velocity[None], noise_position[None]),
     }
     velocity_variance = sum(part.velocity**2 for part in parts.values())
     position_variance = sum(part.position**2 for part in parts.values())
     return Growth(time, np.sqrt(velocity_variance), np.sqrt(position_variance)), parts
 
 
-def _constant_variances(uncertainty, force):
+def _constant_variances(uncertainty: Uncertainty, force: np.ndarray) -> tuple[float, float]:
     """
-    Return the variances of the errors of specific force and rate from the parameters.
+    Return the variances of force and rate errors from the parameters, at rest with a force, (3,).
 
-    The variance of the specific-force error covers all axes, and the variance of the rate error is
-    across the vertical.
+    Of the force the sum over its axes, of the rate the sum over the horizontal axes.
     """
     covariance = uncertainty.at(force).parameters
+    rate_cov = covariance[3:, 3:]
     up = force / np.linalg.norm(force)
-    return np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:]) - up @ covariance[3:, 3:] @ up
+    return np.trace(covariance[:3, :3]), np.trace(rate_cov) - up @ rate_cov @ up
 
 
-def _constant_growth(time, variances, gravity):
+def _constant_growth(time: np.ndarray, variances: np.ndarray, gravity: float) -> Growth:
+    """
+    Return the Growth of constant errors (`expected_growth`), one run per row of `variances`.
+
+    `variances`: of the errors of force and horizontal rate, shape (n_runs, 2).
+    """
     force, rate = np.sqrt(np.maximum(variances, 0)).T[:, :, None]
     return Growth(
         time,
@@ -207,70 +209,54 @@ def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:
     The truth is that of the table, carried to the origin that the calibration compensates to. Noise
     is included.
     """
-    windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= MIN_DRAWN_SECONDS][
-        :MAX_RUNS
-    ]
+    windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= MIN_DRAWN_SECONDS]
+    windows = windows[:MAX_RUNS]
     if not windows:
         return None
     length = min(w.time[-1] - w.time[0] for w in windows)
     pairs = [_moving_runs(result, window, length) for window in windows]
-    grid = np.linspace(0.0, length, RUN_INSTANTS)
-    before = _joined_growth(grid, [raw for raw, _ in pairs])
-    after = _joined_growth(grid, [corrected for _, corrected in pairs])
+    before = _joined_growth([raw for raw, _ in pairs])
+    after = _joined_growth([corrected for _, corrected in pairs])
     return before, after
 
 
-def _joined_growth(time, runs):
-    """Return the Growth of several stretches on one grid of times, s."""
-    return Growth(
-        time, np.array([run.velocity for run in runs]), np.array([run.position for run in runs])
-    )
+def _joined_growth(runs: list[Growth]) -> Growth:
+    """Return the Growth of several runs of one size (n,) on one grid of times."""
+    velocity = np.array([run.velocity for run in runs])
+    return Growth(runs[0].time, velocity, np.array([run.position for run in runs]))
 
 
-def _moving_runs(result, window, length):
-    """Return the Growth of one stretch, raw and corrected."""
-    some = slice(0, int(np.searchsorted(window.time, window.time[0] + length, 'right')))
-    time = window.time[some]
-    motion = window.motion.select(some)
+def _moving_runs(result: CalibrationResult, window: Window, length: float) -> list[Growth]:
+    """Return the Growth, shapes (n,), of the first `length` s of a window: raw, then corrected."""
+    stretch = slice(0, int(np.searchsorted(window.time, window.time[0] + length, 'right')))
+    time = window.time[stretch]
+    force_s = window.force_s[stretch]
+    rate_s = window.rate_s[stretch]
+    motion = window.motion.select(stretch)
     truth = _at_origin(result.calibration, reference_motion(result.data.table, motion))
-    reference_c = result.calibration.model.temperature_ref_c
-    temperature = (
-        np.full(len(time), reference_c)
-        if window.temperature_c is None
-        else window.temperature_c[some]
-    )
+    if window.temperature_c is None:
+        temperature_c = np.full(len(time), result.calibration.model.temperature_ref_c)
+    else:
+        temperature_c = window.temperature_c[stretch]
     corrected = compensated_samples(
         result.calibration,
-        window.force_s[some],
-        window.rate_s[some],
+        force_s,
+        rate_s,
         alpha_s=truth.alpha_s,
-        temperature_c=temperature,
+        temperature_c=temperature_c,
     )
     grid = np.linspace(0.0, length, RUN_INSTANTS)
     growths = []
-    for force, rate in (
-        (window.force_s[some], window.rate_s[some]),
-        (corrected.force, corrected.rate),
-    ):
-        errors = dead_reckoning_errors(truth, force, rate)
-        growths.append(
-            Growth(
-                grid,
-                *(
-                    np.interp(grid, time - time[0], np.linalg.norm(error, axis=1))
-                    for error in errors
-                ),
-            )
-        )
+    for force, rate in ((force_s, rate_s), (corrected.force, corrected.rate)):
+        sizes = []
+        for error in dead_reckoning_errors(truth, force, rate):  # of velocity and position
+            sizes.append(np.interp(grid, time - time[0], np.linalg.norm(error, axis=1)))
+        growths.append(Growth(grid, *sizes))
     return growths
 
 
-def _at_origin(calibration, ref):
-    """
-    Return the reference at the origin of the calibration's arms.
-
-    The common lever arm leads to this origin.
-    """
+def _at_origin(calibration: Calibration, ref: Reference) -> Reference:
+    """Return the reference at the origin of the accelerometers, by their common lever arm."""
     arm = calibration.of('accelerometer', Role.ARM)
     if arm is None:
         return ref

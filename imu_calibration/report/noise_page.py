@@ -29,25 +29,25 @@ def draw_curve(result: NoiseIdentification, sensor: str) -> Drawn:
 
 def _curves(figure, result, sensor):
     """
-    Points with 95 % bands, the model's line, and the contribution of the trends.
+    Draw the Allan deviations of a sensor: points with 95 % bands, model, and curve with trends.
 
     There is also a slope for each process of the noisiest axis.
     """
-    axes, curve, (factor, unit) = (
-        figure.subplots(),
-        result.record.curve,
-        for_people(UNITS[sensor], NOISE_QUANTITY),
-    )
+    axes = figure.subplots()
+    curve = result.record.curve
+    factor, unit = for_people(UNITS[sensor], NOISE_QUANTITY)
     log_axis(axes.xaxis)
     log_axis(axes.yaxis)
-    own = range(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
-    for k, name in zip(own, AXIS_COLOURS):
+    # Columns of the sensor among the six axes.
+    first = 3 * SENSORS.index(sensor)
+    columns = range(first, first + 3)
+    for k, name in zip(columns, AXIS_COLOURS):
         _axis(axes, result, k, factor, name)
     # The bands of single averages are much wider than the range of the measured values.
-    shown = factor * np.sqrt(np.concatenate([curve.variance[:, own], curve.raw[:, own]]))
+    shown = factor * np.sqrt(np.concatenate([curve.variance[:, columns], curve.raw[:, columns]]))
     axes.set_ylim(np.nanmin(shown[shown > 0]) / 2.5, np.nanmax(shown) * 2.0)
     noisiest = max(
-        (result.axes[k].terms for k in own), key=lambda terms: terms[WHITE.name].interval[1]
+        (result.axes[k].terms for k in columns), key=lambda terms: terms[WHITE.name].interval[1]
     )
     _slopes(axes, curve.tau, noisiest, factor)
     axes.set(xlabel='averaging time τ, s', ylabel=f'Allan deviation, {unit}')
@@ -57,18 +57,21 @@ def _curves(figure, result, sensor):
         Line2D([], [], color=hue, marker=MARKER[name], markersize=4, lw=1.3, label=name)
         for name, hue in AXIS_COLOURS.items()
     ]
-    if any(result.record.trends[k] for k in own):
+    if any(result.record.trends[k] for k in columns):
         handles.append(Line2D([], [], color=GREY, ls=':', label='with its trends'))
     axes.legend(handles=handles, loc='upper right', ncols=len(handles))
 
 
 def _axis(axes, result, k, factor, name):
-    """Draw one axis: measured, band, model, and the curve with its trends."""
+    """Draw axis k: measured, band, model, and the curve with its trends; `factor` of the unit."""
     curve = result.record.curve
     colour = AXIS_COLOURS[name]
-    measured, raw = (np.sqrt(values[:, k]) * factor for values in (curve.variance, curve.raw))
+    measured = np.sqrt(curve.variance[:, k]) * factor
+    raw = np.sqrt(curve.raw[:, k]) * factor
     model, freedom = predicted(result.record.moments[k], result.axes[k])
-    lower, upper = (measured * np.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
+    # The estimated variance times freedom / true variance has a chi-square distribution.
+    lower = measured * np.sqrt(freedom / chdtri(freedom, 0.025))
+    upper = measured * np.sqrt(freedom / chdtri(freedom, 0.975))
     axes.fill_between(curve.tau, lower, upper, color=colour, alpha=0.13, lw=0)
     axes.plot(curve.tau, measured, MARKER[name], color=colour, markersize=3.2, zorder=3)
     axes.plot(curve.tau, np.sqrt(model) * factor, color=colour, lw=1.3, zorder=2)
@@ -80,21 +83,22 @@ def _axis(axes, result, k, factor, name):
 
 def _slopes(axes, tau, terms, factor):
     """Draw a straight line for every process of an axis, with the letter and the slope."""
+    # Process, label, line of a coefficient c, and place of the label as a share of the curve.
     lines = (
         (WHITE.name, 'N: slope −½', lambda c: c / np.sqrt(tau), 0.35),
         (RANDOM_WALK.name, 'K: slope +½', lambda c: c * np.sqrt(tau / 3), 0.8),
         (FLICKER.name, 'B: flat at 0.664 B', lambda c: c * FLATNESS + 0 * tau, 0.8),
     )
-    for name, label, line, where in lines:
+    for name, label, line, label_share in lines:
         term = terms.get(name)
         if term is None or term.value is None:
             continue
         values = line(term.value) * factor
         axes.plot(tau, values, '--', color=FAINT, lw=0.9, zorder=1)
-        at = min(int(where * len(tau)), len(tau) - 1)
+        place = min(int(label_share * len(tau)), len(tau) - 1)
         axes.annotate(
             label,
-            (tau[at], values[at]),
+            (tau[place], values[place]),
             (-6, -12),
             textcoords='offset points',
             color=GREY,
@@ -111,7 +115,8 @@ def noise_report(
     result: NoiseIdentification, figures: NoiseFigures, horizon: float = HORIZON
 ) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
-    found = document.counts(figures)
+    counts = document.counts(figures)
+    # Sensor -> (title, unit) of a table -> its rows.
     tables = {sensor: {} for sensor in figures.sensors}
     for row in document.rows(figures):
         tables[row.sensor].setdefault((row.title, row.unit), []).append(row)
@@ -124,8 +129,8 @@ def noise_report(
     return render(
         'noise.html',
         title='Noise of an IMU',
-        headline=f'{found[DETERMINED]} of {sum(found.values())} figures determined',
-        word='weak' if found[WEAK] or found[HELD] else 'good',
+        headline=f'{counts[DETERMINED]} of {sum(counts.values())} figures determined',
+        word='weak' if counts[WEAK] or counts[HELD] else 'good',
         lines=document.lines(figures),
         figures=figures,
         tables=tables,

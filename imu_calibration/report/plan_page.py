@@ -20,8 +20,11 @@ from imu_calibration.report.page import render
 HALF_EDGES = np.array([1.0, 0.7, 0.3])
 """Half edges of the box along x, y, z: all different, so that attitudes are distinguishable."""
 VIEW = np.array([[-np.sqrt(0.5), np.sqrt(0.5), 0.0], [-0.35, -0.35, 0.87]])
-"""From the level frame to the picture: seen from above one's shoulder."""
-FIGURE_COLUMNS, MAX_ATTITUDES = 6, 36
+"""From the level frame to the picture (right, up): seen from above one's shoulder."""
+FIGURE_COLUMNS = 6
+"""Drawings of attitudes in a row."""
+MAX_ATTITUDES = 36
+"""Steps that are drawn."""
 
 
 def draw_steps(steps: Sequence[HandStep]) -> str:
@@ -31,48 +34,49 @@ def draw_steps(steps: Sequence[HandStep]) -> str:
     return draw(
         'hand-steps',
         (8.6, 1.75 * rows),
-        _paint,
+        _steps,
         shown,
         rows,
         label='How to hold and to turn the IMU',
     )
 
 
-def _paint(figure, steps, rows):
-    axes = np.atleast_1d(figure.subplots(rows, FIGURE_COLUMNS)).ravel()
-    for place, axis in enumerate(axes):
-        axis.set_axis_off()
-        if place < len(steps):
-            _box(axis, steps[place].up)
-            axis.set_title(
-                f'{place + 1}: {direction_words(steps[place].up)} up', fontsize=8, color=INK
-            )
-            axis.set(aspect='equal', xlim=(-1.7, 1.7), ylim=(-1.5, 1.6))
+def _steps(figure, steps, rows):
+    """Draw the attitude of each step in a panel, with its number and the direction that is up."""
+    panels = np.atleast_1d(figure.subplots(rows, FIGURE_COLUMNS)).ravel()
+    for axes in panels:
+        axes.set_axis_off()
+    for number, (axes, step) in enumerate(zip(panels, steps), 1):
+        _box(axes, step.up)
+        axes.set_title(f'{number}: {direction_words(step.up)} up', fontsize=8, color=INK)
+        axes.set(aspect='equal', xlim=(-1.7, 1.7), ylim=(-1.5, 1.6))
 
 
-def _box(axis, up):
+def _box(axes, up):
+    """Draw the IMU as a box with its axes; `up`: vertical direction in the sensor frame, (3,)."""
     mat_ns = align(np.asarray(up, float))
-    toward = np.cross(VIEW[0], VIEW[1])
+    toward_viewer = np.cross(VIEW[0], VIEW[1])
+    edges = np.diag(HALF_EDGES)
+    # The visible faces, by their normal in the sensor frame.
     for k, sign in itertools.product(range(3), (1.0, -1.0)):
         normal = sign * np.eye(3)[k]
-        if (mat_ns @ normal) @ toward > 0:
-            others = [i for i in range(3) if i != k]
-            edges = np.diag(HALF_EDGES)
-            corners = [
-                sign * edges[k] + a * edges[others[0]] + b * edges[others[1]]
-                for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-            ]
-            axis.fill(
-                *(VIEW @ mat_ns @ np.array(corners).T), facecolor='#f4f6f9', edgecolor=FAINT, lw=1.0
-            )
+        if (mat_ns @ normal) @ toward_viewer <= 0:
+            continue
+        i, j = (axis for axis in range(3) if axis != k)
+        corners = [
+            sign * edges[k] + a * edges[i] + b * edges[j]
+            for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+        ]
+        x, y = VIEW @ mat_ns @ np.array(corners).T
+        axes.fill(x, y, facecolor='#f4f6f9', edgecolor=FAINT, lw=1.0)
     for k, (name, colour) in enumerate(AXIS_COLOURS.items()):
         tip = VIEW @ mat_ns @ (np.eye(3)[k] * (HALF_EDGES[k] + 0.55))
-        axis.annotate('', tip, (0, 0), arrowprops={'arrowstyle': '->', 'color': colour, 'lw': 1.4})
-        axis.text(*(1.12 * tip), name, color=colour, fontsize=8, ha='center', va='center')
-    axis.annotate(
+        axes.annotate('', tip, (0, 0), arrowprops={'arrowstyle': '->', 'color': colour, 'lw': 1.4})
+        axes.text(*(1.12 * tip), name, color=colour, fontsize=8, ha='center', va='center')
+    axes.annotate(
         '', (-1.55, 1.2), (-1.55, 0.4), arrowprops={'arrowstyle': '->', 'color': GREY, 'lw': 1.0}
     )
-    axis.text(-1.55, 0.2, 'up', color=GREY, fontsize=7, ha='center', va='center')
+    axes.text(-1.55, 0.2, 'up', color=GREY, fontsize=7, ha='center', va='center')
 
 
 KIND = {
@@ -114,6 +118,7 @@ def draw_progress(plan: Plan) -> Drawn:
 
 
 def _motion(figure, plan):
+    """Draw the joints against time, angles within one turn, and a band of the kinds of motion."""
     axes = figure.subplots()
     points = plan.points
     if not len(points):
@@ -122,20 +127,24 @@ def _motion(figure, plan):
     time = np.concatenate([[0.0], points.time])
     position = np.concatenate([plan.start[None], points.position])
     for k, name in enumerate(points.joint_names):
-        values = np.degrees(position[:, k]) if turns[k] else 1000 * position[:, k]
-        wrapped = (values + 180.0) % 360.0 - 180.0 if turns[k] else values
-        wrapped = np.where(np.abs(np.diff(wrapped, prepend=wrapped[0])) > 180.0, np.nan, wrapped)
+        if turns[k]:
+            unit = 'deg'
+            values = (np.degrees(position[:, k]) + 180.0) % 360.0 - 180.0
+        else:
+            unit = 'mm'
+            values = 1000 * position[:, k]
+        # No line across the panel where an angle begins a new turn.
+        steps = np.abs(np.diff(values, prepend=values[0]))
         axes.plot(
             time,
-            wrapped,
+            np.where(steps > 180.0, np.nan, values),
             color=JOINT_COLOURS[k % len(JOINT_COLOURS)],
             lw=1.2,
-            label=f'{name}, {"deg" if turns[k] else "mm"}',
+            label=f'{name}, {unit}',
         )
-    top = axes.get_ylim()[1]
-    bottom = axes.get_ylim()[0]
+    bottom, top = axes.get_ylim()
     begins = np.concatenate([[0.0], plan.ends[:-1]])
-    shown = set()
+    shown = set()  # kinds that are in the legend
     for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True):
         axes.fill_between(
             [begin, end],
@@ -153,7 +162,7 @@ def _motion(figure, plan):
 def _progress(figure, plan):
     """Draw a line for each parameter, the worst of all, the tolerance, and the least time."""
     axes = figure.subplots()
-    shown = set()
+    shown = set()  # sensors that are in the legend
     time = np.concatenate([[0.0], plan.ends])
     history = plan.history
     names = [
