@@ -317,11 +317,9 @@ class Recording:
         if parts or last.dropped:
             yield last
 
-    def _decoders(
-        self, joint_names: Iterable[str] | None, frame_id: str | None
-    ) -> dict[str, Decoder]:
+    def _decoders(self, joint_names: Iterable[str] | None, frame_id: str | None) -> dict[str, Any]:
         """
-        Return topic -> decoder of the topics that are read.
+        Return topic -> Decoder of the topics that are read.
 
         `joint_names`: joints of the table; `frame_id`: frame of the Imu messages, None for any.
         """
@@ -384,7 +382,7 @@ class Recording:
         self.close()
 
 
-def _block(parts: dict[type, list], decoders: Iterable[Decoder]) -> SampleBlock:
+def _block(parts: dict[Any, list], decoders: Iterable[Decoder]) -> SampleBlock:
     """
     Return the samples of a block and the counts of the decoders since the last block.
 

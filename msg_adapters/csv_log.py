@@ -16,6 +16,7 @@ from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 from weakref import finalize
 
 import numpy as np
@@ -338,6 +339,7 @@ def read_csv(
         elif each.quantity == 'joint':
             joint = _with_unit(each, lambda: None, path)
             joints.append(joint)
+            assert joint.unit is not None
             unit_rad = COLUMN_UNITS['joint'][joint.unit]
             angles[joint.joint] = table.values(joint.names)[:, 0] * unit_rad
     used += joints
@@ -477,11 +479,15 @@ def _sensors(
         rate_s = table.values(rate.names) * _size_of(rate)
         return _Readings((rate,), ImuSamples(stamp_ns, absent, rate_s, 'imu_link'))
     raw_force = table.values(by_quantity['force'].names)
-    force = _with_unit(
-        by_quantity['force'],
-        lambda: _force_unit(raw_force) or _refuse_increments(raw_force, stamp_ns),
-        table.path,
-    )
+
+    def find_unit() -> str | None:
+        """Return the unit of force, or raise for increments; None for an unknown unit."""
+        unit = _force_unit(raw_force)
+        if unit is None:
+            _refuse_increments(raw_force, stamp_ns)
+        return unit
+
+    force = _with_unit(by_quantity['force'], find_unit, table.path)
     force_s = raw_force * _size_of(force)
     if 'rate' not in by_quantity:
         return _Readings((force,), ImuSamples(stamp_ns, force_s, absent, 'imu_link'))
@@ -607,6 +613,7 @@ def _log_of_two(force: _SensorLog, rate: _SensorLog) -> CsvLog:
     """Return the CsvLog of a log of each sensor."""
     readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.table.path)
     of_force, of_rate = readings.columns
+    assert readings.joined is not None
     return CsvLog(
         (force.time, of_force, rate.time, of_rate),
         readings.imu,
@@ -928,15 +935,17 @@ def _tick_size(unit: str) -> float:
     return number / divisor * COLUMN_UNITS['time'][tick[3]]
 
 
-def _time_size(unit: str) -> float:
+def _time_size(unit: str | None) -> float:
     """Return the size of a unit of time, s."""
+    assert unit is not None  # after `_with_unit`
     return COLUMN_UNITS['time'].get(unit) or _tick_size(unit)
 
 
-def _size_of(columns: Columns) -> float | np.ndarray:
+def _size_of(columns: Columns) -> Any:
     """Return the size in SI of the unit of force or rate, for each axis if it differs."""
     if columns.unit == RAW_UNIT:
         return 1.0
+    assert columns.unit is not None  # after `_with_unit`
     return 1.0 / np.asarray(unit_of(SENSOR_OF[columns.quantity], columns.unit).scale)
 
 
@@ -1138,7 +1147,11 @@ class _Table:
         """
         wanted = sorted({self.column(name) for name in names})
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
-        options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': None}
+        options: dict[str, Any] = {
+            'delimiter': self.delimiter,
+            'encoding': 'utf-8-sig',
+            'comments': None,
+        }
         lines = self._complete(self._selected(self._rows, where), wanted[-1] + 1)
         self.lines = lines
         number_lines = [self._as_numbers(line) for line in lines]
@@ -1686,9 +1699,9 @@ def _require_distinct_times(values: np.ndarray, path: Path) -> None:
     n_distinct = len(np.unique(values))
     if len(values) < MIN_ROWS_OF_TIMES or n_distinct >= MIN_DISTINCT_TIMES * len(values):
         return
-    what = 'all stamps are equal' if n_distinct == 1 else f'only {n_distinct} stamps differ'
+    fault = 'all stamps are equal' if n_distinct == 1 else f'only {n_distinct} stamps differ'
     raise InputError(
-        f'the time in {path} must differ from row to row, {what} in {len(values)} rows, the first'
+        f'the time in {path} must differ from row to row, {fault} in {len(values)} rows, the first'
         f' is {values[0]}: written with too few digits?; export the time with nine digits after'
         ' the second, or name another column with time=NAME:UNIT',
         key='columns',

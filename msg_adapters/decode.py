@@ -200,7 +200,7 @@ class JointDecoder(Decoder):
     """
 
     def __init__(
-        self, joint_names: Sequence[str] | None = None, deserialize: Callable | None = None
+        self, joint_names: Iterable[str] | None = None, deserialize: Callable | None = None
     ):
         super().__init__(JOINT_STATE_TYPE, deserialize)
         self.requires_names = joint_names is not None
@@ -253,10 +253,13 @@ class JointDecoder(Decoder):
                 key='joint_topic',
             )
         got = '; '.join(', '.join(names) or 'no names' for names in self.seen_names)
-        missing = [[name for name in self.names if name not in names] for names in self.seen_names]
+        missing = min(
+            ([name for name in self.names if name not in names] for names in self.seen_names),
+            key=len,
+        )
         raise InputError(
             f'JointState must name the joints of the table ({", ".join(self.names)}), got'
-            f' {got}, which lacks {", ".join(min(missing, key=len))}; correct the names in the'
+            f' {got}, which lacks {", ".join(missing)}; correct the names in the'
             ' table description, or choose another topic',
             key='joint_topic',
             code='joint_names',

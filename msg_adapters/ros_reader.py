@@ -46,10 +46,12 @@ class RosReader(Rosbag2):
         """Name in rosbag2 of the storage."""
         return self.files[0].identifier
 
-    def _storage_paths(self):
+    def _storage_paths(self) -> list[Path]:
+        """Return the recording itself: rosbag2_py finds its files."""
         return [self.path]
 
     def _open(self, path, unpack):  # noqa: ARG002
+        """Open the recording, which rosbag2_py decompresses; return the error when that fails."""
         try:
             self.files.append(RosFile(path, self.metadata))
         except Exception as error:  # rosbag2_py raises RuntimeError of many causes

@@ -474,7 +474,8 @@ def _stretch(parts: list[Part]) -> Stretch:
     )
     topic_ids = np.concatenate([part.topic_ids for part in parts])
 
-    def received_ns(index):
+    def received_ns(index: np.ndarray) -> np.ndarray:
+        """Return the receive times at an index of the stretch; read when they are needed."""
         values = chain.from_iterable(part.times() for part in parts)
         return np.array(list(map(_integer, values)), dtype=np.int64)[index]
 

@@ -111,10 +111,10 @@ class StorageFile:
         The ids are looked up at once, because a hostile file has thousands of topics.
         """
         # A file without a summary declares topics between its messages.
-        known = self.topic_ids
+        ids_of_topic = self.topic_ids
         number_of = {}
         for number, topic in enumerate(topics):
-            for topic_id in known.get(topic, ()):
+            for topic_id in ids_of_topic.get(topic, ()):
                 number_of[topic_id] = number
         if not number_of:
             return np.full(len(topic_ids), -1)
@@ -150,13 +150,15 @@ class StorageFile:
         None, and counted in `lost`, when it is damaged or the stretch is too large.
         """
         if n_before >= LARGEST_STRETCH:
-            return self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
+            self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
+            return None
         # Called only where `unpack` is given.
         assert self.unpack is not None
         try:
             return self.unpack(data)
         except Exception as error:  # decompressors raise various errors on damaged data
-            return self._lose(f'messages that cannot be decompressed ({error})', 1)
+            self._lose(f'messages that cannot be decompressed ({error})', 1)
+            return None
 
     def _lose(self, kind: str, count: int) -> None:
         """Count lost data in `lost`; `kind` describes it without the name of the file."""

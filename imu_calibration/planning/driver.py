@@ -423,7 +423,7 @@ class Driver:
         """Return the fault of joints that leave their path or do not advance on it, '' for none."""
         watch = self._watch
         # Called only during a motion.
-        assert watch is not None
+        assert watch is not None and self.position is not None
         if watch.has_strayed:
             joint = watch.suspect()
             distance = watch.deviation.max() * watch.tolerance[joint]

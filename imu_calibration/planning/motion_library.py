@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any
@@ -357,7 +357,8 @@ class MotionLibrary:
     def _pairs(self) -> list[tuple[int, ...]]:
         """Return the pairs of joints that move together: the last ones, near the sensor."""
         moving = np.flatnonzero(self.limits.upper > self.limits.lower)
-        return list(combinations(moving, 2))[-6:]
+        pairs: list[tuple[int, ...]] = list(combinations(moving.tolist(), 2))
+        return pairs[-6:]
 
     def _swings_together(self) -> Iterator[PlannedMotion]:
         """Yield swings of pairs of joints, and of all joints, with different frequencies."""
@@ -491,7 +492,7 @@ class MotionLibrary:
             sizes.append(f'{self.names[k]} by {size} at {frequency[k]:.2g} Hz')
         return middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s'
 
-    def _rate_words(self, rates: Sequence[float]) -> str:
+    def _rate_words(self, rates: np.ndarray) -> str:
         """Return the joints that turn and their rates (rad/s) as text."""
         return ' and '.join(
             f'{name} at {np.degrees(rate):+.0f} deg/s'

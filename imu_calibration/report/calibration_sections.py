@@ -89,9 +89,9 @@ def _correlation(calibration: Calibration, live: np.ndarray) -> tuple[np.ndarray
 
 def short_name(name: str) -> str:
     """Return a parameter or effect name that fits a figure."""
-    sensor, _, rest = name.partition('.')
-    rest = rest.removeprefix(PREFIXES.get(sensor, '') + '_').replace('_', ' ').replace('.', ' ')
-    return rest if sensor == 'reference' else f'{PREFIXES[sensor]} {rest}'
+    sensor, _, label = name.partition('.')
+    label = label.removeprefix(PREFIXES.get(sensor, '') + '_').replace('_', ' ').replace('.', ' ')
+    return label if sensor == 'reference' else f'{PREFIXES[sensor]} {label}'
 
 
 def _bars(figure, result, live):

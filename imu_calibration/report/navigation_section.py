@@ -226,8 +226,8 @@ def _joined_growth(runs: list[Growth]) -> Growth:
     return Growth(runs[0].time, velocity, np.array([run.position for run in runs]))
 
 
-def _moving_runs(result: CalibrationResult, window: Window, length: float) -> list[Growth]:
-    """Return the Growth, shapes (n,), of the first `length` s of a window: raw, then corrected."""
+def _moving_runs(result: Any, window: Window, length: float) -> list[Growth]:
+    """Return the Growth, shapes (n,), in the first `length` s of a window: raw, then corrected."""
     stretch = slice(0, int(np.searchsorted(window.time, window.time[0] + length, 'right')))
     time = window.time[stretch]
     force_s = window.force_s[stretch]
