@@ -49,7 +49,7 @@ def shown(knowledge, seen):
     steps = foretold(knowledge)
     first, seconds = steps[0], sum(step.seconds for step in steps)
     return Coverage(
-        knowledge.best()[1],
+        knowledge.best().gains,
         np.array(seen),
         seen[-1],
         Step(first.words, first.up, first.axis, first.angle),

@@ -95,7 +95,11 @@ def test_at_first_everything_is_worth_having_and_the_time_is_foretold():
 def test_what_has_been_held_many_times_is_worth_less_than_what_has_not():
     knowledge = knowing(*[(1, 0, 0), (0, 1, 0)] * 10, (0, 0, 1))
     worth = dict(
-        zip(map(tuple, np.sign(DIRECTIONS).astype(int).tolist()), knowledge.best()[1], strict=True)
+        zip(
+            map(tuple, np.sign(DIRECTIONS).astype(int).tolist()),
+            knowledge.best().gains,
+            strict=True,
+        )
     )
     assert max(worth[1, 0, 0], worth[0, 1, 0]) < 0.5 * worth[-1, 0, 0]
 
@@ -103,7 +107,7 @@ def test_what_has_been_held_many_times_is_worth_less_than_what_has_not():
 def test_an_attitude_that_nobody_took_is_worth_nothing_once_everything_is_known():
     ups = [d for d in DIRECTIONS if d[2] > -0.9]
     enough = knowing(*ups, *ups, factor=10.0)
-    _, worth, _ = enough.best()
+    worth = enough.best().gains
     assert foretold(enough) == [] and (worth < MIN_CELL_WORTH).all()
 
 
@@ -117,10 +121,10 @@ def test_what_is_foretold_takes_off_what_is_missing():
         == min(sum(step.seconds for step in plan) for plan in hasty)
         < max(sum(s.seconds for s in p) for p in hasty)
     )
-    before = float(knowledge.missing(knowledge.information))
+    before = float(knowledge.excess(knowledge.information))
     for step in steps:
         knowledge = knowledge.then(step)
-        after = float(knowledge.missing(knowledge.information))
+        after = float(knowledge.excess(knowledge.information))
         assert after < before
         before = after
     assert before == 0

@@ -75,13 +75,11 @@ class HandStep:
     @property
     def details(self) -> dict[str, Any]:
         """Numbers of the step for plan.yaml."""
-        found: dict[str, Any] = {'up': [float(f'{c:.6g}') for c in self.up]}
+        details: dict[str, Any] = {'up': [float(f'{c:.6g}') for c in self.up]}
         if self.axis is not None and self.is_turn:
-            found |= {
-                'turn_axis': [float(f'{c:.6g}') for c in self.axis],
-                'turn_deg': round(float(np.degrees(self.angle)), 1),
-            }
-        return found
+            details['turn_axis'] = [float(f'{c:.6g}') for c in self.axis]
+            details['turn_deg'] = round(float(np.degrees(self.angle)), 1)
+        return details
 
     @property
     def words(self) -> str:
@@ -103,22 +101,29 @@ def direction_words(up: np.ndarray) -> str:
 
 def shortest_turn(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, float]:
     """
-    Return (axis in the sensor frame, angle) of the shortest turn of the sensor.
+    Return (axis in the sensor frame, angle in rad) of the shortest turn of the sensor.
 
-    The turn brings `end` up where `start` was.
+    Before the turn the direction `start` of the sensor points up, after it the direction `end`.
     """
-    about = cross(end[:, None], start[:, None])[:, 0]
-    size = np.linalg.norm(about)
-    angle = float(np.arctan2(size, start @ end))
-    return (about / size if size > 1e-6 else tangent(start[None])[0, :, 0]), angle
+    axis_times_sine = cross(end[:, None], start[:, None])[:, 0]
+    sine = np.linalg.norm(axis_times_sine)
+    angle = float(np.arctan2(sine, start @ end))
+    if sine > 1e-6:
+        return axis_times_sine / sine, angle
+    # Parallel or opposite directions: any axis orthogonal to them.
+    return tangent(start[None])[0, :, 0], angle
 
 
 def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
     """
-    Return the design of the shortest turn between two directions up.
+    Return the rows of the shortest turn from `start` up to `end` up, shape (2, 9).
 
-    It is the design for the gyroscope's matrix, shape (2, 9), of the turn from one direction up to
-    another.
+    They are the columns of the matrix M of the gyroscope, row by row, in the equation that compares
+    rotated gravity with gravity after the turn (`equations.GravityRows`)::
+
+        rows = T' [end x] dpsi/dM,    T = tangent(end)
+
+    Zero without a first direction, and for turns too small to count.
     """
     if start is None:
         return np.zeros((2, 9))
@@ -131,39 +136,39 @@ def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
 
 def steps_from(up: np.ndarray | None) -> tuple[tuple[HandStep, ...], np.ndarray]:
     """
-    Return the step to each of `DIRECTIONS`.
+    Return (steps to each of `DIRECTIONS`, their `turn_rows`, shape (26, 2, 9)).
 
-    By the shortest turn from the current one, and the `turn_rows` of each, shape (26, 2, 9).
+    Each step is the shortest turn from the current direction `up`; None: from anywhere.
     """
     return _steps_from(None if up is None else tuple(up.tolist()))
 
 
 @lru_cache(maxsize=256)  # plans revisit the same directions
 def _steps_from(up: tuple[float, ...] | None) -> tuple[tuple[HandStep, ...], np.ndarray]:
+    """Return `steps_from` of a direction that can be the key of a cache."""
     start = None if up is None else np.array(up)
-    steps = tuple(
-        HandStep(to) if start is None else HandStep(to, *shortest_turn(start, to))
-        for to in DIRECTIONS
-    )
-    rows = np.array([turn_rows(start, to) for to in DIRECTIONS])
-    rows.flags.writeable = False
-    return steps, rows
+    steps = []
+    for end in DIRECTIONS:
+        steps.append(HandStep(end) if start is None else HandStep(end, *shortest_turn(start, end)))
+    rows = np.array([turn_rows(start, end) for end in DIRECTIONS])
+    rows.flags.writeable = False  # all callers share the array
+    return tuple(steps), rows
 
 
-def _rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:
+def _rotation_slopes(axis: np.ndarray, angle: float) -> np.ndarray:
     """
-    Return the derivative of the rotation error by the gyroscope's matrix.
+    Return the derivative of the rotation error of a turn by the gyroscope's matrix, shape (3, 9).
 
-    It is in the turned frame, near the identity, and has shape (3, 9).
+    For a turn at unit rate about the axis a, near ``M = 1``, in the frame after the turn, with the
+    rotation ``C(s) = exp(-s [a x])`` over the angle s::
+
+        psi = -integral C(angle - t) dM a dt = -(integral of C from 0 to angle) dM a
     """
-    cross = skew(about)
-    # integral over the turn of the remaining rotation, C(angle - t)
-    to_come = (
-        angle * np.outer(about, about)
-        + np.sin(angle) * (np.eye(3) - np.outer(about, about))
-        - (1 - np.cos(angle)) * cross
+    along = np.outer(axis, axis)
+    integral = (
+        angle * along + np.sin(angle) * (np.eye(3) - along) - (1 - np.cos(angle)) * skew(axis)
     )
-    return -np.einsum('ip,q->ipq', to_come, about).reshape(3, 9)
+    return -np.einsum('ip,q->ipq', integral, axis).reshape(3, 9)
 
 
 TREMBLING, CREEPING = 1.5e-3, 5e-4
@@ -201,6 +206,18 @@ recommended for it too.
 
 
 @dataclass(frozen=True, eq=False)
+class StepChoice:
+    """The best next step, and the gains of all directions."""
+
+    step: HandStep
+    """The step with the largest gain per second."""
+    gains: np.ndarray
+    """Share of the excess that a rest in each of `DIRECTIONS` removes, 0 to 1, shape (26,)."""
+    information: np.ndarray
+    """Information after the step, shape (n, n)."""
+
+
+@dataclass(frozen=True, eq=False)
 class HandKnowledge:
     """Current information of a session by hand, and the expected information of one more pose."""
 
@@ -209,146 +226,140 @@ class HandKnowledge:
     values: np.ndarray
     """Their values, or the nominal ones, shape (n,)."""
     information: np.ndarray
-    """Of the data so far, shape (n, n)."""
+    """Inverse covariance from the data so far, without priors, shape (n, n)."""
     tolerances: np.ndarray
-    """Goal, shape (n,)."""
+    """Standard deviations that are the goal, shape (n,)."""
     pose_sd: float
-    """Expected sd of one pose, m/s^2."""
+    """Expected sd of the specific force of one pose, m/s^2."""
     drift_sd: float
-    """The same for the bias of the gyroscope, rad/s."""
+    """Expected sd of the gyroscope's bias in one pose, rad/s."""
     turn_sd: float
-    """The same for a turn, rad."""
+    """Expected sd of the angle of one turn, rad."""
     up: np.ndarray | None
     """Current vertical in the sensor frame, shape (3,); None: unknown."""
 
-    def norms(self, ups: np.ndarray) -> np.ndarray:
+    def norm_columns(self, ups: np.ndarray) -> np.ndarray:
         """
-        Return the design of the length of gravity at rest in several directions, shape (k, n).
+        Return minus the derivative of ``|true force|`` at rest by all parameters, shape (k, n).
 
-        It depends on the values, not on the information.
+        `ups` are the directions that point up in each of the k poses. The derivative depends on the
+        values of the parameters, not on the information.
         """
         bias, matrix, *_ = self.model.linear(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
-        # temperature and time at the reference point: one more pose there has no information about
-        # thermal effects
+        # At the reference time and temperature the columns of thermal effects are zero: one more
+        # pose has no information about them.
         count = len(ups)
-        warmth = np.full(count, self.model.model.temperature_ref_c)
-        return self.model.norm_rows(
-            self.values, forces, time=np.zeros(count), temperature_c=warmth
-        )[1]
+        reference_c = np.full(count, self.model.model.temperature_ref_c)
+        _, columns = self.model.norm_rows(
+            self.values, forces, time=np.zeros(count), temperature_c=reference_c
+        )
+        return columns
 
-    def after(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    def information_after(self, norm_columns: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """
-        Return the information after a turn to each of several directions and a rest there.
+        Return the information after one more turn and rest, for each of k directions, (k, n, n).
 
-        With their `norms` (k, n) and `turn_rows` (k, 2, 9).
+        `norm_columns` (k, n) and `turns` (k, 2, 9; `turn_rows`) belong to the directions.
         """
-        rows = self.rows(norms, turns)
+        rows = self.step_rows(norm_columns, turns)
         return self.information + rows.transpose(0, 2, 1) @ rows
 
-    def rows(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    def step_rows(self, norm_columns: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """
-        Return the design of poses in sd, shape (k, 6, n).
+        Return the rows of k steps in units of their expected sd, shape (k, 6, n).
 
-        From lengths of gravity (k, n), rates at rest, turns (k, 2, 9).
+        Row 0 is the length of gravity at rest, from `norm_columns` (k, n); rows 1 to 3 are the
+        rates at rest, which measure the bias; rows 4 and 5 the turn, from `turns` (k, 2, 9).
         """
-        rows = np.zeros((len(norms), 6, self.model.size))
-        rows[:, 0] = norms / self.pose_sd
+        rows = np.zeros((len(norm_columns), 6, self.model.size))
+        rows[:, 0] = norm_columns / self.pose_sd
         rows[:, 1:4, self.model.gyro_bias] = np.eye(3) / self.drift_sd
         rows[:, 4:6, self.model.gyro_matrix] = turns / self.turn_sd
         return rows
 
     def sd(self, information: np.ndarray) -> np.ndarray:
-        """Return the standard deviations with some information; leading axes are kept."""
+        """Return the sds of the parameters, (..., n), given information (..., n, n)."""
         inverse = np.linalg.inv(information + np.diag(1 / self.model.priors**2))
         return np.sqrt(np.diagonal(inverse, axis1=-2, axis2=-1))
 
-    def missing(
-        self, information: np.ndarray, only: Sequence[int] | slice = slice(None)
+    def excess(
+        self, information: np.ndarray, parameters: Sequence[int] | slice = slice(None)
     ) -> np.ndarray:
-        """
-        Return the remaining `excess` of all or some parameters given some information.
-
-        Leading axes are kept.
-        """
-        return sd_excess(self.sd(information)[..., only], self.tolerances[only])
+        """Return `sd_excess` of the parameters, shape (...), given information (..., n, n)."""
+        return sd_excess(self.sd(information)[..., parameters], self.tolerances[parameters])
 
     def best(
         self,
-        only: Sequence[int] | slice = slice(None),
+        parameters: Sequence[int] | slice = slice(None),
         *,
-        weight: float = 1.0,
-        norms: np.ndarray | None = None,
-    ) -> tuple[HandStep, np.ndarray, np.ndarray]:
+        seconds_exponent: float = 1.0,
+        norm_columns: np.ndarray | None = None,
+    ) -> StepChoice:
         """
-        Return (best step, gains of `DIRECTIONS`, information after the step).
+        Return the step to one of `DIRECTIONS` with the largest ``gain / seconds**exponent``.
 
-        The step is the one with the largest gain per second. The gain of each of `DIRECTIONS` is
-        relative.
-
-        only : sequence of int, optional
+        parameters : sequence of int, optional
             Parameters for which the gain is computed; by default all.
-        weight : float
-            Exponent of the seconds; 0: they do not count.
-        norms : ndarray, shape (26, n), optional
-            `norms` of `DIRECTIONS`, where they are known.
+        seconds_exponent : float
+            Exponent of the duration of a step; 0: it does not count.
+        norm_columns : ndarray, shape (26, n), optional
+            `norm_columns` of `DIRECTIONS`, where they are known.
 
         """
+        if norm_columns is None:
+            norm_columns = self.norm_columns(DIRECTIONS)
         steps, turns = steps_from(self.up)
-        information = self.after(self.norms(DIRECTIONS) if norms is None else norms, turns)
-        worth = share_gained(
-            float(self.missing(self.information, only)), self.missing(information, only)
-        )
+        information = self.information_after(norm_columns, turns)
+        current_excess = float(self.excess(self.information, parameters))
+        gains = share_gained(current_excess, self.excess(information, parameters))
         if self.up is not None:
-            worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0  # the current attitude
-        place = int(np.argmax(worth / np.array([step.seconds for step in steps]) ** weight))
-        return steps[place], worth, information[place]
+            gains[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0  # the current attitude
+        seconds = np.array([step.seconds for step in steps])
+        index = int(np.argmax(gains / seconds**seconds_exponent))
+        return StepChoice(steps[index], gains, information[index])
 
     def then(self, step: HandStep) -> HandKnowledge:
         """Return the knowledge after a step."""
-        return replace(
-            self,
-            information=self.after(self.norms(step.up[None]), turn_rows(self.up, step.up)[None])[0],
-            up=step.up,
-        )
+        columns = self.norm_columns(step.up[None])
+        turn = turn_rows(self.up, step.up)[None]
+        return replace(self, information=self.information_after(columns, turn)[0], up=step.up)
 
 
 def foretold(knowledge: HandKnowledge) -> list[HandStep]:
     """
-    Return the steps still needed.
+    Return the steps still needed, chosen one by one by their gain.
 
-    The shorter of the plans with and without the seconds of each step in its choice.
-
-    The largest gain per second is not always the shortest plan: it begins with small turns, after
-    which more remains to be done.
+    Of the choices by ``gain`` and by ``gain / seconds`` (`WEIGHTS`) the one with the smaller
+    remaining excess is returned, if equal the shorter one. The largest gain per second is not
+    always the shortest plan: it begins with small turns, after which more steps are needed.
     """
-    plans = [_rollout(knowledge, weight) for weight in WEIGHTS]
+    plans = [_rollout(knowledge, exponent) for exponent in WEIGHTS]
     return min(plans, key=lambda plan: (plan[1], sum(step.seconds for step in plan[0])))[0]
 
 
-def _rollout(knowledge: HandKnowledge, weight: float) -> tuple[list[HandStep], float]:
+def _rollout(knowledge: HandKnowledge, seconds_exponent: float) -> tuple[list[HandStep], float]:
     """Return (the steps by greedy choice, the remaining excess)."""
     steps: list[HandStep] = []
-    norms = knowledge.norms(DIRECTIONS)
-    while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_PLANNED_STEPS:
-        step, worth, information = knowledge.best(weight=weight, norms=norms)
-        if worth.max() < MIN_POSE_GAIN:
+    norm_columns = knowledge.norm_columns(DIRECTIONS)
+    while float(knowledge.excess(knowledge.information)) > 0 and len(steps) < MOST_PLANNED_STEPS:
+        choice = knowledge.best(seconds_exponent=seconds_exponent, norm_columns=norm_columns)
+        if choice.gains.max() < MIN_POSE_GAIN:
             break
-        steps.append(step)
-        knowledge = replace(knowledge, information=information, up=step.up)
-    return steps, round(float(knowledge.missing(knowledge.information)), 9)
+        steps.append(choice.step)
+        knowledge = replace(knowledge, information=choice.information, up=choice.step.up)
+    return steps, round(float(knowledge.excess(knowledge.information)), 9)
 
 
 def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     """
-    Return the undetermined parameters and the needs of each undetermined sensor.
+    Return the undetermined parameters with the motion or remedy that determines them.
 
-    The values are {'parameters': {name: sd over tolerance}, 'needs': the step that helps most} for
-    each sensor that is not fully determined. Where no motion helps, it is the remedy for the cause
-    (`_without_motion`).
+    One item for each sensor that another attitude determines, then one for each sensor and remedy
+    where none does (`_without_motion`): {'parameters': {name: sd over tolerance}, 'needs': text}.
 
-    Recommended is the next step of the common plan, shown in the picture, if it serves the sensor;
-    otherwise the best step for the sensor.
+    The recommended step is the next one of the common plan, shown in the picture, if it serves the
+    sensor; otherwise the best step for the sensor.
     """
     absent = hand.hand_model.absent
     lacking: dict[str, dict[str, float]] = {}
@@ -373,41 +384,42 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
             for names in lacking.values()
         )
     knowledge = knowledge_after(hand)
-    parts = {}  # sensor -> places of its parameters, in the order of the sensors
-    for sensor in SENSORS:
-        if sensor in lacking:
-            parts[sensor] = [hand.param_names.index(name) for name in lacking[sensor]]
-    plan = foretold(knowledge)[:1] if parts else []
+    plan = foretold(knowledge)[:1] if lacking else []
 
-    def gain(part: list[int], step: HandStep) -> float:
-        """Return the excess of some parameters that a step removes in a second."""
-        before = knowledge.missing(knowledge.information, part)
-        after = knowledge.missing(knowledge.then(step).information, part)
+    def gain_rate(parameters: list[int], step: HandStep) -> float:
+        """Return the decrease of the excess of the parameters by a step, per second."""
+        before = knowledge.excess(knowledge.information, parameters)
+        after = knowledge.excess(knowledge.then(step).information, parameters)
         return float(before - after) / step.seconds
 
-    found = []
-    for sensor, part in parts.items():
-        own = knowledge.best(part)[0]
-        best = next((step for step in plan if gain(part, step) >= SERVES * gain(part, own)), own)
-        found.append({'parameters': lacking[sensor], 'needs': best.words})
-    found += [{'parameters': names, 'needs': text} for (_, text), names in remedies.items()]
-    return tuple(found)
+    needs = []
+    for sensor in SENSORS:
+        if sensor not in lacking:
+            continue
+        parameters = [hand.param_names.index(name) for name in lacking[sensor]]
+        recommended = knowledge.best(parameters).step
+        least_rate = SERVES * gain_rate(parameters, recommended)
+        if plan and gain_rate(parameters, plan[0]) >= least_rate:
+            recommended = plan[0]
+        needs.append({'parameters': lacking[sensor], 'needs': recommended.words})
+    needs += [{'parameters': names, 'needs': text} for (_, text), names in remedies.items()]
+    return tuple(needs)
 
 
 def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') -> str:
     """
-    Return what determines a parameter if another attitude does not; '' if it does.
+    Return the remedy for an undetermined parameter that no attitude determines; '' if one does.
 
     An effect in time or temperature needs these to change. Otherwise the remedy is that of the
     cause: the standard deviations follow from the scatter of poses and turns, so that a misfit of
     the model enlarges them as noise would (`EXCESS`).
     """
-    model, terms = hand.hand_model, hand.terms
     for effect in hand.model.effects:
-        own = hand.model.slices[effect.key]
-        if own.start <= index < own.stop and effect.motion[0] in WARMING:
+        parameters = hand.model.slices[effect.key]
+        if parameters.start <= index < parameters.stop and effect.motion[0] in WARMING:
             return ALL_MOTIONS[effect.motion[0]]
 
+    # The bias of the gyroscope is determined at rest, its other parameters by turns.
     bias = hand.model.part('gyroscope', Role.OFFSET)
     of_turns = hand.param_names[index].startswith('gyroscope') and index not in range(
         bias.start, bias.stop
@@ -424,7 +436,7 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
         return TURNS_REMEDY
 
     # A parameter that the attitudes do not determine needs other attitudes for any scatter.
-    if hand.judged_sd[index] > UNKNOWN_SHARE * model.priors[index]:
+    if hand.judged_sd[index] > UNKNOWN_SHARE * hand.hand_model.priors[index]:
         return ''
     if hand.param_names[index].startswith('accelerometer'):
         excess = excesses.pose
@@ -433,12 +445,18 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
         excess = max(excesses.pose, excesses.turn)
     else:
         excess = excesses.bias
-    return remedy(terms, index, hand.tolerances[index], excess=excess if excess > EXCESS else 1.0)
+    if excess <= EXCESS:
+        excess = 1.0
+    return remedy(hand.terms, index, hand.tolerances[index], excess=excess)
 
 
 @dataclass(frozen=True)
 class _Excesses:
-    """Scatter of poses and turns over that of noise and a quiet hand (`TREMBLING`, `CREEPING`)."""
+    """
+    Ratio of the scatter of poses and turns to that of a quiet hand (`TREMBLING`, `CREEPING`).
+
+    Both scatters include the noise of the means.
+    """
 
     pose: float
     """Of the specific force of a pose."""
@@ -449,12 +467,14 @@ class _Excesses:
 
     @classmethod
     def of(cls, hand: HandCalibration) -> '_Excesses':
+        """Return the ratios of a solution."""
         statistics = hand.statistics
         sd_force, sd_bias, sd_turn = SCATTER_SD
         force_noise = np.sqrt(np.mean(hand.poses.force_sem**2))
         rate_noise = np.sqrt(np.mean(hand.poses.rate_sem**2))
 
         def ratio(scatter: float, quiet: float, noise: float) -> float:
+            """Return the ratio of two sds, each with the noise added."""
             return float(np.hypot(scatter, noise) / np.hypot(quiet, noise))
 
         return cls(
@@ -474,41 +494,39 @@ def knowledge_at_first(
     """
     Return the HandKnowledge before the first solution.
 
-    From the poses only, at nominal values and with the default scatter.
+    It has the information of the poses so far, at the nominal values and with the default scatter.
 
     Parameters
     ----------
     model : HandModel
     tolerances : ndarray, shape (n,)
     noise : tuple
-        Contribution of the sensor noise to a pose (m/s^2), to its mean rate (rad/s) and to a turn
-        (rad).
+        Sd from the sensor noise of the mean force of a pose (m/s^2), of its mean rate (rad/s) and
+        of the angle of a turn (rad).
     poses : Poses, optional
         Poses so far.
 
     """
     scatter = np.hypot(SCATTER_SD, (TREMBLING, CREEPING, 0.0))
-    pose_sd, drift_sd, turn_sd = (
-        float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True)
-    )
+    pose_sd, drift_sd, turn_sd = np.hypot(scatter, noise).tolist()
     knowledge = HandKnowledge(
         model,
-        model.nominal,
-        np.zeros((model.size, model.size)),
-        GOAL_SHARE * tolerances,
-        pose_sd,
-        drift_sd,
-        turn_sd,
-        None,
+        values=model.nominal,
+        information=np.zeros((model.size, model.size)),
+        tolerances=GOAL_SHARE * tolerances,
+        pose_sd=pose_sd,
+        drift_sd=drift_sd,
+        turn_sd=turn_sd,
+        up=None,
     )
     if poses is None:
         return knowledge
     ups = ups_of(poses)
-    # No turn before the first pose.
-    turns = np.array(
-        [turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)]
-    )
-    rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], turns)
+    turns = np.zeros((len(ups), 2, 9))  # no turn before the first pose
+    for pose in range(1, len(ups)):
+        turns[pose] = turn_rows(ups[pose - 1], ups[pose])
+    _, norm_columns = model.norm_rows(model.nominal, poses.force)
+    rows = knowledge.step_rows(norm_columns, turns)
     return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows), up=ups[-1])
 
 
@@ -516,26 +534,27 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     """
     Return the HandKnowledge of a solution.
 
-    Its information, reduced by the growth of its standard deviations beyond noise.
+    Its sds exceed those of its information by the terms beyond noise. The largest of these factors
+    divides the information and enlarges the expected sds of poses and turns.
     """
     model = hand.hand_model
     statistics = hand.statistics
     poses = hand.poses
-    expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
-    known = expected < UNKNOWN_SHARE * model.priors
-    wider = max(1.0, float(np.max(np.where(known, hand.judged_sd / expected, 0.0))))
+    noise_sd = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
+    known = noise_sd < UNKNOWN_SHARE * model.priors
+    sd_factor = max(1.0, float(np.max(np.where(known, hand.judged_sd / noise_sd, 0.0))))
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
     turn_sd = max(statistics['turn_scatter_sd'], 1e-4)
     return HandKnowledge(
         model,
-        hand.values,
-        hand.information / wider**2,
-        GOAL_SHARE * hand.tolerances,
-        float(wider * pose_sd),
-        float(wider * drift_sd),
-        float(wider * turn_sd),
-        ups_of(poses)[-1],
+        values=hand.values,
+        information=hand.information / sd_factor**2,
+        tolerances=GOAL_SHARE * hand.tolerances,
+        pose_sd=float(sd_factor * pose_sd),
+        drift_sd=float(sd_factor * drift_sd),
+        turn_sd=float(sd_factor * turn_sd),
+        up=ups_of(poses)[-1],
     )
 
 
