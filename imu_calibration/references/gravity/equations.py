@@ -25,7 +25,8 @@ Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's
 """
 SCATTER_SD = (0.002, 1e-4, 2e-3)
 """
-Their standard deviations when there are too few poses or turns to estimate them, m/s^2, rad/s, rad.
+Standard deviations of the `COMPONENTS` when poses or turns are too few to estimate them, m/s^2,
+rad/s, rad.
 """
 
 
@@ -163,11 +164,14 @@ class GravityRows:
         """
         Return the state after a step.
 
-        Pose after pose 2 components of its direction and 3 of its drift, then the parameters.
+        The step has 5 nuisances for each pose, 2 components of its direction and 3 of its drift,
+        then the parameters: shape (5 k + n,).
         """
-        own = step[: 5 * len(state.up)].reshape(-1, 5)
-        up = state.up + np.einsum('kij,kj->ki', tangent(state.up), own[:, :2])
-        return State(state.values + step[own.size :], unit_rows(up), state.drift + own[:, 2:])
+        of_poses = step[: 5 * len(state.up)].reshape(-1, 5)
+        direction_step = of_poses[:, OF_DIRECTION]
+        drift_step = of_poses[:, OF_DRIFT]
+        up = state.up + np.einsum('kij,kj->ki', tangent(state.up), direction_step)
+        return State(state.values + step[of_poses.size :], unit_rows(up), state.drift + drift_step)
 
     def linearise(self, state: State) -> Rows:
         """Return the rows of poses, bias drifts, calm drifts and turns at a state."""
@@ -191,18 +195,19 @@ class _RememberedTurn:
     """A turn, and the gyroscope's parameters with which it was integrated."""
 
     bias: np.ndarray
-    """rad/s, shape (3,)."""
+    """Bias, rad/s, shape (3,)."""
     matrix: np.ndarray
-    """Shape (3, 3)."""
+    """Matrix, shape (3, 3)."""
     further: np.ndarray
-    """Values of the further effects."""
+    """Values of the further effects, shape (p,)."""
     turn: Turn
+    """Rotation, and its derivatives by these parameters."""
 
     def moved(self, bias: np.ndarray, matrix: np.ndarray, further: np.ndarray) -> np.ndarray | None:
         """
         Return `Turn.mat_ji` at other parameters to first order, ``(1 - [psi x]) mat_ji``.
 
-        None where they have changed too much for that.
+        None where the rotation psi due to the change of the parameters is too large for that.
         """
         psi = (
             self.turn.by_bias @ (bias - self.bias)
@@ -223,23 +228,32 @@ class _Equations:
         self.model = model
         self.poses = poses
         self.state = state
+        # Number of the turn -> the turn as integrated before; new ones are added.
         self.memory = memory
+        # Two unit vectors across gravity in each pose, shape (k, 3, 2).
         self.across = tangent(state.up)
+        # True specific force in each pose, m/s^2, shape (k, 3).
         self.true_force = model.gravity * state.up
         linear = model.linear(state.values)
-        self.force_bias, self.force_matrix, self.gyro_bias, self.gyro_matrix = linear
+        self.force_bias = linear.force_bias
+        self.force_matrix = linear.force_matrix
+        self.gyro_bias = linear.gyro_bias
+        self.gyro_matrix = linear.gyro_matrix
+        # Parameters of the further effects of the gyroscope, indices.
         self.further_of_gyroscope = model.extra_index('gyroscope')
 
     def of_poses(self) -> Rows:
         """
-        Return ``force = bias + matrix @ (gravity * up) + further effects``.
+        Return ``force = bias + matrix @ (gravity * up) + further effects``, three rows per pose.
 
-        Three rows per pose, two of them used for its direction.
+        Two of them determine the direction `up` of the pose, one the parameters.
         """
         model = self.model
         poses = self.poses
         true = self.true_force
-        more, slopes = model.further('accelerometer', self.state.values, true, **poses.conditions)
+        further, slopes = model.further(
+            'accelerometer', self.state.values, true, **poses.conditions
+        )
         main = np.zeros((len(true), 3, model.size))
         main[:, :, 0:3] = np.eye(3)
         # Row i of the lower triangular matrix has the elements up to i.
@@ -247,7 +261,7 @@ class _Equations:
             main[:, i, 3 + 3 * i : 4 + 4 * i] = true[:, : i + 1]
         main[:, :, model.extra_index('accelerometer')] = slopes
         return self._of_each_pose(
-            poses.force - self.force_bias - true @ self.force_matrix.T - more,
+            poses.force - self.force_bias - true @ self.force_matrix.T - further,
             main,
             poses.force_sem**2,
             place=OF_DIRECTION,
@@ -290,18 +304,34 @@ class _Equations:
         blocks: np.ndarray,
         component: int,
     ) -> Rows:
-        """Return three rows per pose; `blocks`: their columns of its own nuisances at `place`."""
-        own = np.arange(len(residual))
+        """
+        Return three rows per pose.
+
+        Parameters
+        ----------
+        residual, noise : array, shape (k, 3)
+            Measured minus predicted, and its variance.
+        main : array, shape (k, 3, n)
+            Columns of the parameters.
+        place : slice
+            `OF_DIRECTION` or `OF_DRIFT`: nuisances of the pose in its rows.
+        blocks : array, shape (k, 3, m) or (3, m)
+            Columns of these nuisances.
+        component : int
+            Place in `COMPONENTS`.
+
+        """
+        pose = np.arange(len(residual))
         size = residual.size
         nuisance = np.zeros((*residual.shape, len(residual), 5))
-        nuisance[own, :, own, place] = blocks
+        nuisance[pose, :, pose, place] = blocks
         return scalar_rows(
             nuisance.reshape(size, -1),
             main.reshape(size, -1),
             residual.ravel(),
             variance=noise.ravel(),
             component=np.full(size, component),
-            group=np.repeat(own, 3),
+            group=np.repeat(pose, 3),
         )
 
     def of_zero_sums(self) -> Rows:
@@ -326,11 +356,12 @@ class _Equations:
 
     def of_turn(self, data: TurnData, number: int) -> Rows:
         """
-        Return the direction before a turn, rotated by the gyroscope, against that after it.
+        Return two rows of a turn: the direction before it, rotated by the rates, is that after it.
 
-        Two rows, from middle to middle::
+        With the directions u, their tangents T and nuisances n in the poses i and j, and the
+        rotation R from the middle of pose i to the middle of pose j::
 
-            0 = T_j' R (up_i + T_i n_i) - T_j' T_j n_j,    R = exp(-[psi x]) mat_ji
+            0 = T_j' R (u_i + T_i n_i) - T_j' T_j n_j,    R = exp(-[psi x]) mat_ji
         """
         model, state = self.model, self.state
         i, j = data.first, data.last
@@ -366,9 +397,9 @@ class _Equations:
 
     def _integrated(self, data: TurnData, bias: np.ndarray, number: int) -> tuple[np.ndarray, Turn]:
         """
-        Return (mat_ji, Turn) of turn `number`.
+        Return (mat_ji, Turn) of turn `number` at the present parameters.
 
-        From memory when the gyroscope's parameters have hardly changed since.
+        A remembered turn is corrected to first order if the parameters have changed little.
         """
         further = self.state.values[self.further_of_gyroscope]
         if number in self.memory:
@@ -388,9 +419,9 @@ class _Equations:
 
     def of_known_turn(self, data: TurnData, known: np.ndarray, known_cov: np.ndarray) -> Rows:
         """
-        Return the equation of a turn by a known rotation about a fixed body axis, three rows.
+        Return three rows of a turn by a known rotation about a fixed body axis, whitened.
 
-        It is ``matrix^-1 integral(measured - bias - further effects) = known``, whitened.
+        They are ``matrix^-1 integral(measured - bias - further effects) = known``, rad.
         """
         model = self.model
         count = len(self.state.up)
@@ -426,9 +457,10 @@ class _Equations:
 
     def _further_of_turn(self, data: TurnData, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return output and columns of the gyroscope's further effects along a turn.
+        Return (output, columns) of the gyroscope's further effects along a turn.
 
-        They are at the forces and rates without the further effects.
+        The shapes are those of `HandModel.further`. The true force and rate, at which the effects
+        are computed, are approximated by readings corrected for bias and matrix only.
         """
         force = np.linalg.solve(self.force_matrix, (data.force - self.force_bias).T).T
         rate = np.linalg.solve(self.gyro_matrix, (data.rate - bias).T).T
@@ -444,9 +476,9 @@ class _Equations:
 
 def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndarray:
     """
-    Return the matrix of a turn, (3, 3).
+    Return the rotation from the middle of the pose before a turn to the middle of the one after.
 
-    From the middle of the pose before it to that of the one after.
+    `mat_ji`, shape (3, 3), is the rotation from the end of the first to the start of the second.
     """
     if poses.half_turn is None:
         return mat_ji

@@ -6,14 +6,14 @@ Bias and matrix of both sensors, and further effects of the catalogue.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.base import Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.forward_equations import output_of_effects
 from imu_calibration.effects.sensor_model import SensorModel, linear_names, parse_effects
@@ -44,13 +44,24 @@ def possible_by_hand(effect: Effect) -> bool:
     """
     Return whether an effect is observable from gravity in poses and the turns between them.
 
-    It has columns, and none needs a table.
+    It has columns, does not change the time axis, and none of its inputs needs a table.
     """
-    return (
-        bool(effect.groups)
-        and effect.warp is None
-        and not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
-    )
+    if not effect.groups or effect.warp is not None:
+        return False
+    return not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
+
+
+class LinearParameters(NamedTuple):
+    """Bias and matrix of both sensors."""
+
+    force_bias: np.ndarray
+    """Bias of the accelerometer, m/s^2, shape (3,)."""
+    force_matrix: np.ndarray
+    """Matrix of the accelerometer, shape (3, 3)."""
+    gyro_bias: np.ndarray
+    """Bias of the gyroscope, rad/s, shape (3,)."""
+    gyro_matrix: np.ndarray
+    """Matrix of the gyroscope, shape (3, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +92,11 @@ class HandModel:
 
     def __post_init__(self) -> None:
         """Refuse effects that are not observable by hand."""
-        strange = [e.name for e in self.model.further if not possible_by_hand(e)]
-        if strange:
+        impossible = [e.name for e in self.model.further if not possible_by_hand(e)]
+        if impossible:
             raise InputError(
                 'the reference by hand is gravity and the turns between poses, '
-                f'{", ".join(strange)} cannot be estimated from it; give a table, or omit it',
+                f'{", ".join(impossible)} cannot be estimated from it; give a table, or omit it',
                 key='table',
                 code='table_needed',
             )
@@ -136,32 +147,27 @@ class HandModel:
         return self.model.part('gyroscope', Role.LINEAR)
 
     def base_index(self, sensor: str) -> np.ndarray:
-        """Return the estimated parameters of bias and matrix of one sensor."""
-        parts = [self.model.part(sensor, role) for role in (Role.OFFSET, Role.LINEAR)]
-        places = np.concatenate([self._places(part) for part in parts])
-        return places[~self.fixed[places]]
+        """Return the indices of the estimated parameters of bias and matrix of one sensor."""
+        every = np.arange(self.size)
+        bias = every[self.model.part(sensor, Role.OFFSET)]
+        matrix = every[self.model.part(sensor, Role.LINEAR)]
+        index = np.concatenate([bias, matrix])
+        return index[~self.fixed[index]]
 
     def extra_index(self, sensor: str) -> np.ndarray:
-        """Return the parameters of the further effects of one sensor."""
-        parts = [self.model.slices[e.key] for e in self.extras if e.sensor == sensor]
-        return np.concatenate([np.zeros(0, int), *map(self._places, parts)])
+        """Return the indices of the parameters of the further effects of one sensor."""
+        every = np.arange(self.size)
+        parts = [every[self.model.slices[e.key]] for e in self.extras if e.sensor == sensor]
+        return np.concatenate([np.zeros(0, int), *parts])
 
-    @staticmethod
-    def _places(part: slice) -> np.ndarray:
-        return np.arange(part.start, part.stop)
-
-    def linear(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """
-        Return the biases and matrices of a parameter vector.
-
-        The order is (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix).
-        """
-        found = (
-            values[self.model.part(sensor, role)]
-            for sensor, role in product(SENSORS, (Role.OFFSET, Role.LINEAR))
+    def linear(self, values: np.ndarray) -> LinearParameters:
+        """Return the biases and matrices of a parameter vector, shape (n,)."""
+        return LinearParameters(
+            values[self.model.part('accelerometer', Role.OFFSET)],
+            values[self.model.part('accelerometer', Role.LINEAR)].reshape(3, 3),
+            values[self.gyro_bias],
+            values[self.gyro_matrix].reshape(3, 3),
         )
-        bias_f, matrix_f, bias_w, matrix_w = found
-        return bias_f, matrix_f.reshape(3, 3), bias_w, matrix_w.reshape(3, 3)
 
     def at(self, values: np.ndarray) -> 'HandModel':
         """Return the same model with the columns of warm-ups computed at `values`."""
@@ -178,9 +184,7 @@ class HandModel:
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the contribution of the further effects to a sensor's output.
-
-        The derivative of the contribution by their parameters is returned as well.
+        Return the sum of the further effects in a sensor's output, and its derivative.
 
         Parameters
         ----------
@@ -194,7 +198,8 @@ class HandModel:
         Returns
         -------
         tuple
-            Output, shape (m, 3), and columns, shape (m, 3, p) in the order of `extra_index`.
+            Output, shape (m, 3), and its derivative by the parameters of the effects, shape
+            (m, 3, p) in the order of `extra_index`.
 
         """
         effects = [e for e in self.extras if e.sensor == sensor]
@@ -222,20 +227,36 @@ class HandModel:
         time: np.ndarray | None = None,
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return true specific force and rate for readings of shape (m, 3)."""
-        bias_f, matrix_f, bias_w, matrix_w = self.linear(values)
-        true_f = np.linalg.solve(matrix_f, (force - bias_f).T).T
-        true_w = np.linalg.solve(matrix_w, (rate - bias_w).T).T
+        """
+        Return (true specific force, true rate) of readings, each of shape (m, 3).
+
+        Bias and matrix are inverted directly, further effects by a fixed-point iteration::
+
+            true = matrix^-1 (reading - bias - further(true))
+        """
+        force_bias, force_matrix, gyro_bias, gyro_matrix = self.linear(values)
+        true_force = np.linalg.solve(force_matrix, (force - force_bias).T).T
+        true_rate = np.linalg.solve(gyro_matrix, (rate - gyro_bias).T).T
         for _ in range(REPEATS if self.extras else 0):
-            more_f, more_w = (
-                self.further(
-                    s, values, true_f, rate=true_w, time=time, temperature_c=temperature_c
-                )[0]
-                for s in SENSORS
+            further_force, _ = self.further(
+                'accelerometer',
+                values,
+                true_force,
+                rate=true_rate,
+                time=time,
+                temperature_c=temperature_c,
             )
-            true_f = np.linalg.solve(matrix_f, (force - bias_f - more_f).T).T
-            true_w = np.linalg.solve(matrix_w, (rate - bias_w - more_w).T).T
-        return true_f, true_w
+            further_rate, _ = self.further(
+                'gyroscope',
+                values,
+                true_force,
+                rate=true_rate,
+                time=time,
+                temperature_c=temperature_c,
+            )
+            true_force = np.linalg.solve(force_matrix, (force - force_bias - further_force).T).T
+            true_rate = np.linalg.solve(gyro_matrix, (rate - gyro_bias - further_rate).T).T
+        return true_force, true_rate
 
     def norm_rows(
         self,
@@ -246,9 +267,11 @@ class HandModel:
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return ``|true force| - gravity`` of mean readings at rest.
+        Return ``|true force| - gravity`` at rest, shape (k,), and minus its derivative, (k, n).
 
-        Shape (k,), and minus its derivative by all parameters, shape (k, n).
+        With the unit vector u of the true force t and the matrix M, minus the derivative is
+        ``M^-T u`` by the bias, ``(M^-T u) t'`` by the matrix, and ``(M^-T u)' slopes`` by the
+        parameters of further effects.
 
         Parameters
         ----------
@@ -258,21 +281,22 @@ class HandModel:
             Shape (k,).
 
         """
-        matrix = self.linear(values)[1]
-        true = self.compensate(
+        matrix = self.linear(values).force_matrix
+        true, _ = self.compensate(
             values, force, np.zeros_like(force), time=time, temperature_c=temperature_c
-        )[0]
-        norm = np.linalg.norm(true, axis=1)
-        back = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
-        columns = np.zeros((len(force), self.size))
-        columns[:, 0:3] = back
-        columns[:, 3:12] = (back[:, :, None] * np.tril(true[:, None].repeat(3, axis=1))).reshape(
-            -1, 9
         )
-        slopes = self.further(
+        norm = np.linalg.norm(true, axis=1)
+        by_reading = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
+
+        columns = np.zeros((len(force), self.size))
+        columns[:, 0:3] = by_reading
+        # Row i of the lower triangular matrix has the elements up to i.
+        true_of_row = np.tril(true[:, None].repeat(3, axis=1))
+        columns[:, 3:12] = (by_reading[:, :, None] * true_of_row).reshape(-1, 9)
+        _, slopes = self.further(
             'accelerometer', values, true, time=time, temperature_c=temperature_c
-        )[1]
-        columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', back, slopes)
+        )
+        columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', by_reading, slopes)
         return norm - self.gravity, columns
 
     def rate_rows(
@@ -285,18 +309,18 @@ class HandModel:
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return ``rate - bias - further effects`` of mean rates at rest, and its columns.
+        Return ``rate - bias - further effects`` at rest, shape (k, 3), and its columns, (k, 3, n).
 
-        The shapes are (k, 3) for the rates and (k, 3, n) for the columns. The columns are at true
-        specific forces.
+        The columns are minus its derivative by all parameters. `rate` is the mean reading, `force`
+        the true specific force, each of shape (k, 3).
         """
-        more, slopes = self.further(
+        further, slopes = self.further(
             'gyroscope', values, force, time=time, temperature_c=temperature_c
         )
         columns = np.zeros((len(rate), 3, self.size))
         columns[:, :, self.gyro_bias] = np.eye(3)
         columns[:, :, self.extra_index('gyroscope')] = slopes
-        return rate - values[self.gyro_bias] - more, columns
+        return rate - values[self.gyro_bias] - further, columns
 
 
 GRAVITY_LEAST, GRAVITY_MOST = 9.7, 9.9
@@ -311,13 +335,13 @@ class KnownTurn:
     """A turn of known angle about a fixed body axis."""
 
     start: int
-    """First sample."""
+    """Index of the first sample."""
     stop: int
-    """After the last sample."""
+    """Index after the last sample."""
     axis: tuple
     """Unit vector in the sensor frame; turns counter-clockwise seen from its tip."""
     angle: float
-    """rad."""
+    """Angle of the turn, rad."""
 
 
 @dataclass(frozen=True)
@@ -327,13 +351,13 @@ class HandOptions:
     gravity: float = STANDARD_GRAVITY
     """Local gravity, m/s^2."""
     gravity_sd: float = 0.0
-    """Its standard deviation, m/s^2."""
+    """Standard deviation of the local gravity, m/s^2."""
     tolerances: dict = field(default_factory=dict)
     """{sensor: {effect: sufficient sd}}; by default the catalogue's."""
     accelerometer: tuple[str, ...] | None = None
     """Effects to estimate; None: bias and matrix."""
     gyroscope: tuple[str, ...] | None = None
-    """The same; None: bias and matrix, and the g-sensitivity when the poses show it."""
+    """Effects to estimate; None: bias and matrix, and the g-sensitivity if it is significant."""
     added: tuple[tuple[str, str], ...] = ()
     """(sensor, effect) that the recording demands in addition."""
     point: dict[str, np.ndarray] = field(default_factory=dict)
@@ -344,9 +368,9 @@ class HandOptions:
 
 def hand_options(options: CalibrationOptions) -> HandOptions:
     """
-    Return the requested options by hand.
+    Return the options of a calibration by hand.
 
-    The standard gravity with its uncertainty if the local one is unknown.
+    If the local gravity is unknown, the standard one with its uncertainty is the reference.
 
     Raises
     ------
@@ -360,25 +384,28 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
             key='table',
             code='table_only',
         )
-    asked = (options.accelerometer_model, options.gyroscope_model)
-    accelerometer, gyroscope = (
-        None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
-        for sensor, text in zip(SENSORS, asked, strict=True)
-    )
+    accelerometer = None
+    if options.accelerometer_model is not None:
+        accelerometer = parse_effects(
+            'accelerometer', options.accelerometer_model, catalogue=options.catalogue
+        )
+    gyroscope = None
+    if options.gyroscope_model is not None:
+        gyroscope = parse_effects('gyroscope', options.gyroscope_model, catalogue=options.catalogue)
     if options.gravity is not None and not GRAVITY_LEAST <= options.gravity <= GRAVITY_MOST:
         raise InputError(
             f'gravity must be {GRAVITY_LEAST} to {GRAVITY_MOST} m/s^2, which covers the surface of'
             f' the Earth, got {options.gravity:g}; give the local gravity in m/s^2, or none',
             key='gravity',
         )
-    gravity, spread = (
-        (STANDARD_GRAVITY, STANDARD_GRAVITY_SD)
-        if options.gravity is None
-        else (options.gravity, options.gravity_sd)
-    )
+    gravity = options.gravity
+    gravity_sd = options.gravity_sd
+    if gravity is None:
+        gravity = STANDARD_GRAVITY
+        gravity_sd = STANDARD_GRAVITY_SD
     return HandOptions(
         gravity,
-        spread,
+        gravity_sd,
         tolerances=options.tolerances,
         accelerometer=accelerometer,
         gyroscope=gyroscope,
