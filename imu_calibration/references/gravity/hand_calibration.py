@@ -6,14 +6,13 @@ Gravity is the reference, poses held still and the turns between them are the da
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
 from imu_calibration.estimation.solution import (
     DRIFT,
@@ -128,15 +127,15 @@ class HandCalibration(Solution):
     tolerances: np.ndarray
     """Sufficient standard deviation, shape (n,)."""
     statistics: dict
-    """Counts, noise, scatter, chi-square: plain numbers."""
+    """Counts, noise, scatter, chi-square: plain numbers, by name."""
     poses: Poses
     """The poses that were used."""
     state: State
     """Directions and drifts of the poses, and the parameters."""
     used_poses: Poses
     """The poses as weighted: excluded ones with negligible weight, a drifting bias at its mean."""
-    used_turns: list
-    """`TurnData` without excluded turns."""
+    used_turns: list[TurnData]
+    """Turns without the excluded ones."""
 
     @property
     def gravity(self) -> float:
@@ -151,20 +150,20 @@ class HandCalibration(Solution):
     @property
     def replacement_limit(self) -> np.ndarray:
         """
-        Likelihood ratio for cross terms, otherwise the smallest expected error.
+        Largest ``(value - prior)^2 / variance`` of a weak parameter that its prior replaces.
 
-        The cross terms are terms of the accelerometer.
-
-        Near the six faces the poses determine cross terms only through small tilts.
+        It is `CROSS_TERM_RATIO` for cross terms of the accelerometer, because near the six faces
+        the poses determine them only through small tilts. Otherwise it is 1, which gives the
+        smallest expected error.
         """
         return np.where(np.isin(self.param_names, CROSS_TERMS), CROSS_TERM_RATIO, 1.0)
 
     @property
     def statuses(self) -> tuple[Status, ...]:
         """
-        Status of each parameter relative to gravity as used.
+        Status of each parameter with gravity as used.
 
-        Without its uncertainty (`common_scale`).
+        The uncertainty of gravity has a separate status (`common_scale` of the statistics).
         """
         return statuses(self.judged_sd, self.held, self.tolerances)
 
@@ -266,10 +265,10 @@ class HandData:
 
     poses: Poses
     """Means over the intervals at rest."""
-    turns: list
-    """`TurnData` between consecutive poses, then those of known angle."""
+    turns: list[TurnData]
+    """Turns between consecutive poses, then those of known angle."""
     statistics: dict
-    """Attitudes, excluded turns, noise and period of the samples."""
+    """Attitudes, excluded turns, noise and period of the samples, by name."""
     absent: tuple[str, ...] = ()
     """Sensors without readings."""
 
@@ -283,7 +282,7 @@ def gather_by_hand(
 ) -> HandData:
     """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
     time = sample_times(imu)
-    poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
+    poses = average_poses(imu, _ranges_at_rest(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force)
     # Without an accelerometer gravity is not measured: rests determine the gyroscope's bias.
     if attitudes < MIN_ATTITUDES and 'accelerometer' not in imu.absent:
@@ -301,83 +300,89 @@ def gather_by_hand(
         statistics = {'attitudes': attitudes, 'turns_dropped': {}, **noise_statistics(poses)}
         return HandData(without_sensors(poses, imu.absent), [], statistics, imu.absent)
     turns, dropped = collect_turns(time, imu, poses=poses, temperature_c=temperature_c)
-    turns += [
-        known_turn_data(time, imu, turn, poses=poses, temperature_c=temperature_c)
-        for turn in known_turns
-    ]
-    return HandData(
-        poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)}
-    )
+    for turn in known_turns:
+        turns.append(known_turn_data(time, imu, turn, poses=poses, temperature_c=temperature_c))
+    statistics = {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)}
+    return HandData(poses, turns, statistics)
 
 
 def solve_by_hand(data: HandData, options: HandOptions) -> HandCalibration:
     """
-    Estimate from given poses and turns.
+    Return the calibration from given poses and turns (`calibrate_by_hand`).
 
-    See `calibrate_by_hand`. Cross terms of the accelerometer that no attitude tests are held at
-    their prior (`tested_directions`).
+    Cross terms of the accelerometer that no attitude tests are held at their prior, unless turns or
+    placements support them (`tested_directions`).
     """
     report('solving')
-    free = _solved(data, options)
+    free = _solve(data, options)
     if 'accelerometer' in data.absent:
         return free
-    model, poses = free.hand_model, free.used_poses
-    up = directions(model, poses)
-    names = off_axis_lacking(up)
-    if not names:
+    up = directions(free.hand_model, free.used_poses)
+    untested = off_axis_lacking(up)
+    if not untested:
         return free
-    testing = turns_between(up, free.used_turns)
-    held = _solved(data, options, untested=names)
-    if len(testing) < TESTING_TURNS:
-        # Norms decide, with one error for all rests of a placement. The readings are those of the
-        # recording: outliers and a wandering bias were estimated with one of the models, whose
-        # errors they would hide.
-        measured = data.poses
-        used = np.zeros(len(up), bool)
-        for hand in (free, held):
-            used |= np.all(hand.used_poses.force_sem <= measured.force_sem, axis=1)
-        demanded = placements_demand(model, held.hand_model, measured, up=up, used=used)
-        chosen = free if demanded else held
-        fit = fit_placements(chosen.hand_model, chosen.values, measured, up=up, used=used)
-        if fit.covariance is None:
-            return chosen
-        more = excess(fit.covariance, total(chosen.terms), fit.index)
-        return replace(chosen, terms=with_term(chosen.terms, SAMPLE_NOISE, more))
-    errors = [np.array([_missed_by(hand, turn) for turn in testing]) for hand in (free, held)]
-    return held if contradicted_by_turns(*errors) else free
+
+    # The model with these cross terms against the one with their priors.
+    held = _solve(data, options, untested=untested)
+    testing_turns = turns_between(up, free.used_turns)
+    if len(testing_turns) < TESTING_TURNS:
+        return _chosen_by_placements(data.poses, free, held, up=up)
+    free_errors = np.array([_turn_error(free, turn) for turn in testing_turns])
+    held_errors = np.array([_turn_error(held, turn) for turn in testing_turns])
+    return held if contradicted_by_turns(free_errors, held_errors) else free
 
 
-def _missed_by(hand: HandCalibration, turn: TurnData) -> float:
+def _chosen_by_placements(
+    poses: Poses, free: HandCalibration, held: HandCalibration, *, up: np.ndarray
+) -> HandCalibration:
+    """
+    Return the solution that the lengths of gravity support, with the covariance of the placements.
+
+    Parameters
+    ----------
+    poses : Poses
+        Readings of the recording. Outliers and a wandering bias were estimated with one of the
+        models, whose errors they would hide.
+    free, held : HandCalibration
+        Solutions with estimated cross terms, and with cross terms at their prior.
+    up : array, shape (k, 3)
+        `directions`.
+
+    """
+    # Poses that at least one of the models does not exclude as outliers.
+    used = np.zeros(len(up), bool)
+    for hand in (free, held):
+        used |= np.all(hand.used_poses.force_sem <= poses.force_sem, axis=1)
+    demanded = placements_demand(free.hand_model, held.hand_model, poses, up=up, used=used)
+    chosen = free if demanded else held
+
+    # One error for all rests of a placement gives a larger covariance than one for each rest.
+    fit = fit_placements(chosen.hand_model, chosen.values, poses, up=up, used=used)
+    if fit.covariance is None:
+        return chosen
+    additional = excess(fit.covariance, total(chosen.terms), fit.index)
+    return replace(chosen, terms=with_term(chosen.terms, SAMPLE_NOISE, additional))
+
+
+def _turn_error(hand: HandCalibration, turn: TurnData) -> float:
     """Return the angle between rotated and measured gravity after a turn, rad."""
-    force = hand.compensate(hand.poses.force, hand.poses.rate, **hand.poses.conditions)[0]
+    force, _ = hand.compensate(hand.poses.force, hand.poses.rate, **hand.poses.conditions)
     state = replace(hand.state, up=unit_rows(force))
     return missed_angle(state, hand.poses, turn, matrix=hand.gyroscope[1])
 
 
-def _solved(
+def _solve(
     data: HandData, options: HandOptions, *, untested: tuple[str, ...] = ()
 ) -> HandCalibration:
     """Return the calibration with the cross terms `untested` held at their prior."""
-    poses, turns = data.poses, data.turns
-    if data.absent:
-        # The g-sensitivity relates both sensors.
-        default = BASE
-        evidence = dict(NO_EVIDENCE)
-    else:
+    poses = data.poses
+
+    # 1. Model. The g-sensitivity relates both sensors, so that it needs both.
+    default = BASE
+    evidence = dict(NO_EVIDENCE)
+    if not data.absent:
         default, evidence = default_gyroscope(poses)
-    reference_c = (
-        25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
-    )
-    sensors = SensorModel(
-        options.accelerometer or BASE,
-        options.gyroscope or default,
-        temperature_ref_c=reference_c,
-        point=options.point,
-        catalogue=options.catalogue,
-    )
-    for sensor, name in options.added:
-        if (sensor, name) not in sensors.slices:
-            sensors = sensors.with_effect(sensor, name)
+    sensors = _requested_effects(options, poses, default_gyroscope=default)
     model = HandModel(sensors, options.gravity, untested=untested, absent=data.absent)
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
@@ -385,70 +390,69 @@ def _solved(
             f'{", ".join(thermal)} needs temperatures, the recording has none; record'
             ' imu/temperature or omit it'
         )
+
+    # 2. First guess, and the turns that contradict gravity with it.
     state = first_state(model, poses)
-    model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
-    turns, contradicted = possible_turns(model, state, poses, turns=turns)
-    left = {CONTRADICTED_TURNS: contradicted} if contradicted else {}
-    solved = partial(solve_joint, gravity_sd=options.gravity_sd)
+    model = replace(model, gyro_factor=full_scale_factor(state, poses, data.turns))
+    turns, n_contradicted = possible_turns(model, state, poses, turns=data.turns)
+    n_excluded = {}  # kind -> number of poses or turns
+    if n_contradicted:
+        n_excluded[CONTRADICTED_TURNS] = n_contradicted
+
+    # 3. Time constants of warm-ups. Gauss-Newton does not converge from a distant one, so the best
+    #    of several is the point of the first linearisation.
     for effect in model.extras:
-        # A time constant distant from the prior does not converge from there.
         if effect.time_constant and effect.name not in options.point:
-            trials = [
-                replace(model, model=each)
-                for each in at_time_constants(model.model, effect, float(poses.time[-1]))
-            ]
-            scatter = [
-                solved(trial, poses, turns)[0].scatter.variance[SENSORS.index(effect.sensor)]
-                for trial in trials
-            ]
-            model = trials[int(np.argmin(scatter))]
+            model = _best_time_constant(model, effect, poses, turns, options.gravity_sd)
+
+    # 4. Solve, relinearise and exclude outliers until neither changes the solution.
     for _ in range(MAX_HAND_PASSES):
-        found, integrated = solved(model, poses, turns)
-        # The columns below are computed at the estimate.
-        integrated = {} if model.model.relinearised else integrated
-        settled = _settled(model, found)
-        model = model.at(found.state.values)
-        poses, turns, out = without_outlying_poses(
-            model, found, poses=poses, turns=turns, integrated=integrated
+        estimate, integrated_turns = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd)
+        settled = _settled(model, estimate)
+        if model.model.relinearised:
+            integrated_turns = {}  # they belong to the columns of the previous linearisation
+        model = model.at(estimate.state.values)
+        poses, turns, n_outliers = without_outlying_poses(
+            model, estimate, poses=poses, turns=turns, integrated=integrated_turns
         )
-        left |= {
-            f'outlying {kind}': left.get(f'outlying {kind}', 0) + count
-            for kind, count in out.items()
-        }
-        if settled and not out:
+        for kind, count in n_outliers.items():
+            key = f'outlying {kind}'
+            n_excluded[key] = n_excluded.get(key, 0) + count
+        if settled and not n_outliers:
             break
-    movements = bias_movements(model, found.state.values, poses)
-    if 'accelerometer' in movements:
-        poses = without_movement(poses, movements)
-        found, _ = solved(model, poses, turns)
-    terms = with_term(
-        found.terms,
-        DRIFT,
-        with_movement(covariance := total(found.terms), model, movements) - covariance,
-    )
+
+    # 5. Drift of the biases. That of the accelerometer is subtracted from the poses; that of the
+    #    gyroscope is a nuisance of every pose already.
+    drifts = bias_movements(model, estimate.state.values, poses)
+    if 'accelerometer' in drifts:
+        poses = without_movement(poses, drifts)
+        estimate, _ = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd)
+
+    # 6. Covariance: drift, errors common to all rests, and errors common to those of a placement.
+    covariance = total(estimate.terms)
+    drift_covariance = with_movement(covariance, model, drifts) - covariance
+    terms = with_term(estimate.terms, DRIFT, drift_covariance)
     terms = with_term(terms, DRIFT, _hidden_covariance(model, poses))
-    rows = GravityRows(model, poses, turns).linearise(found.state)
-    common = covariance_of_placements(rows, found)
-    if common.any():
-        # These errors also scatter the parameters between parts of the recording: added is what
-        # exceeds the other terms.
-        free = np.flatnonzero(found.free)
-        expected = (of_fit(found.terms) + common)[np.ix_(free, free)]
+    rows = GravityRows(model, poses, turns).linearise(estimate.state)
+    placement_covariance = covariance_of_placements(rows, estimate)
+    if placement_covariance.any():
+        # Errors of placements also scatter the parameters between parts of the recording, which is
+        # in the terms already: only the excess over them is added.
+        free = np.flatnonzero(estimate.free)
+        expected = (of_fit(estimate.terms) + placement_covariance)[np.ix_(free, free)]
         terms[PLACEMENTS] = excess(expected, total(terms), free)
-    terms = bounded_by_prior(terms, found.held, model.priors)
-    # The result has all poses unchanged, also excluded and drifting ones.
-    used = poses
-    poses = data.poses
+    terms = bounded_by_prior(terms, estimate.held, model.priors)
+
+    # 7. Statistics, of all poses: also of the excluded and drifting ones.
     goals = tolerances_of(model.model, options.tolerances)
+    bias_moved = {sensor: float(np.linalg.norm(drift.size)) for sensor, drift in drifts.items()}
     statistics = {
         **data.statistics,
         **evidence,
         'gyro_factor': model.gyro_factor,
-        'left_out': left,
-        'bias_moved': {
-            sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()
-        },
-        **_statistics(model, found, poses, turns),
+        'left_out': n_excluded,
+        'bias_moved': bias_moved,
+        **_statistics(model, estimate, data.poses, turns),
     }
     if options.gravity_sd:
         sd = options.gravity_sd / options.gravity
@@ -458,27 +462,66 @@ def _solved(
             'tolerance': goal,
             'status': str(statuses([sd], [False], [goal])[0]),
         }
-    noise = {
-        sensor: replace(poses.noise[sensor], offset_sd=statistics[f'{name}_scatter_sd'])
-        for sensor, name in zip(SENSORS, COMPONENTS)
-    }
+    noise = {}
+    for sensor, component in zip(SENSORS, COMPONENTS):
+        scatter_sd = statistics[f'{component}_scatter_sd']
+        noise[sensor] = replace(data.poses.noise[sensor], offset_sd=scatter_sd)
     return HandCalibration(
         model=model.model,
-        values=found.state.values,
+        values=estimate.state.values,
         terms=terms,
-        held=found.held,
+        held=estimate.held,
         noise=noise,
         residual_rms={},
         chi2_per_dof={sensor: {'mean': None} for sensor in SENSORS},
-        information=found.factor.T @ found.factor,
+        information=estimate.factor.T @ estimate.factor,
         hand_model=model,
         tolerances=goals,
         statistics=statistics,
-        poses=poses,
-        state=found.state,
-        used_poses=used,
+        poses=data.poses,
+        state=estimate.state,
+        used_poses=poses,
         used_turns=turns,
     )
+
+
+def _requested_effects(
+    options: HandOptions, poses: Poses, *, default_gyroscope: tuple[str, ...]
+) -> SensorModel:
+    """Return the requested and the added effects, with the mean temperature as the reference."""
+    reference_c = 25.0
+    if poses.temperature_c is not None:
+        reference_c = float(np.round(np.mean(poses.temperature_c)))
+    sensors = SensorModel(
+        options.accelerometer or BASE,
+        options.gyroscope or default_gyroscope,
+        temperature_ref_c=reference_c,
+        point=options.point,
+        catalogue=options.catalogue,
+    )
+    for sensor, name in options.added:
+        if (sensor, name) not in sensors.slices:
+            sensors = sensors.with_effect(sensor, name)
+    return sensors
+
+
+def _best_time_constant(
+    model: HandModel, effect: Effect, poses: Poses, turns: list[TurnData], gravity_sd: float
+) -> HandModel:
+    """
+    Return the model linearised at the best of several time constants of an effect.
+
+    The best one has the smallest scatter of the sensor between poses.
+    """
+    component = SENSORS.index(effect.sensor)
+    trials = []
+    variances = []
+    for sensors in at_time_constants(model.model, effect, float(poses.time[-1])):
+        trial = replace(model, model=sensors)
+        estimate, _ = solve_joint(trial, poses, turns, gravity_sd=gravity_sd)
+        trials.append(trial)
+        variances.append(estimate.scatter.variance[component])
+    return trials[int(np.argmin(variances))]
 
 
 def _hidden_covariance(model: HandModel, poses: Poses) -> np.ndarray:
@@ -495,16 +538,19 @@ def _hidden_covariance(model: HandModel, poses: Poses) -> np.ndarray:
     return covariance
 
 
-def _settled(model: HandModel, found: RowEstimate) -> bool:
+def _settled(model: HandModel, estimate: RowEstimate) -> bool:
     """Return whether the columns of warm-ups were computed close enough to the solution."""
-    known = []
-    for e in model.extras:
-        if e.time_constant:
-            known.append((model.model.slices[e.key].stop - 1, model.model.point_of(e)[-1]))
-    return all(
-        found.held[k] or abs(found.state.values[k] / time - 1) <= MAX_SETTLED_CHANGE
-        for k, time in known
-    )
+    for effect in model.extras:
+        if not effect.time_constant:
+            continue
+        # The time constant is the last value of an effect.
+        index = model.model.slices[effect.key].stop - 1
+        linearised_at = model.model.point_of(effect)[-1]
+        if estimate.held[index]:
+            continue
+        if not abs(estimate.state.values[index] / linearised_at - 1) <= MAX_SETTLED_CHANGE:
+            return False
+    return True
 
 
 def without_sensors(poses: Poses, absent: Sequence[str]) -> Poses:
@@ -521,41 +567,56 @@ def without_sensors(poses: Poses, absent: Sequence[str]) -> Poses:
 
 def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
     """
-    Return (the gyroscope's effects without a request, the evidence of the poses for g-sensitivity).
+    Return (default effects of the gyroscope, `g_sensitivity_evidence` that decides on them).
     """
     evidence = g_sensitivity_evidence(poses)
     return G_SENSITIVE if shown(evidence) else BASE, evidence
 
 
 def _statistics(
-    model: HandModel, found: RowEstimate, poses: Poses, turns: Sequence[TurnData]
+    model: HandModel, estimate: RowEstimate, poses: Poses, turns: Sequence[TurnData]
 ) -> dict[str, float | None]:
-    before, after = (
-        model.norm_rows(values, poses.force, **poses.conditions)[0]
-        for values in (model.nominal, found.state.values)
-    )
+    """Return counts, residuals of the lengths of gravity, and scatter of an estimate, by name."""
+    before, _ = model.norm_rows(model.nominal, poses.force, **poses.conditions)
+    after, _ = model.norm_rows(estimate.state.values, poses.force, **poses.conditions)
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
     of_accelerometer = model.model.mask(lambda effect: effect.sensor == 'accelerometer')
-    spare = len(after) - int(np.sum(of_accelerometer & found.free))
+    spare = len(after) - int(np.sum(of_accelerometer & estimate.free))
     result = {
         'poses': len(poses),
         'turns': len(turns),
-        'steps': found.steps,
+        'steps': estimate.steps,
         'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))),
         'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
         'norm_chi2_per_dof': float(np.sum((after / sem) ** 2) / spare) if spare > 0 else None,
     }
     for index, name in enumerate(COMPONENTS):
-        result[f'{name}_scatter_sd'] = float(np.sqrt(found.scatter.variance[index]))
-        result[f'{name}_dof'] = float(found.scatter.dof[index])
+        result[f'{name}_scatter_sd'] = float(np.sqrt(estimate.scatter.variance[index]))
+        result[f'{name}_dof'] = float(estimate.scatter.dof[index])
     return result
 
 
-def _as_ranges(imu: ImuSamples, stills: Sequence[slice] | None) -> list[tuple[int, int]]:
+def _ranges_at_rest(imu: ImuSamples, stills: Sequence | None) -> list[tuple[int, int]]:
+    """
+    Return the ranges (start, stop) of at least two samples at rest.
+
+    `stills` as in `calibrate_by_hand`; None: found here.
+
+    Raises
+    ------
+    NotObservableError
+        When there is none.
+
+    """
     if stills is None:
         stills = find_still(imu)
-    ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
-    ranges = [(a, b) for a, b in ranges if b - a >= 2]
+    ranges = []
+    for still in stills:
+        if isinstance(still, slice):
+            still = (still.start, still.stop)
+        start, stop = int(still[0]), int(still[1])
+        if stop - start >= 2:
+            ranges.append((start, stop))
     if not ranges:
         require_no_sway(imu, np.zeros((0, 3)), [], least=MIN_ATTITUDES)
         raise NotObservableError(
