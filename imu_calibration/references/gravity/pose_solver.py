@@ -54,7 +54,9 @@ def solve_joint(
     model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float
 ) -> tuple[RowEstimate, dict]:
     """
-    Return the estimate of all parameters from poses and turns, and the turns integrated there.
+    Return (estimate of all parameters from poses and turns, turns as integrated at the estimate).
+
+    The turns are `GravityRows.memory`.
 
     Parameters
     ----------
@@ -66,50 +68,52 @@ def solve_joint(
         Sd of gravity, m/s^2.
 
     """
-    found = estimate_rows(
+    estimate = estimate_rows(
         GravityRows(model, poses, turns),
         first_state(model, poses),
         fallback=np.square(SCATTER_SD),
         withheld=model.withheld,
     )
     reference = GravityRows(model, poses, turns)
-    scale = common_scale(model.model, found.state.values)
+    scale = common_scale(model.model, estimate.state.values)
     terms = {
-        **found.terms,
-        **_model_error(reference, found).terms(total(found.terms)),
+        **estimate.terms,
+        **_model_error(reference, estimate).terms(total(estimate.terms)),
         GRAVITY: (gravity_sd / model.gravity) ** 2 * np.outer(scale, scale),
-        UNMODELLED_EARTH_RATE: _of_earth(model, found.state, poses, found.free),
+        UNMODELLED_EARTH_RATE: _earth_covariance(model, estimate.state, poses, estimate.free),
     }
-    return replace(found, terms=terms), reference.memory
+    return replace(estimate, terms=terms), reference.memory
 
 
-def _model_error(reference: GravityRows, found: RowEstimate) -> ModelError:
+def _model_error(reference: GravityRows, estimate: RowEstimate) -> ModelError:
     """
     Return the model error; a block is a pose with the turn that begins in it.
 
-    None where parts are fitted almost exactly: they have no scatter to compare.
+    Zero, if poses or degrees of freedom are so few that the blocks are fitted almost exactly: they
+    have no scatter to compare.
     """
     model = reference.model
-    free = found.free
+    free = estimate.free
     count = len(reference.poses)
-    rows = reference.linearise(found.state)
+    rows = reference.linearise(estimate.state)
     # The rows of poses and turns, without those that directions and parameters need; the bias of
     # the gyroscope is determined at rest.
     of_poses_and_turns = np.isin(rows.component, (0, 2)).sum()
     spare = of_poses_and_turns - 2 * count - free.sum() + free[model.gyro_bias].sum()
     if min(count, spare) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
-    return model_error_of_rows(rows, found, model.model, block=np.minimum(rows.group, count - 1))
+    return model_error_of_rows(rows, estimate, model.model, block=np.minimum(rows.group, count - 1))
 
 
 def first_state(model: HandModel, poses: Poses) -> State:
     """
-    Return a `State` from the norms in poses, which determine directions too, and the rates at rest.
+    Return the `State` in which the accelerometer fits ``|true force| = gravity`` in the poses.
 
-    The norms have a mirrored solution, ``matrix -> -matrix``, and Gauss-Newton steps from the
-    nominal values end there, or nowhere, for scale factors or biases far from the nominal ones.
-    The search therefore begins in several places, and the best solution with a positive diagonal is
-    returned.
+    Directions are those of the corrected forces, the bias of the gyroscope is its mean reading,
+    and drifts are zero. The norms have a mirrored solution, ``matrix -> -matrix``. Gauss-Newton
+    steps from the nominal values end there, or do not converge, for scale factors or biases that
+    differ much from the nominal ones. The search therefore begins in several places, and the best
+    solution with a positive diagonal is returned.
     """
     values = model.nominal.copy()
     if 'accelerometer' not in model.absent:
@@ -123,14 +127,19 @@ def first_state(model: HandModel, poses: Poses) -> State:
             if cost < least:
                 values = end
                 least = cost
-    bias, matrix, *_ = model.linear(values)
-    true = np.linalg.solve(matrix, (poses.force - bias).T).T
+    linear = model.linear(values)
+    true = np.linalg.solve(linear.force_matrix, (poses.force - linear.force_bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)
     return State(values, unit_rows(true), np.zeros_like(poses.rate))
 
 
 def _starting_points(model: HandModel, poses: Poses) -> list[np.ndarray]:
-    """Return parameter vectors: nominal, with the scale of the norms, and with the sphere."""
+    """
+    Return parameter vectors from which the search for `first_state` begins, each of shape (n,).
+
+    They are the nominal values, these with the scale of the median norm, and, if the directions are
+    spread enough, these with centre and radius of the sphere through the readings.
+    """
     bias_at = model.model.part('accelerometer', Role.OFFSET)
     matrix_at = model.model.part('accelerometer', Role.LINEAR)
     median_norm = float(np.median(np.linalg.norm(poses.force, axis=1)))
@@ -180,10 +189,10 @@ class NormSquares:
 
 
 class _NormsAndPriors(NormSquares):
-    """The same in standard deviations, with the distances from the priors."""
+    """Sum of squares of `NormSquares` over `NORM_SD_SHARE`, and of the distances from priors."""
 
     def rows(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the errors, those of the priors last, and their columns."""
+        """Return errors in sds, (k + n_free,), those of the priors last, and their columns."""
         errors, columns = super().rows(values)
         norm_sd = NORM_SD_SHARE * self.model.gravity
         prior_sd = self.model.priors[self.index]
@@ -201,28 +210,34 @@ class _NormsAndPriors(NormSquares):
         return not self.is_possible(values) or bool(np.max(np.abs(step)) < 1e-10)
 
     def is_possible(self, values: np.ndarray) -> bool:
-        """Return whether no scale is negative: there lies the mirrored solution, or none."""
-        is_finite = np.isfinite(values).all()
-        return bool(is_finite and np.diag(self.model.linear(values)[1]).min() > 0.0)
+        """Return whether all scale factors are positive; the mirrored solution has negative."""
+        if not np.isfinite(values).all():
+            return False
+        return bool(np.diag(self.model.linear(values).force_matrix).min() > 0.0)
 
 
-def _of_earth(model: HandModel, state: State, poses: Poses, free: np.ndarray) -> np.ndarray:
+def _earth_covariance(model: HandModel, state: State, poses: Poses, free: np.ndarray) -> np.ndarray:
     """
-    Return the contribution of the Earth's rate to the covariance.
+    Return the covariance of the parameters from the Earth's rate about the vertical, shape (n, n).
 
-    It is the rate about the vertical, which contributes through biases and responses to gravity.
+    At rest the gyroscope measures e u, with the direction u of gravity and the unknown rate e of
+    the sd `EARTH_UPWARDS_SD`. The parameters fitted to rates at rest, with columns A, change by
+    ``e c``, and the covariance is::
+
+        sd^2 c c',    c = lstsq(A, u)
     """
     _, columns = model.rate_rows(
         state.values, model.gravity * state.up, poses.rate, **poses.conditions
     )
     columns = columns.reshape(-1, model.size)
-    # The change of the free parameters of the rates at rest by one sd of the Earth's rate.
-    own = np.concatenate([np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')])
-    kept = own[free[own]]
-    earth = EARTH_UPWARDS_SD * state.up.ravel()
-    taken = np.zeros(model.size)
-    taken[kept] = np.linalg.lstsq(columns[:, kept], earth, rcond=None)[0]
-    return np.outer(taken, taken)
+    at_rest = np.concatenate(
+        [np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')]
+    )
+    estimated = at_rest[free[at_rest]]
+    earth_rates = EARTH_UPWARDS_SD * state.up.ravel()
+    change = np.zeros(model.size)
+    change[estimated] = np.linalg.lstsq(columns[:, estimated], earth_rates, rcond=None)[0]
+    return np.outer(change, change)
 
 
 MAX_POSE_OUTLIERS = 0.1
@@ -238,14 +253,14 @@ rad; a larger angle between rotated and observed gravity after a turn is no erro
 scale errors of a tenth cause less.
 """
 CONTRADICTED_TURNS = 'contradicted by gravity'
-"""Kind of the turns that are left out by CONTRADICTED, in `left_out` of the statistics."""
-LEAST_SHARE_OF_KIND = 1e-3
-"""The same for all rows of a kind together."""
+"""Kind of the turns that are excluded by CONTRADICTED, in `left_out` of the statistics."""
 LEAST_ERROR_SHARE = 0.05
 """
-A combination of a unit's rows that keeps less than this share of its error after the fit is not
-tested.
+A combination of the rows of a pose or turn that keeps less than this share of its error after the
+fit is not tested.
 """
+LEAST_SHARE_OF_KIND = 1e-3
+"""The share for all rows of a kind together, in place of `LEAST_ERROR_SHARE`."""
 OUTLIER_SD_FACTOR = 1e3
 """Sd factor that excludes an outlying pose; its direction is still estimated from the turns."""
 
@@ -254,9 +269,9 @@ def possible_turns(
     model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]
 ) -> tuple[list[TurnData], int]:
     """
-    Return (turns whose rates match gravity approximately, number of excluded turns).
+    Return (turns whose rates match gravity within `CONTRADICTED`, number of excluded turns).
 
-    In a pause of the recorder, rates miss a turn.
+    If the recorder paused during a turn, the integrated rates miss a part of it.
     """
     kept = []
     for turn in turns:
@@ -270,58 +285,63 @@ def possible_turns(
 
 def without_outlying_poses(
     model: HandModel,
-    found: RowEstimate,
+    estimate: RowEstimate,
     *,
     poses: Poses,
     turns: list[TurnData],
     integrated: dict | None = None,
-) -> tuple[Poses, list[TurnData], dict]:
+) -> tuple[Poses, list[TurnData], dict[str, int]]:
     """
-    Return (poses, turns, {kind: number}) without outliers.
+    Return (poses, turns, {kind: number of outliers}) without outliers.
 
-    Leave-one-out F tests per kind, with Bonferroni correction.
-
-    Excluded poses keep their place, with negligible weight. `integrated`: the turns at the
-    estimate, from `solve_joint`.
+    Kinds are the `COMPONENTS`. Each pose or turn of a kind is compared with the other ones of the
+    kind (F tests with Bonferroni correction). Outlying poses keep their place, with negligible
+    weight; outlying turns are omitted. `integrated`: the turns at the estimate, from `solve_joint`.
     """
-    rows = GravityRows(model, poses, turns, integrated or {}).linearise(found.state)
-    rest, basis = _whitened(rows, found)
+    rows = GravityRows(model, poses, turns, integrated or {}).linearise(estimate.state)
+    residual, basis = _whitened(rows, estimate)
     pose = rows.group
     # The turn that begins in a pose.
     turn_of = {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
 
-    left: dict[str, tuple[int, ...]] = {}
+    outliers: dict[str, tuple[int, ...]] = {}  # kind -> numbers of poses or turns
     for component, kind in enumerate(COMPONENTS):
         of_kind = rows.component == component
-        all_of_kind = _distance(rest[of_kind], basis[of_kind], LEAST_SHARE_OF_KIND)
+        misfit_of_kind = _misfit(residual[of_kind], basis[of_kind], LEAST_SHARE_OF_KIND)
         p_values = {}
         for number in np.unique(pose[of_kind]).tolist():
-            own = of_kind & (pose == number)
-            p_value = _p_value(_distance(rest[own], basis[own], LEAST_ERROR_SHARE), all_of_kind)
-            p_values[turn_of[number] if kind == 'turn' else number] = p_value
+            tested = of_kind & (pose == number)
+            misfit = _misfit(residual[tested], basis[tested], LEAST_ERROR_SHARE)
+            p_values[turn_of[number] if kind == 'turn' else number] = _p_value(
+                misfit, misfit_of_kind
+            )
         most = max(1, int(MAX_POSE_OUTLIERS * len(p_values)))
-        out = find_outliers(p_values, n_tests=len(p_values), most=most).numbers
-        if out:
-            left[kind] = out
-    if left.get('pose'):
-        poses = replace(poses, force_sem=_loosened(poses.force_sem, left['pose']))
-    if left.get('drift'):
-        poses = replace(poses, rate_sem=_loosened(poses.rate_sem, left['drift']))
-    turns = [turn for index, turn in enumerate(turns) if index not in left.get('turn', ())]
-    return poses, turns, {kind: len(out) for kind, out in left.items()}
+        outlying = find_outliers(p_values, n_tests=len(p_values), most=most).numbers
+        if outlying:
+            outliers[kind] = outlying
+    if 'pose' in outliers:
+        poses = replace(poses, force_sem=_loosened(poses.force_sem, outliers['pose']))
+    if 'drift' in outliers:
+        poses = replace(poses, rate_sem=_loosened(poses.rate_sem, outliers['drift']))
+    turns = [turn for index, turn in enumerate(turns) if index not in outliers.get('turn', ())]
+    return poses, turns, {kind: len(numbers) for kind, numbers in outliers.items()}
 
 
-def _whitened(rows: Rows, found: RowEstimate) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals in sds, and an orthonormal basis of the fitted columns."""
-    weighted = rows.of_parameters(found.free).with_scatter(found.scatter.variance)
+def _whitened(rows: Rows, estimate: RowEstimate) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return (residuals in sds, orthonormal basis of the columns), shapes (m,) and (m, q).
+
+    Columns are those of the nuisances and of the estimated parameters.
+    """
+    weighted = rows.of_parameters(estimate.free).with_scatter(estimate.scatter.variance)
     white = flat(weighted.white())
     design = white[:, :-1]
-    rest = white[:, -1]
+    right_side = white[:, -1]
     # A ridge, as some columns may be dependent.
     ridge = np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)
     factor = triangular_of_band(np.vstack([design, ridge]))
     basis = solve_triangular(factor, design.T, trans='T').T
-    return rest - basis @ (basis.T @ rest), basis
+    return right_side - basis @ (basis.T @ right_side), basis
 
 
 class _Misfit(NamedTuple):
@@ -333,28 +353,34 @@ class _Misfit(NamedTuple):
     """Rank of the covariance of the residuals."""
 
 
-def _distance(rest: np.ndarray, basis: np.ndarray, least: float) -> _Misfit:
+def _misfit(residual: np.ndarray, basis: np.ndarray, least: float) -> _Misfit:
     """
-    Return the misfit of residuals with the covariance ``1 - basis basis'`` after the fit.
+    Return the misfit ``r' C^-1 r`` of residuals r, in sds, with their covariance C after the fit.
 
-    Combinations that keep less than the share `least` of their error are left out.
+    ``C = 1 - B B'`` with the rows B of the basis. Combinations of residuals with a variance below
+    `least`, which the fit makes almost zero, are omitted.
     """
-    values, vectors = np.linalg.eigh(np.eye(len(rest)) - basis @ basis.T)
-    seen = values > least
-    square = np.sum((vectors[:, seen].T @ rest) ** 2 / values[seen])
-    return _Misfit(float(square), int(np.count_nonzero(seen)))
+    variances, combinations = np.linalg.eigh(np.eye(len(residual)) - basis @ basis.T)
+    tested = variances > least
+    square = np.sum((combinations[:, tested].T @ residual) ** 2 / variances[tested])
+    return _Misfit(float(square), int(np.count_nonzero(tested)))
 
 
-def _p_value(own: _Misfit, all_rows: _Misfit) -> float:
-    """Return the p-value of an F test of some rows against the other ones; 1 without freedom."""
-    spare = all_rows.rank - own.rank
-    if not own.rank or spare < MIN_POSE_FREEDOM:
+def _p_value(tested: _Misfit, all_rows: _Misfit) -> float:
+    """
+    Return the p-value of an F test of a pose or turn against all other rows of its kind.
+
+    It is 1 without degrees of freedom.
+    """
+    spare = all_rows.rank - tested.rank
+    if not tested.rank or spare < MIN_POSE_FREEDOM:
         return 1.0
-    return chance_of_fall(own.square, own.rank, rest=all_rows.square - own.square, spare=spare)
+    other_square = all_rows.square - tested.square
+    return chance_of_fall(tested.square, tested.rank, rest=other_square, spare=spare)
 
 
 def _loosened(sem: np.ndarray, outliers: Sequence[int]) -> np.ndarray:
-    """Return standard errors with negligible weights of the outliers, numbers of poses."""
+    """Return standard errors (k, 3), enlarged by `OUTLIER_SD_FACTOR` in the poses `outliers`."""
     loose = sem.copy()
     loose[list(outliers)] *= OUTLIER_SD_FACTOR
     return loose
