@@ -46,67 +46,70 @@ def average_poses(
     """
     Return the means over the intervals, with their sd from the noise within the intervals.
 
-    `temperature_c` is that of the samples, shape (n,), when it was recorded.
+    The mean rate is less the rate at which the attitude creeps (`_creep`).
 
-    The noise need not be white: the scatter of means of pieces of half a second or more determines
-    the factor over white noise.
+    Parameters
+    ----------
+    imu : ImuSamples
+    ranges : sequence of (start, stop)
+        Intervals at rest.
+    temperature_c : array, shape (n,), optional
+        Temperature of the samples.
+
     """
-    parts = {
-        'accelerometer': [imu.force_s[a:b] for a, b in ranges],
-        'gyroscope': [imu.rate_s[a:b] for a, b in ranges],
-    }
-    rounding = {
-        'accelerometer': rounding_variance(imu.force_s),
-        'gyroscope': rounding_variance(imu.rate_s),
-    }
-    noise = {sensor: _pooled_noise(part, rounding[sensor]) for sensor, part in parts.items()}
-    count = np.array([b - a for a, b in ranges])
-    means, sems = [], []
-    for sensor in SENSORS:
-        means.append(np.array([part.mean(0) for part in parts[sensor]]))
-        variance = noise[sensor].low_variance / count[:, None]
-        sems.append(np.sqrt(_with_rounding(variance, parts[sensor], rounding[sensor])))
+    forces = [imu.force_s[start:stop] for start, stop in ranges]
+    rates = [imu.rate_s[start:stop] for start, stop in ranges]
+    force_rounding = rounding_variance(imu.force_s)
+    rate_rounding = rounding_variance(imu.rate_s)
+    force_noise = _pooled_noise(forces, force_rounding)
+    rate_noise = _pooled_noise(rates, rate_rounding)
+    mean_rate = np.array([rate.mean(0) for rate in rates])
+
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
     length = 1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start])
-    creep = _creep(parts['accelerometer'], length, noise['accelerometer'])
-    warm = (
-        None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges])
-    )
+    creep = _creep(forces, length, force_noise)
+    mean_temperature_c = None
+    if temperature_c is not None:
+        mean_temperature_c = np.array([temperature_c[a:b].mean() for a, b in ranges])
     return Poses(
-        means[0],
-        means[1] - creep,
-        sems[0],
-        sems[1],
+        force=np.array([force.mean(0) for force in forces]),
+        rate=mean_rate - creep,
+        force_sem=_sd_of_means(forces, force_noise, force_rounding),
+        rate_sem=_sd_of_means(rates, rate_noise, rate_rounding),
         start=start,
         stop=stop,
         time=time,
-        temperature_c=warm,
-        noise=noise,
+        temperature_c=mean_temperature_c,
+        noise={'accelerometer': force_noise, 'gyroscope': rate_noise},
         half_turn=0.5 * length[:, None] * creep,
-        sway=sway_at_rest(parts['accelerometer'], parts['gyroscope'], length),
+        sway=sway_at_rest(forces, rates, length),
         period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9,
-        hidden=_hidden_rates(imu.rate_s, parts['gyroscope'], means[1]),
+        hidden=_hidden_rates(imu.rate_s, rates, mean_rate),
     )
 
 
-def _with_rounding(
-    variance: np.ndarray, parts: Sequence[np.ndarray], rounding: np.ndarray
+def _sd_of_means(
+    parts: Sequence[np.ndarray], noise: SensorNoise, rounding: np.ndarray
 ) -> np.ndarray:
     """
-    Return the variance of the means, at least that of rounding where it matters.
+    Return the sd of the mean of each of k intervals, shape (k, 3).
 
-    Rounding matters where readings scatter by less than half a step and do not average it.
+    Where readings scatter by less than half a step, they do not average rounding: the variance of
+    the mean is then at least that of rounding, shape (3,).
     """
-    within = np.array([part.var(axis=0) for part in parts])
-    return np.where(within < DITHER * rounding, np.maximum(variance, rounding), variance)
+    count = np.array([len(part) for part in parts])
+    variance = noise.low_variance / count[:, None]
+    scatter = np.array([part.var(axis=0) for part in parts])
+    at_least_rounding = np.maximum(variance, rounding)
+    return np.sqrt(np.where(scatter < DITHER * rounding, at_least_rounding, variance))
 
 
 def _hidden_rates(
     rate_s: np.ndarray, parts: Sequence[np.ndarray], means: np.ndarray
 ) -> HiddenRates:
     """
-    Return the `HiddenRates` of poses with the readings `parts` and their means (k, 3).
+    Return the `HiddenRates` of k poses from their readings `parts` and the means of these, (k, 3).
 
     A mean of readings with the variance v and the step h has a rounding error of the variance
     ``h^2 / 12 exp(-4 pi^2 v / h^2)``: noise of half a step averages it. The bias, and with it the
@@ -125,74 +128,85 @@ def _hidden_rates(
 
 def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: SensorNoise) -> np.ndarray:
     """
-    Return the rates at which the attitude creeps in each pose, as observable from gravity, rad/s.
+    Return the rates across gravity at which the attitude creeps in each pose, rad/s, shape (k, 3).
 
-    Shape (k, 3).
+    The slope of the force f in a pose is ``df/dt = -rate x f``, so that the rate across gravity is
+    ``df/dt x f / |f|^2``. Zero where the slopes of all poses together are no more than noise.
 
-    ``d force / dt = -rate x force``: the part across gravity. Zero where the slopes of all poses
-    together are no more than noise.
+    Parameters
+    ----------
+    forces : sequence of array, shape (n, 3)
+        Readings of the accelerometer in each pose, m/s^2.
+    length : array, shape (k,)
+        Duration of each pose, s.
+    noise : SensorNoise
+        Noise of the accelerometer.
+
     """
     rates = np.zeros((len(forces), 3))
-    excess = 0.0
+    # Squares of the slopes across gravity over their variances, two for each pose.
+    squares = 0.0
     for pose, (force, seconds) in enumerate(zip(forces, length)):
-        since = np.linspace(-0.5, 0.5, len(force)) * seconds
-        slope = since @ force / (since @ since)
-        up = force.mean(axis=0)
-        rates[pose] = np.cross(slope, up) / (up @ up)
-        across = np.cross(up, rates[pose])
-        excess += across @ across * (since @ since) / np.mean(noise.low_variance)
-    return rates if excess > CREEPS * 2 * len(forces) else np.zeros_like(rates)
+        time = np.linspace(-0.5, 0.5, len(force)) * seconds
+        slope = time @ force / (time @ time)
+        mean_force = force.mean(axis=0)
+        rates[pose] = np.cross(slope, mean_force) / (mean_force @ mean_force)
+        slope_across = np.cross(mean_force, rates[pose])
+        squares += slope_across @ slope_across * (time @ time) / np.mean(noise.low_variance)
+    return rates if squares > CREEPS * 2 * len(forces) else np.zeros_like(rates)
 
 
-def noise_statistics(poses: Poses) -> dict:
-    """Return noise and tilt within the intervals as plain numbers."""
-    found = {}
+def noise_statistics(poses: Poses) -> dict[str, float | list[float]]:
+    """Return noise and tilt within the intervals as plain numbers, by name."""
+    statistics: dict[str, float | list[float]] = {}
     for sensor, name in zip(SENSORS, ('force', 'rate')):
         noise = poses.noise[sensor]
-        found |= {
-            f'{name}_noise_sd': noise.white_sd.tolist(),
-            f'{name}_noise_colour': np.sqrt(noise.inflation).tolist(),
-        }
-    return found | {'period': poses.period, 'sway': poses.sway}
+        statistics[f'{name}_noise_sd'] = noise.white_sd.tolist()
+        statistics[f'{name}_noise_colour'] = np.sqrt(noise.inflation).tolist()
+    statistics['period'] = poses.period
+    statistics['sway'] = poses.sway
+    return statistics
 
 
 def _pooled_noise(
     parts: Sequence[np.ndarray], rounding: np.ndarray, pieces: int = 8
 ) -> SensorNoise:
     """
-    Return the SensorNoise of samples.
+    Return the SensorNoise of one sensor from its readings in the intervals.
 
-    From the median of the intervals and how much means of pieces scatter more than white noise.
+    The variance of single readings is the median of those of the intervals, at least that of
+    rounding, shape (3,). The noise need not be white: the inflation is the variance of the means of
+    n samples times n over the variance of single readings, from `pieces` pieces of each interval,
+    if it exceeds 1 by two standard deviations.
     """
-    floor = 1e-9 * max(1e-3, max(np.max(np.abs(p)) for p in parts))
-    within = (
-        np.sqrt(np.maximum(np.median([p.var(0, ddof=1) for p in parts], axis=0), rounding)) + floor
-    )
+    floor = 1e-9 * max(1e-3, max(np.max(np.abs(part)) for part in parts))
+    median_variance = np.median([part.var(0, ddof=1) for part in parts], axis=0)
+    sd = np.sqrt(np.maximum(median_variance, rounding)) + floor
     ratios = []
     for part in parts:
         length = len(part) // pieces
         if length >= 4:
             means = part[: length * pieces].reshape(pieces, length, 3).mean(1)
-            # differences of neighbours: a slow drift belongs to the scatter between poses, not here
-            ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * length / within**2)
+            # Differences of neighbours: a slow drift belongs to the scatter between poses, not
+            # here.
+            ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * length / sd**2)
     if not ratios:
-        return SensorNoise(within**2, np.ones(3))
+        return SensorNoise(sd**2, np.ones(3))
     ratio = np.mean(ratios, axis=0)
     margin = 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
-    return SensorNoise(within**2, np.where(ratio > 1 + margin, ratio, 1.0))
+    return SensorNoise(sd**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
 
 def distinct_attitudes(force: np.ndarray) -> int:
     """
-    Return how many of the mean readings (k, 3) point in separate directions.
-
-    The directions are more than `ATTITUDES_APART` from each other.
+    Return the number of directions of the mean readings (k, 3) more than `ATTITUDES_APART` apart.
     """
-    kept = []
+    distinct = []
     for direction in unit_rows(force):
-        if all(np.arccos(np.clip(direction @ other, -1, 1)) > ATTITUDES_APART for other in kept):
-            kept.append(direction)
-    return len(kept)
+        angles = [np.arccos(np.clip(direction @ known, -1, 1)) for known in distinct]
+        if all(angle > ATTITUDES_APART for angle in angles):
+            distinct.append(direction)
+    return len(distinct)
 
 
 MAX_RANGE_READINGS = 4000
@@ -234,20 +248,22 @@ def collect_turns(
     """
     Return (turns between consecutive poses, {reason: count of excluded ones}).
 
-    `temperature_c` is that of the samples or None.
+    `time` has the times of the samples, s, shape (n,); `temperature_c` their temperatures.
     """
     turns = []
     dropped = {}
     rate = imu.rate_s
-    limit = max(MAX_TURN_GAP, 5 * poses.period)
-    ended = at_range_end(rate)
+    max_gap = max(MAX_TURN_GAP, 5 * poses.period)
+    clipped = at_range_end(rate)
     density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
     for first in range(len(poses) - 1):
+        # From the last sample of one pose to the first sample of the next one.
         piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
-        reason = _unusable(time[piece], ended[piece], limit)
+        reason = _unusable(time[piece], clipped[piece], max_gap)
         if reason:
             dropped[reason] = dropped.get(reason, 0) + 1
             continue
+        # Integrated white noise, and rounding at the slow ends of the turn.
         noise_variance = density * (time[piece][-1] - time[piece][0])
         noise_variance += _slow_rounding_variance(time[piece], rate[piece], poses.hidden)
         turns.append(
@@ -274,17 +290,18 @@ def _slow_rounding_variance(
     """
     if hidden is None:
         return 0.0
-    slow = np.abs(rate[:-1]) <= hidden.step
-    slow_seconds = np.diff(time) @ slow
+    is_slow = np.abs(rate[:-1]) <= hidden.step
+    slow_seconds = np.diff(time) @ is_slow
     return float(np.mean(np.square(hidden.rounding_sd * slow_seconds)))
 
 
-def _unusable(time: np.ndarray, ended: np.ndarray, gap: float) -> str:
+def _unusable(time: np.ndarray, clipped: np.ndarray, max_gap: float) -> str:
+    """Return the reason why a turn cannot be integrated; '' if it can."""
     if time[-1] - time[0] > TURN_LONGEST:
         return 'too long'
-    if np.max(np.diff(time)) > gap:
+    if np.max(np.diff(time)) > max_gap:
         return 'gap'
-    return 'clipped' if ended.any() else ''
+    return 'clipped' if clipped.any() else ''
 
 
 def at_range_end(rate: np.ndarray) -> np.ndarray:
@@ -301,49 +318,72 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
         Readings in any unit.
 
     """
-    fresh = np.ones(len(rate), bool)  # a reading published twice is one reading
-    fresh[1:] = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rate.T])
-    ended = np.zeros(len(rate), bool)
-    ended |= _at_end(np.abs, rate.T, fresh)
+    is_new = np.ones(len(rate), bool)  # a reading published twice is one reading
+    is_new[1:] = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rate.T])
+    at_end = _at_end(np.abs, rate.T, is_new)
     for axis in rate.T:
-        for signed in (np.positive, np.negative):
-            ended |= _at_end(signed, axis[None], fresh)
-    return ended
+        at_end |= _at_end(np.positive, axis[None], is_new)
+        at_end |= _at_end(np.negative, axis[None], is_new)
+    return at_end
 
 
-def _at_end(signed: Callable, axes: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+def _at_end(signed: Callable, axes: np.ndarray, is_new: np.ndarray) -> np.ndarray:
     """
-    Return the samples at the largest value of ``signed(axes)``.
+    Return the samples at the largest value of ``signed(axes)`` if it ends the range, shape (n,).
 
-    Shape (m, n), when that is the end of a range.
+    It ends the range if more readings are at it than expected by chance from the density of the
+    `TOP` readings below it.
+
+    Parameters
+    ----------
+    signed : callable
+        Absolute value, identity or negative.
+    axes : array, shape (m, n)
+        Readings of m axes.
+    is_new : array of bool, shape (n,)
+        False for repeated readings.
+
     """
-    some = np.sort(np.concatenate([_largest(signed, axis, fresh) for axis in axes]))[
-        -MAX_RANGE_READINGS:
-    ]
-    step = np.diff(some)
-    step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
+    largest = np.concatenate([_largest(signed, axis, is_new) for axis in axes])
+    largest = np.sort(largest)[-MAX_RANGE_READINGS:]
+    extreme = largest[-1]
+    step = np.diff(largest)
+    step = step[step > 1e-9 * np.abs(extreme)].min(initial=np.inf)
+
     # Two's complement: one end is larger by a step.
     margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step
-    margin = min(margin, 1e-4 * np.abs(some[-1]))
-    at = np.logical_or.reduce([signed(axis) >= some[-1] - margin for axis in axes])
-    below = some[some < some[-1] - margin][-TOP:]
+    margin = min(margin, 1e-4 * np.abs(extreme))
+    at_extreme = np.logical_or.reduce([signed(axis) >= extreme - margin for axis in axes])
+    below = largest[largest < extreme - margin][-TOP:]
     if len(below) < TOP:
-        return np.zeros(len(fresh), bool)
-    chance = TOP * (margin + 0.5 * step) / (some[-1] - below[0]) if np.isfinite(step) else 0.0
-    runs = np.diff(runs_of(at[fresh]))
-    # the top of one smooth turn may fill a coarse step for some samples
-    number = runs.sum() if chance < CERTAIN else np.maximum(runs - SUMMIT, 0).sum() + len(runs)
-    return at if number >= max(2, CROWDED * chance) else np.zeros(len(fresh), bool)
+        return np.zeros(len(is_new), bool)
+
+    n_by_chance = 0.0
+    if np.isfinite(step):
+        n_by_chance = TOP * (margin + 0.5 * step) / (extreme - below[0])
+    run_lengths = np.diff(runs_of(at_extreme[is_new]))
+    if n_by_chance < CERTAIN:
+        n_readings = run_lengths.sum()
+    else:
+        # The top of one smooth turn may fill a coarse step for some samples: they count once.
+        n_readings = np.maximum(run_lengths - SUMMIT, 0).sum() + len(run_lengths)
+    if n_readings < max(2, CROWDED * n_by_chance):
+        return np.zeros(len(is_new), bool)
+    return at_extreme
 
 
-def _largest(signed: Callable, axis: np.ndarray, fresh: np.ndarray) -> np.ndarray:
-    """Return the largest values of ``signed(axis[fresh])``, block by block."""
+def _largest(signed: Callable, axis: np.ndarray, is_new: np.ndarray) -> np.ndarray:
+    """
+    Return the largest `MAX_RANGE_READINGS` values of ``signed(axis[is_new])``, or some more.
+
+    They are computed in blocks, which need less memory.
+    """
     largest = np.zeros(0)
     least = -np.inf
     for start in range(0, len(axis), SAMPLES_AT_ONCE):
         stop = start + SAMPLES_AT_ONCE
         values = signed(axis[start:stop])
-        largest = np.append(largest, values[(values > least) & fresh[start:stop]])
+        largest = np.append(largest, values[(values > least) & is_new[start:stop]])
         if len(largest) > MAX_RANGE_READINGS:
             largest = np.partition(largest, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:]
             least = largest[0]
@@ -359,7 +399,10 @@ def known_turn_data(
     temperature_c: np.ndarray | None = None,
 ) -> TurnData:
     """
-    Return the data of a `KnownTurn`; `KNOWN_TURN_SD` applies along and, for the axis, across it.
+    Return the data of a `KnownTurn`.
+
+    Along the axis the sd of the rotation is that of the angle, `KNOWN_TURN_SD`; across it, the same
+    error of the axis times the angle.
     """
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
@@ -382,75 +425,88 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
     """
     Return the times of samples since the first one, s, shape (n,).
 
-    Of the clock fitted to the stamps, or the stamps.
-
-    An even clock is a straight line through the stamps over the count of the samples, in pieces of
-    `LINE` seconds. It is used unless the readings interpolate better from their neighbours at the
-    stamps, as with a driver that polls the sensor at uneven times.
+    They are those of an even clock, a straight line through the stamps over the count of the
+    samples, in pieces of `LINE` seconds. They are the stamps if the readings interpolate better
+    from their neighbours at the stamps, as with a driver that polls the sensor at uneven times.
     """
     stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     even = stamps.copy()
     step = np.diff(stamps)
     period = float(np.median(step))
+    # A longer step is a pause: the clock of each stretch between pauses is fitted separately.
     edges = np.flatnonzero(step / period > MOST_LOST + MAX_REGULAR_STEP) + 1
     del step  # a long recording is large
     for start, stop in zip([0, *edges], [*edges, len(stamps)]):
         if stop - start >= 2 * LAG:
             even[start:stop] = _clock_times(stamps[start:stop], period)
-    return (
-        even
-        if np.all(np.diff(even) > 0)
-        and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s)
-        else stamps
-    )
+    if not np.all(np.diff(even) > 0):
+        return stamps
+    if _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s):
+        return even
+    return stamps
 
 
 def _clock_times(stamps: np.ndarray, period: float) -> np.ndarray:
     """
-    Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed.
+    Return the times of the even clock of one stretch, s, shape (n,).
+
+    They are the stamps if the mean stamps of pieces depart from the clock by 0.6 periods or more:
+    samples were lost unnoticed.
     """
-    step = np.diff(stamps) / period
+    # Number of each sample: counted, and with lost samples in steps of several periods. The better
+    # line is used, because long steps of a rebuilt clock need not be lost samples.
     numbers = [np.arange(float(len(stamps)))]
+    step = np.diff(stamps) / period
     lost = (step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE)
-    if lost.any():  # long steps of a rebuilt clock need not be lost samples
-        numbers.insert(0, np.concatenate([[0.0], np.cumsum(np.where(lost, np.rint(step), 1.0))]))
-    lines = (
-        _clock_line(number, stamps, max(1, int(period * len(stamps) / LINE))) for number in numbers
-    )
+    if lost.any():
+        n_periods = np.where(lost, np.rint(step), 1.0)
+        numbers.insert(0, np.concatenate([[0.0], np.cumsum(n_periods)]))
+    n_lines = max(1, int(period * len(stamps) / LINE))
+    lines = [_clock_line(number, stamps, n_lines) for number in numbers]
     line = min(lines, key=lambda line: np.sum((stamps - line) ** 2))
-    part = np.arange(len(stamps) // LAG)
-    size, longer = divmod(len(stamps), len(part))
-    late = np.add.reduceat(stamps - line, part * size + np.minimum(part, longer)) / (
-        size + (part < longer)
-    )
-    return line if np.abs(late).max() < 0.6 * period else stamps
+
+    # Mean departure of pieces of about LAG samples, of which the first `longer` have one more.
+    piece = np.arange(len(stamps) // LAG)
+    size, longer = divmod(len(stamps), len(piece))
+    sums = np.add.reduceat(stamps - line, piece * size + np.minimum(piece, longer))
+    departure = sums / (size + (piece < longer))
+    return line if np.abs(departure).max() < 0.6 * period else stamps
 
 
 def _clock_line(number: np.ndarray, time: np.ndarray, pieces: int) -> np.ndarray:
+    """
+    Return the times of a clock at the sample numbers, s, shape (n,).
+
+    It is a straight line through the stamps `time`, with the mean departures of the pieces from it,
+    interpolated between their middles.
+    """
     line = np.polynomial.Polynomial.fit(number, time, 1)(number)
     middles = [part.mean() for part in np.array_split(number, pieces)]
-    late = [part.mean() for part in np.array_split(time - line, pieces)]
-    return line + np.interp(number, middles, late)
+    departures = [part.mean() for part in np.array_split(time - line, pieces)]
+    return line + np.interp(number, middles, departures)
 
 
 def _roughness(time: np.ndarray, rate: np.ndarray) -> float:
     """
-    Return the sum of squared errors of linear interpolation.
-
-    The interpolation is between the two neighbours of each reading.
+    Return the sum of squared errors of rates (n, 3) interpolated between their two neighbours.
     """
     total = 0.0
     for start in range(0, len(time) - 2, SAMPLES_AT_ONCE):
         stop = start + SAMPLES_AT_ONCE + 2
-        some = time[start:stop]
-        own = rate[start:stop].T
-        share = (some[1:-1] - some[:-2]) / (some[2:] - some[:-2])
-        total += float(np.sum((own[:, 1:-1] - (1 - share) * own[:, :-2] - share * own[:, 2:]) ** 2))
+        t = time[start:stop]
+        w = rate[start:stop].T
+        share = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+        errors = w[:, 1:-1] - (1 - share) * w[:, :-2] - share * w[:, 2:]
+        total += float(np.sum(errors**2))
     return total
 
 
 def rising(time: np.ndarray) -> np.ndarray:
-    """Spread repeated stamps over the following step: their order is known, their times are not."""
+    """
+    Return stamps in which repeated ones are spread over the following step.
+
+    The order of samples with equal stamps is known, their times are not.
+    """
     if np.all(np.diff(time) > 0):
         return time
     kept = np.concatenate([[True], np.diff(time) > 0])
@@ -463,10 +519,8 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
     """
     Return the factor between measured and true rates (`preprocessing.full_scale`).
 
-    It is 1 if the rotated gravity matches its observed direction.
-
-    Only turns with gravity as reference count; the bias of each is the mean of the rates at rest
-    before and after it.
+    It is the one with which rotated gravity matches its observed direction after the turns, 1 with
+    few turns. Turns of known angle are not used.
 
     Parameters
     ----------
@@ -476,26 +530,27 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
     turns : sequence of TurnData
 
     """
-    some = [turn for turn in turns if turn.rotation is None][:MOST_TURNS]
-    if len(some) < LEAST_TURNS:
+    used_turns = [turn for turn in turns if turn.rotation is None][:MOST_TURNS]
+    if len(used_turns) < LEAST_TURNS:
         return 1.0
 
-    def missed(factor: float) -> float:
-        return float(
-            np.median(
-                [missed_angle(state, poses, turn, matrix=factor * np.eye(3)) for turn in some]
-            )
-        )
+    def median_error(factor: float) -> float:
+        """Return the median angle error of the turns with a factor, rad."""
+        matrix = factor * np.eye(3)
+        angles = [missed_angle(state, poses, turn, matrix=matrix) for turn in used_turns]
+        return float(np.median(angles))
 
-    return believed_factor(missed)
+    return believed_factor(median_error)
 
 
 def missed_angle(state: State, poses: Poses, turn: TurnData, *, matrix: np.ndarray) -> float:
     """
     Return the angle between rotated and observed gravity after a turn, rad.
 
-    The gyroscope reads `matrix` times the rate.
+    The gyroscope reads ``bias + matrix @ rate``, with the mean bias of the poses before and after
+    the turn.
     """
     bias = 0.5 * (poses.rate[turn.first] + poses.rate[turn.last])
     mat_ji = total_rotation(turn.time, (turn.rate - bias) @ np.linalg.inv(matrix).T)
-    return float(np.arccos(np.clip(mat_ji @ state.up[turn.first] @ state.up[turn.last], -1.0, 1.0)))
+    cosine = mat_ji @ state.up[turn.first] @ state.up[turn.last]
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
