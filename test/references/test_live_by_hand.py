@@ -105,7 +105,7 @@ def test_solving_on_the_way_changes_nothing(session, expected):
     live, solved = make_live(), 0
     for number, block in enumerate(blocks(session, 3)):
         live.push(block)
-        if number % 10 == 9 and live.found.attitudes >= 4:
+        if number % 10 == 9 and live.scan.attitudes >= 4:
             live.solve(pending=number % 20 == 19)
             solved += 1
     assert solved >= 3
@@ -130,7 +130,7 @@ def test_before_any_motion_it_asks_for_attitudes():
     assert (
         status.word == 'waiting'
         and re.search(r'[+-][xyz] up', status.message)
-        and set(unseen(live.found)) == set(FACE_DIRECTIONS)
+        and set(unseen(live.scan)) == set(FACE_DIRECTIONS)
     )
     assert all(group.status == 'waiting' and group.needs for group in live.groups())
 
@@ -146,7 +146,7 @@ def test_the_direction_that_is_missing_is_named():
     live, asked = make_live(), {}
     for block in blocks(imu):
         live.push(block)
-        asked[live.found.attitudes] = live.status(), unseen(live.found)
+        asked[live.scan.attitudes] = live.status(), unseen(live.scan)
         assert f'next: {live.coverage().next.text}' in live.status().message
     assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(
         FACE_DIRECTIONS
@@ -265,7 +265,7 @@ def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
         largest = max(largest, len(live._store))
     assert largest < len(session) + 5000 and live.status().values['samples forgotten'] > 4_000
     result = live.solve(pending=True)
-    assert live.found.attitudes == 12 and live.found.turns == 11
+    assert live.scan.attitudes == 12 and live.scan.turns == 11
     assert_same(result, offline(all_kept(live)), 1e-4)
     assert np.all(
         np.abs(result.calibration.values - expected.calibration.values)

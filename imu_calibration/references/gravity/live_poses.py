@@ -87,15 +87,15 @@ FACE_REACH = np.pi / 4
 class PoseScan:
     """Result of the search for rest in the samples so far."""
 
-    rests: list
-    """Ranges at rest (slice)."""
+    rests: list[slice]
+    """Ranges of samples at rest."""
     poses: Poses | None
-    """Their means; None without any rest."""
+    """Means over the rests; None without any rest."""
     attitudes: int
     """Number of different attitudes."""
     turns: int
     """Number of usable turns between consecutive poses."""
-    dropped: dict
+    dropped: dict[str, int]
     """Reason -> number of unusable turns."""
     resting: float
     """Duration of the current rest, s; 0 in motion."""
@@ -117,25 +117,33 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> PoseScan:
     dropped: dict[str, int] = {}
     if not imu.absent:  # a turn relates both sensors
         turns, dropped = collect_turns(seconds, imu, poses=poses)
-    goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
-    resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
-    attitudes = distinct_attitudes(poses.force)
-    return PoseScan(rests, poses, attitudes, len(turns), dropped, resting, imu.absent)
+    resting = 0.0
+    if seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1:  # the last rest still lasts
+        resting = float(seconds[-1] - seconds[rests[-1].start])
+    return PoseScan(
+        rests=rests,
+        poses=poses,
+        attitudes=distinct_attitudes(poses.force),
+        turns=len(turns),
+        dropped=dropped,
+        resting=resting,
+        absent=imu.absent,
+    )
 
 
 def hand_status(
-    found: PoseScan,
+    scan: PoseScan,
     calibration: Calibration | None,
     *,
     step: str,
     hints: dict[str, str] | None = None,
 ) -> LiveState:
     """
-    Return the LiveState.
+    Return the LiveState of a session by hand: counts of poses and turns, and what to do next.
 
     Parameters
     ----------
-    found : PoseScan
+    scan : PoseScan
     calibration : Calibration or None
         The last solution.
     step : str
@@ -144,81 +152,76 @@ def hand_status(
         As for `errors.with_hint`.
 
     """
-    not_seen = unseen(found)
-    word, needs = _needs(found, not_seen, calibration, step=step, hints=hints or {})
+    unseen_faces = unseen(scan)
+    progress, needs = _needs(scan, unseen_faces, calibration, step=step, hints=hints or {})
     values = {
-        'poses': len(found.rests),
-        'attitudes': found.attitudes,
-        'turns': found.turns,
-        **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
-        'directions of gravity not seen': ' '.join(not_seen),
-        'at rest for [s]': f'{found.resting:.1f}',
+        'poses': len(scan.rests),
+        'attitudes': scan.attitudes,
+        'turns': scan.turns,
+        **{f'turns left out: {reason}': count for reason, count in scan.dropped.items()},
+        'directions of gravity not seen': ' '.join(unseen_faces),
+        'at rest for [s]': f'{scan.resting:.1f}',
         'next': '; '.join(needs),
     }
     parts = [
-        f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")},'
-        f' {_plural(found.turns, "turn")}'
+        f'{_plural(len(scan.rests), "pose")} in {_plural(scan.attitudes, "attitude")},'
+        f' {_plural(scan.turns, "turn")}'
     ]
-    if found.dropped:
-        parts.append(
-            'turns left out: '
-            + ', '.join(f'{count} {reason}' for reason, count in sorted(found.dropped.items()))
-        )
-    if found.resting:
-        parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
-    parts += (
-        [f'next: {need}' for need in needs]
-        if needs
-        else ['all parameters are determined: save the calibration']
-    )
-    return LiveState(word, '; '.join(parts), values)
+    if scan.dropped:
+        counts = [f'{count} {reason}' for reason, count in sorted(scan.dropped.items())]
+        parts.append('turns left out: ' + ', '.join(counts))
+    if scan.resting:
+        parts.append(f'at rest for {scan.resting:.1f} s: this pose counts, move on')
+    parts += [f'next: {need}' for need in needs]
+    if not needs:
+        parts.append('all parameters are determined: save the calibration')
+    return LiveState(progress, '; '.join(parts), values)
 
 
-def unseen(found: PoseScan) -> list[str]:
+def unseen(scan: PoseScan) -> list[str]:
     """
     Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first.
     """
-    if 'accelerometer' in found.absent:
+    if 'accelerometer' in scan.absent:
         return []
-    if found.poses is None:
+    if scan.poses is None:
         return list(FACE_DIRECTIONS)
-    up = unit_rows(found.poses.force)
-    nearest = {
-        name: float(np.arccos(np.clip(up @ face, -1, 1)).min())
-        for name, face in FACE_DIRECTIONS.items()
-    }
-    return sorted(
-        (name for name, angle in nearest.items() if angle > FACE_REACH),
-        key=lambda name: -nearest[name],
-    )
+    up = unit_rows(scan.poses.force)
+    nearest = {}  # face -> smallest angle to an attitude, rad
+    for name, face in FACE_DIRECTIONS.items():
+        nearest[name] = float(np.arccos(np.clip(up @ face, -1, 1)).min())
+    unseen_faces = [name for name, angle in nearest.items() if angle > FACE_REACH]
+    return sorted(unseen_faces, key=lambda name: -nearest[name])
 
 
 def _needs(
-    found: PoseScan,
-    not_seen: Sequence[str],
+    scan: PoseScan,
+    unseen_faces: Sequence[str],
     calibration: Calibration | None,
     *,
     step: str,
     hints: dict[str, str],
 ) -> tuple[Progress, list[str]]:
-    if 'accelerometer' in found.absent:
+    """Return (progress, texts of the next steps or remedies); arguments as for `hand_status`."""
+    if 'accelerometer' in scan.absent:
         # Gravity is not measured: one rest determines the bias, and no turn the matrix.
         if calibration is None:
             return Progress.WAITING, ['hold it still']
         if not parameter_count(calibration).lacking:
             return Progress.DETERMINED, []
         return Progress.WEAK, needs_of(calibration)
-    if found.attitudes < MIN_ATTITUDES or calibration is None:
-        more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
+    if scan.attitudes < MIN_ATTITUDES or calibration is None:
+        faces = f' (faces not seen yet: {", ".join(unseen_faces)})' if unseen_faces else ''
         return Progress.WAITING, [
-            f'{step}{more}; {MIN_ATTITUDES} attitudes at least, {POSES_FULL} for all parameters'
+            f'{step}{faces}; {MIN_ATTITUDES} attitudes at least, {POSES_FULL} for all parameters'
         ]
     if not parameter_count(calibration).lacking:
         return Progress.DETERMINED, []
     needs = needs_of(calibration)
-    without_motion = [
-        with_hint(need, REMEDY_KEYS.get(need), hints) for need in needs if need in NO_STEP
-    ]
+    without_motion = []
+    for need in needs:
+        if need in NO_STEP:
+            without_motion.append(with_hint(need, REMEDY_KEYS.get(need), hints))
     if len(without_motion) == len(needs) > 0:
         return Progress.WEAK, without_motion
     # The planned step serves the parameters whose need is a pose or a turn.
@@ -226,21 +229,26 @@ def _needs(
 
 
 def needs_of(calibration: Calibration) -> list[str]:
-    """Return what the undetermined parameters need; the gravity where it alone is missing."""
+    """
+    Return the needs of the undetermined parameters, each once.
+
+    If only the common scale is undetermined, it needs the local gravity.
+    """
     if parameter_count(calibration).lacking == (COMMON_SCALE,):
         return [REMEDIES[GRAVITY,]]
     return list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
 
 
 def _plural(count: int, noun: str) -> str:
+    """Return '1 pose', '2 poses'."""
     return f'{count} {noun}' + ('' if count == 1 else 's')
 
 
-def knowledge_of(found: PoseScan, result: HandResult | None, options: HandOptions) -> HandKnowledge:
+def knowledge_of(scan: PoseScan, result: HandResult | None, options: HandOptions) -> HandKnowledge:
     """
     Return the HandKnowledge of a session.
 
-    Before the first solution from its poses, then from the solution.
+    It follows from the last solution, before the first solution from the poses so far.
     """
     if result is not None:
         return knowledge_after(result.applied)
@@ -251,21 +259,21 @@ def knowledge_of(found: PoseScan, result: HandResult | None, options: HandOption
         options.gravity,
     )
     return knowledge_at_first(
-        model, tolerances_of(model.model, options.tolerances), poses=found.poses
+        model, tolerances_of(model.model, options.tolerances), poses=scan.poses
     )
 
 
 def hand_coverage(
-    found: PoseScan, result: HandResult | None, options: HandOptions, *, frame_id: str = ''
+    scan: PoseScan, result: HandResult | None, options: HandOptions, *, frame_id: str = ''
 ) -> Coverage:
     """
     Return the Coverage of a session by hand.
 
-    The cells, the next pose with the turn to it, and the remaining seconds.
+    It has the gain of each direction, the next pose with the turn to it, and the remaining seconds.
     """
     # Without an accelerometer gravity is not measured, and no attitude has a gain.
-    without_gravity = 'accelerometer' in found.absent
-    seen = ups_of(None if without_gravity else found.poses)
+    without_gravity = 'accelerometer' in scan.absent
+    seen = ups_of(None if without_gravity else scan.poses)
     up = seen[-1] if len(seen) else None
     no_gain = Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
     if result is not None:
@@ -278,14 +286,13 @@ def hand_coverage(
             return replace(no_gain, next=Step(needs[0]))
     if without_gravity:
         return no_gain
-    knowledge = knowledge_of(found, result, options)
+    knowledge = knowledge_of(scan, result, options)
     steps = foretold(knowledge)
     if not steps:
         return no_gain
     first = steps[0]
-    worth = knowledge.best()[1]
     return Coverage(
-        worth,
+        knowledge.best().gains,
         seen,
         up,
         Step(first.words, first.up, first.axis, first.angle),
@@ -350,27 +357,36 @@ class LiveByHand(LiveSession):
         self.options = by_hand.at_place(options)
         self.settings = settings
         self._clock = clock
-        self._asked = hand_options(self.options)
+        # Options at the start; the gravity of `options` may change later.
+        self._first_options = hand_options(self.options)
         _check_model(self.model)
         self._check = StreamCheck(one_sensor=True)
         self._store = HandStore(by_hand.hand_samples)
+        # Reason -> number of samples that the source could not use; `_check` counts its own.
         self._drops = Counter()
         if saved is not None:
             self._store.load(saved)
+        # Decides when the next search for rest is due.
         self._pacer = SolvePacer(SEARCH_SHARE)
+        # Number of samples since the last search.
         self._unsearched = 0
+        # Stamp of the end of the last rest that `push` has returned; None before the first.
         self._reported_ns: int | None = None
+        # The last Coverage, with the (scan, result, gravity) from which it was computed.
         self._shown: tuple[tuple, Coverage] | None = None
-        self.found = EMPTY_SCAN
+        # Result of the last search.
+        self.scan = EMPTY_SCAN
         self.result: HandResult | None = None
         self._search(self._store)
 
     @property
     def model(self) -> SensorModel:
-        """The model, as far as known before a solution."""
-        asked = self._asked
+        """The requested model; effects that a solution adds are not in it."""
+        requested = self._first_options
         return SensorModel(
-            asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue
+            requested.accelerometer or BASE,
+            requested.gyroscope or BASE,
+            catalogue=requested.catalogue,
         )
 
     observations = PoseObservations.unit
@@ -384,25 +400,26 @@ class LiveByHand(LiveSession):
 
     def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> bool:
         """
-        Use other settings from now on.
+        Use other settings from now on; return whether the poses have to be solved again.
 
-        For the poses in all samples, another gravity, another number of samples. Return whether
-        the poses have to be solved again.
+        `WindowSettings` apply to all stored samples, `LiveByHandSettings` have the gravity and the
+        largest number of samples.
         """
         if isinstance(settings, LiveSettings):
             self.settings = settings
-        elif isinstance(settings, WindowSettings):
+            return False
+        if isinstance(settings, WindowSettings):
             self.options = replace(self.options, windows=settings)
             self._search(self._store)
-        else:
-            self.options, self._store.most = settings.at_place(self.options), settings.hand_samples
-            return True
-        return False
+            return False
+        self.options = settings.at_place(self.options)
+        self._store.most = settings.hand_samples
+        return True
 
     @property
     def n_windows(self) -> int:
         """Poses at the last search."""
-        return len(self.found.rests)
+        return len(self.scan.rests)
 
     @property
     def n_covered(self) -> int:
@@ -417,16 +434,12 @@ class LiveByHand(LiveSession):
     @property
     def counts(self) -> dict[str, int]:
         """Unusable samples, by reason."""
-        return dict(
-            self._drops
-            + Counter({f'imu {reason}': count for reason, count in self._check.counts.items()})
-        )
+        of_stream = {f'imu {reason}': count for reason, count in self._check.counts.items()}
+        return dict(self._drops + Counter(of_stream))
 
     def push(self, block: SampleBlock) -> list[ImuSamples]:
         """
-        Add arriving samples.
-
-        Return the poses completed since the last call, as mean ImuSamples, one each, in a list.
+        Add arriving samples; return the mean reading of each pose completed since the last call.
         """
         self._drops.update(block.dropped or {})
         imu = block.imu
@@ -438,27 +451,29 @@ class LiveByHand(LiveSession):
         period = self._check.statistics().period
         if self._unsearched * period < SEARCH_STEP or not self._pacer.due(self._clock()):
             return []
-        start, self._unsearched = self._clock(), 0
+        start = self._clock()
+        self._unsearched = 0
         self._search(self._store)
-        if self._store.forget(self.found.rests, MAX_LIVE_POSES):
+        if self._store.forget(self.scan.rests, MAX_LIVE_POSES):
             self._search(self._store)
         self._pacer.note(start, self._clock())
-        return self._newly_over()
+        return self._newly_ended()
 
     def _search(self, store: HandStore) -> None:
+        """Search the samples of a store for rest, and store the result in `scan`."""
         imu = store.samples()
         if imu is not None and len(imu) > 2:
-            self.found = look_for_poses(imu, self.options.windows)
+            self.scan = look_for_poses(imu, self.options.windows)
 
-    def _newly_over(self) -> list[ImuSamples]:
+    def _newly_ended(self) -> list[ImuSamples]:
         """Return the mean reading of each rest that has ended since the last call."""
         imu = self._store.samples()
-        found = self.found
-        if imu is None or found.poses is None:
+        scan = self.scan
+        if imu is None or scan.poses is None:
             return []
 
-        # Unless the last rest still lasts, it is over too.
-        ended = found.rests[:-1] if found.resting else found.rests
+        # Unless the last rest still lasts, it has ended too.
+        ended = scan.rests[:-1] if scan.resting else scan.rests
         reported_ns = self._reported_ns
         means = []
         for k, rest in enumerate(ended):
@@ -468,8 +483,8 @@ class LiveByHand(LiveSession):
             means.append(
                 ImuSamples(
                     self._store.true_stamps(imu.stamp_ns[[middle]]),
-                    found.poses.force[[k]],
-                    found.poses.rate[[k]],
+                    scan.poses.force[[k]],
+                    scan.poses.rate[[k]],
                     imu.frame_id,
                 )
             )
@@ -515,7 +530,7 @@ class LiveByHand(LiveSession):
         delay = delay_of(imu)
         findings = tuple(late_gyroscope(delay))
         recording = SampleRecording(imu, None, self.counts, findings, delay, frozen_sensors)
-        self.result = calibrate_poses(recording, self.options, provenance, stills=self.found.rests)
+        self.result = calibrate_poses(recording, self.options, provenance, stills=self.scan.rests)
         return self.result
 
     def saved(self, pending: bool = False) -> bytes:
@@ -526,49 +541,50 @@ class LiveByHand(LiveSession):
 
     def residuals(self, poses: Sequence[ImuSamples]) -> ImuSamples | None:
         """
-        Return measured minus predicted of poses from `push`, as ImuSamples.
-
-        Or None before the first solution.
+        Return measured minus predicted mean readings of poses from `push`.
 
         The direction of gravity in a pose is estimated, so only the length of the specific force
-        can differ from its prediction; the rate is compared with zero.
+        can differ from its prediction; the rate is compared with zero. None before the first
+        solution.
         """
         if self.result is None or not poses:
             return None
         mean = ImuSamples.concatenate(poses)
         hand = self.result.applied
         time = 1e-9 * (mean.stamp_ns - self.result.gathered.first_stamp_ns)
-        true, turning = hand.compensate(mean.force_s, mean.rate_s, time)
-        gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
-        force_residual = (true - gravity_s) @ hand.accelerometer[1].T
-        rate_residual = turning @ hand.gyroscope[1].T
+        true_force, true_rate = hand.compensate(mean.force_s, mean.rate_s, time)
+        gravity_s = true_force * (hand.gravity / np.linalg.norm(true_force, axis=1))[:, None]
+        # The matrices convert errors of true values to errors of readings.
+        _, force_matrix = hand.accelerometer
+        _, rate_matrix, _ = hand.gyroscope
+        force_residual = (true_force - gravity_s) @ force_matrix.T
+        rate_residual = true_rate @ rate_matrix.T
         if 'accelerometer' in self.result.calibration.absent:
-            force_residual = np.full_like(true, np.nan)
+            force_residual = np.full_like(true_force, np.nan)
         if 'gyroscope' in self.result.calibration.absent:
-            rate_residual = np.full_like(turning, np.nan)
+            rate_residual = np.full_like(true_rate, np.nan)
         return ImuSamples(mean.stamp_ns, force_residual, rate_residual, mean.frame_id)
 
     def waiting(self) -> list[GroupState]:
         """Return the state of every effect of the present sensors, with the first needs."""
         waiting = []
         for group in waiting_groups(self.model):
-            if group.sensor not in self.found.absent:
+            if group.sensor not in self.scan.absent:
                 waiting.append(replace(group, needs=_FIRST_NEEDS[group.sensor]))
         return waiting
 
     def coverage(self) -> Coverage:
         """Return the Coverage: useful attitudes, and the next one."""
-        known = (self.found, self.result, self.options.gravity)
-        if self._shown is None or any(
-            a is not b for a, b in zip(known, self._shown[0], strict=True)
-        ):
-            self._shown = (
-                known,
-                hand_coverage(
-                    self.found, self.result, hand_options(self.options), frame_id=self.frame_id
-                ),
-            )
-        return self._shown[1]
+        inputs = (self.scan, self.result, self.options.gravity)
+        if self._shown is not None:
+            shown_inputs, coverage = self._shown
+            if all(new is old for new, old in zip(inputs, shown_inputs, strict=True)):
+                return coverage
+        coverage = hand_coverage(
+            self.scan, self.result, hand_options(self.options), frame_id=self.frame_id
+        )
+        self._shown = (inputs, coverage)
+        return coverage
 
     def status(self, hints: dict[str, str] | None = None) -> LiveState:
         """
@@ -577,7 +593,7 @@ class LiveByHand(LiveSession):
         `hints` as for `errors.with_hint`.
         """
         status = hand_status(
-            self.found,
+            self.scan,
             self.result.calibration if self.result else None,
             step=self.coverage().next.text,
             hints=hints,
@@ -594,7 +610,7 @@ class LiveByHand(LiveSession):
 
 def _frozen(imu: ImuSamples) -> dict[str, str]:
     """
-    Return the sensor whose outputs never change -> why it cannot be used.
+    Return sensor -> text why it cannot be used, for sensors whose readings never change.
 
     Raises
     ------
@@ -602,13 +618,13 @@ def _frozen(imu: ImuSamples) -> dict[str, str]:
         When no other sensor can be used.
 
     """
-    found = {}
+    frozen = {}
     for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)):
         if sensor not in imu.absent and not np.ptp(values, axis=0).any():
-            found[sensor] = frozen_text(sensor, len(imu), is_zero=not values.any())
-    if len({*found, *imu.absent}) == len(SENSORS) and found:
-        raise InputError(next(iter(found.values())), code='frozen')
-    return found
+            frozen[sensor] = frozen_text(sensor, len(imu), is_zero=not values.any())
+    if frozen and len({*frozen, *imu.absent}) == len(SENSORS):
+        raise InputError(next(iter(frozen.values())), code='frozen')
+    return frozen
 
 
 def _check_model(model: SensorModel) -> None:
