@@ -20,7 +20,11 @@ VARIANCE_STEPS = 5
 
 
 def placements(up: np.ndarray) -> np.ndarray:
-    """Return the first rest of each placement, indices, for unit vectors of shape (k, 3)."""
+    """
+    Return the index of the first rest of each placement.
+
+    `up` has the direction of gravity in each rest, unit vectors of shape (k, 3).
+    """
     step = np.linalg.norm(np.diff(up, axis=0), axis=1)
     return np.flatnonzero(np.append(True, step > PLACED_AGAIN))
 
@@ -45,13 +49,13 @@ def excess(covariance: np.ndarray, known: np.ndarray, index: np.ndarray) -> np.n
     root = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(root)
     shares, axes = np.linalg.eigh(inverse @ known[block] @ inverse.T)
-    grown = root @ axes
-    added = np.zeros_like(known)
-    added[block] = (grown * np.maximum(1.0 - shares, 0.0)) @ grown.T
-    return added
+    scaled_axes = root @ axes
+    excess_covariance = np.zeros_like(known)
+    excess_covariance[block] = (scaled_axes * np.maximum(1.0 - shares, 0.0)) @ scaled_axes.T
+    return excess_covariance
 
 
-def covariance_of_placements(rows: Rows, found: RowEstimate) -> np.ndarray:
+def covariance_of_placements(rows: Rows, estimate: RowEstimate) -> np.ndarray:
     """
     Return the covariance that common errors of rests add to the one of independent errors.
 
@@ -66,7 +70,7 @@ def covariance_of_placements(rows: Rows, found: RowEstimate) -> np.ndarray:
     ----------
     rows : Rows
         `GravityRows` at the estimate.
-    found : RowEstimate
+    estimate : RowEstimate
 
     Returns
     -------
@@ -74,53 +78,60 @@ def covariance_of_placements(rows: Rows, found: RowEstimate) -> np.ndarray:
         Zero where each placement has one rest.
 
     """
-    n_params = len(found.free)
-    added = np.zeros((n_params, n_params))
-    first = placements(found.state.up)
-    if len(first) == len(found.state.up):
-        return added
-    placement = np.searchsorted(first, np.arange(len(found.state.up)), side='right') - 1
+    n_params = len(estimate.free)
+    n_rests = len(estimate.state.up)
+    covariance = np.zeros((n_params, n_params))
+    first = placements(estimate.state.up)
+    if len(first) == n_rests:
+        return covariance
+    placement = np.searchsorted(first, np.arange(n_rests), side='right') - 1
 
     # Weights of the rests in the mean of each placement and axis, shape (n_means, m).
     pose = COMPONENTS.index('pose')
     of_poses = np.flatnonzero(rows.component == pose)
     mean = 3 * placement[rows.group[of_poses]] + np.arange(len(of_poses)) % 3
     weights = np.zeros((3 * len(first), len(rows.residual)))
-    variances = rows.with_scatter(found.scatter.variance).variance.ravel()
+    variances = rows.with_scatter(estimate.scatter.variance).variance.ravel()
     weights[mean, of_poses] = 1 / variances[of_poses]
     weights /= weights.sum(axis=1, keepdims=True)
 
     # Excess of the variance of the means over that of independent rests.
-    variance = _variance_of_means(rows, found, weights).upper[0]
-    more = np.maximum(variance - (weights**2).sum(axis=1) * found.scatter.upper[pose], 0.0)
-    common = gain_of_rows(rows, found.scatter, found.free) @ (weights > 0).T
-    added[np.ix_(found.free, found.free)] = (common * more) @ common.T
-    return added
+    variance = _variance_of_means(rows, estimate, weights).upper[0]
+    of_independent = (weights**2).sum(axis=1) * estimate.scatter.upper[pose]
+    excess_variance = np.maximum(variance - of_independent, 0.0)
+
+    # Change of the estimate by an error that is common to the rests of a mean: sum of the g_i.
+    common_gain = gain_of_rows(rows, estimate.scatter, estimate.free) @ (weights > 0).T
+    free_block = np.ix_(estimate.free, estimate.free)
+    covariance[free_block] = (common_gain * excess_variance) @ common_gain.T
+    return covariance
 
 
-def _variance_of_means(rows: Rows, found: RowEstimate, weights: np.ndarray) -> GroupVariances:
+def _variance_of_means(rows: Rows, estimate: RowEstimate, weights: np.ndarray) -> GroupVariances:
     """
-    Return the variance of the means of placements beyond the noise of their samples.
+    Return the variance of the means of placements beyond the noise of their samples, (m/s^2)^2.
 
-    By restricted likelihood on the means and on the differences within placements: the rows of
-    each placement are transformed to their mean and to the directions across it.
+    It is estimated by restricted likelihood from the means and the differences within placements:
+    the rows of each placement are transformed to their mean and to the directions across it.
+    `weights` of the rows in the means have the shape (n_means, m).
     """
-    free = rows.of_parameters(found.free)
+    free = rows.of_parameters(estimate.free)
     columns = flat(free.equations)
-    white = flat(free.with_scatter(found.scatter.variance).white())
+    white = flat(free.with_scatter(estimate.scatter.variance).white())
 
     transformed = [white[rows.component != COMPONENTS.index('pose')], weights @ columns]
-    for row in weights:
-        own = np.flatnonzero(row)
-        across = scipy.linalg.null_space(np.sqrt(row[own])[None])
-        transformed.append(across.T @ white[own])
-    n_before = len(transformed[0])
-    n_means = len(weights)
+    for weights_of_mean in weights:
+        in_mean = np.flatnonzero(weights_of_mean)
+        across = scipy.linalg.null_space(np.sqrt(weights_of_mean[in_mean])[None])
+        transformed.append(across.T @ white[in_mean])
+    # The means have the variance to be estimated, all other rows are whitened.
     stacked = np.concatenate(transformed)
+    first_mean = len(transformed[0])
+    means = slice(first_mean, first_mean + len(weights))
     noise = np.ones(len(stacked))
+    noise[means] = weights**2 @ rows.variance.ravel()
     component = np.full(len(stacked), NO_COMPONENT)
-    noise[n_before : n_before + n_means] = weights**2 @ rows.variance.ravel()
-    component[n_before : n_before + n_means] = 0
+    component[means] = 0
     rows = Rows(equations=stacked[:, None], variance=noise[:, None], component=component)
 
     fallback = np.array([SCATTER_SD[0] ** 2])

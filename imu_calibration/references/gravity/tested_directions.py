@@ -49,9 +49,9 @@ TURNS_CONTRADICT = 3.84
 
 def directions(model: HandModel, poses: Poses) -> np.ndarray:
     """
-    Return the direction of gravity in each pose without cross terms, unit vectors, shape (k, 3).
+    Return the direction of gravity in each pose, unit vectors, shape (k, 3).
 
-    Estimated cross terms, if they are wrong, would turn it.
+    They are computed with cross terms at their prior: estimated ones, if wrong, would turn them.
     """
     return first_state(replace(model, untested=CROSS_TERMS), poses).up
 
@@ -92,16 +92,16 @@ class PlacementFit:
     spare: int
     """Degrees of freedom of the errors."""
     covariance: np.ndarray | None
-    """Of the estimated parameters, shape (m, m), SI; None with too few placements."""
+    """Covariance of the estimated parameters, shape (m, m), SI; None with too few placements."""
 
     def demands(self, held: 'PlacementFit') -> bool:
-        """Return whether an F test prefers this fit to one with fewer parameters."""
-        n_more = held.spare - self.spare
-        if self.spare < FEWEST_SPARE or n_more <= 0 or self.squares <= 0.0:
+        """Return whether an F test prefers this fit to `held`, which has fewer parameters."""
+        n_additional = held.spare - self.spare
+        if self.spare < FEWEST_SPARE or n_additional <= 0 or self.squares <= 0.0:
             return False
         gain = max(held.squares - self.squares, 0.0)
-        ratio = (gain / n_more) / (self.squares / self.spare)
-        return bool(f_sf(ratio, n_more, self.spare) < DEMANDED)
+        ratio = (gain / n_additional) / (self.squares / self.spare)
+        return bool(f_sf(ratio, n_additional, self.spare) < DEMANDED)
 
 
 class _PlacementSquares(NormSquares):
@@ -189,32 +189,34 @@ def placements_demand(
         As for `fit_placements`.
 
     """
-    of_free = fit_placements(free, free.nominal, poses, up=up, used=used)
-    of_held = fit_placements(held, held.nominal, poses, up=up, used=used)
-    if of_free.spare <= FEWEST_SPARE or not of_free.demands(of_held):
+    free_fit = fit_placements(free, free.nominal, poses, up=up, used=used)
+    held_fit = fit_placements(held, held.nominal, poses, up=up, used=used)
+    if free_fit.spare <= FEWEST_SPARE or not free_fit.demands(held_fit):
         return False
-    # A wrong placement imitates cross terms: none of them decides.
+    # One wrong placement imitates cross terms: the result must not depend on any single one.
     placement = np.searchsorted(placements(up), np.arange(len(up)), side='right')
     for omitted in np.unique(placement[used]):
         kept = used & (placement != omitted)
-        without_free = fit_placements(free, of_free.values, poses, up=up, used=kept)
-        without_held = fit_placements(held, of_held.values, poses, up=up, used=kept)
-        if not without_free.demands(without_held):
+        free_without = fit_placements(free, free_fit.values, poses, up=up, used=kept)
+        held_without = fit_placements(held, held_fit.values, poses, up=up, used=kept)
+        if not free_without.demands(held_without):
             return False
     return True
 
 
 def turns_between(up: np.ndarray, turns: Sequence[TurnData]) -> list[TurnData]:
     """Return the turns between different attitudes, which test the angles between axes."""
-    least = np.cos(ATTITUDES_APART)
-    return [
-        turn for turn in turns if turn.rotation is None and up[turn.first] @ up[turn.last] < least
-    ]
+    largest_cosine = np.cos(ATTITUDES_APART)
+    testing_turns = []
+    for turn in turns:
+        if turn.rotation is None and up[turn.first] @ up[turn.last] < largest_cosine:
+            testing_turns.append(turn)
+    return testing_turns
 
 
 def contradicted_by_turns(free: np.ndarray, held: np.ndarray) -> bool:
     """
-    Return whether turns contradict the cross terms.
+    Return whether turns contradict the cross terms: ``n log(mean square)`` is larger with them.
 
     Parameters
     ----------
@@ -222,4 +224,5 @@ def contradicted_by_turns(free: np.ndarray, held: np.ndarray) -> bool:
         Angle errors of the turns with estimated cross terms, and with cross terms at their prior.
 
     """
-    return bool(len(free) * np.log(np.mean(free**2) / np.mean(held**2)) > TURNS_CONTRADICT)
+    increase = len(free) * np.log(np.mean(free**2) / np.mean(held**2))
+    return bool(increase > TURNS_CONTRADICT)
