@@ -23,7 +23,7 @@ class BiasMovement:
     """The smooth course of one sensor's bias over the poses."""
 
     course: np.ndarray
-    """Departure from its mean in each pose, shape (k, 3), m/s^2 or rad/s."""
+    """Departure of the bias from its mean in each pose, shape (k, 3), m/s^2 or rad/s."""
     growth: np.ndarray
     """
     Factor by which the sds of the sensor's bias and matrix grow when the drift is estimated too,
@@ -32,106 +32,142 @@ class BiasMovement:
 
     @property
     def size(self) -> np.ndarray:
-        """Largest minus smallest on each axis, shape (3,)."""
+        """Largest minus smallest departure on each axis, shape (3,)."""
         return np.ptp(self.course, axis=0)
 
 
 def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[str, BiasMovement]:
     """
-    Return sensor -> `BiasMovement` of the biases that move.
+    Return sensor -> `BiasMovement` of the biases that drift significantly.
 
-    They move beyond the scatter from pose to pose (F test of a parabola in time).
+    The drift is a parabola in time, tested against the scatter from pose to pose (F test).
     """
     if not np.ptp(poses.time) > 0:
         return {}
     time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
-    residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
-    true = model.compensate(values, poses.force, np.zeros_like(poses.force), **poses.conditions)[0]
-    turning = model.rate_rows(values, true, poses.rate, **poses.conditions)[0]
+    movements = {}
+
+    norm_residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
     base = columns[:, model.base_index('accelerometer')]
-    found = {
-        'accelerometer': _of_norms(time, residual, base),
-        'gyroscope': _of_rates(time, turning),
-    }
-    return {sensor: movement for sensor, movement in found.items() if movement is not None}
+    of_accelerometer = _movement_of_norms(time, norm_residual, base)
+    if of_accelerometer is not None:
+        movements['accelerometer'] = of_accelerometer
+
+    at_rest = np.zeros_like(poses.force)
+    true_force, _ = model.compensate(values, poses.force, at_rest, **poses.conditions)
+    rate_residual, _ = model.rate_rows(values, true_force, poses.rate, **poses.conditions)
+    of_gyroscope = _movement_of_rates(time, rate_residual)
+    if of_gyroscope is not None:
+        movements['gyroscope'] = of_gyroscope
+    return movements
 
 
-def _powers(time: np.ndarray, count: int) -> np.ndarray:
-    """Return time and, with enough poses, its square, without their means, shape (k, 1 or 2)."""
+def _powers(time: np.ndarray, freedom: int) -> np.ndarray:
+    """
+    Return time and, with enough degrees of freedom, its square, less their means, (k, 1 or 2).
+    """
     powers = time[:, None]
-    if count >= 2 * MIN_DRIFT_FREEDOM:
+    if freedom >= 2 * MIN_DRIFT_FREEDOM:
         powers = np.column_stack([time, time**2])
     return powers - powers.mean(axis=0)
 
 
-def _of_norms(time: np.ndarray, residual: np.ndarray, base: np.ndarray) -> BiasMovement | None:
+def _movement_of_norms(
+    time: np.ndarray, residual: np.ndarray, base: np.ndarray
+) -> BiasMovement | None:
     """
     Return the drift of the accelerometer's bias, or None where it is not significant.
 
     Only its component along gravity is observable in a pose: a column of the drift is that of the
     bias times a power of time.
+
+    Parameters
+    ----------
+    time : array, shape (k,)
+        Times of the poses, in units of the time from the first to the last.
+    residual : array, shape (k,)
+        ``|true force| - gravity``, m/s^2.
+    base : array, shape (k, n_base)
+        Columns of bias (first three) and matrix.
+
     """
     n_base = base.shape[1]
     powers = _powers(time, len(time) - n_base - 3)
-    both = np.hstack([base, *(power[:, None] * base[:, 0:3] for power in powers.T)])
+    drift_columns = [power[:, None] * base[:, 0:3] for power in powers.T]
+    columns = np.hstack([base, *drift_columns])
 
     # F test of the drift, on the columns that are independent.
-    known = orthonormal_basis(base)
-    new = orthonormal_basis(both)
-    spare = len(time) - new.shape[1]
-    square_before = np.sum((residual - known @ (known.T @ residual)) ** 2)
-    square_after = np.sum((residual - new @ (new.T @ residual)) ** 2)
-    n_added = new.shape[1] - known.shape[1]
-    if spare < MIN_DRIFT_FREEDOM or not _shown(square_before, square_after, n_added, spare):
+    basis_before = orthonormal_basis(base)
+    basis_after = orthonormal_basis(columns)
+    spare = len(time) - basis_after.shape[1]
+    square_before = np.sum((residual - basis_before @ (basis_before.T @ residual)) ** 2)
+    square_after = np.sum((residual - basis_after @ (basis_after.T @ residual)) ** 2)
+    n_added = basis_after.shape[1] - basis_before.shape[1]
+    if spare < MIN_DRIFT_FREEDOM:
+        return None
+    if not _is_significant(square_before, square_after, n_added, spare):
         return None
 
-    # Growth of the sds by the columns that are estimated besides.
-    fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][n_base:].reshape(-1, 3)
+    # Growth of the sds of bias and matrix when the drift is estimated too.
+    drift = np.linalg.lstsq(columns, residual, rcond=1e-9)[0][n_base:].reshape(-1, 3)
     variance_before = np.diag(np.linalg.pinv(base.T @ base))
-    variance_after = np.diag(np.linalg.pinv(both.T @ both))[:n_base]
+    variance_after = np.diag(np.linalg.pinv(columns.T @ columns))[:n_base]
     growth = variance_after / np.maximum(variance_before, 1e-300)
-    return BiasMovement(powers @ fitted, np.sqrt(np.maximum(growth, 1.0)))
+    return BiasMovement(powers @ drift, np.sqrt(np.maximum(growth, 1.0)))
 
 
-def _of_rates(time: np.ndarray, rates: np.ndarray) -> BiasMovement | None:
-    """Return the drift of the gyroscope's bias, or None where it is not significant."""
+def _movement_of_rates(time: np.ndarray, rates: np.ndarray) -> BiasMovement | None:
+    """
+    Return the drift of the gyroscope's bias, or None where it is not significant.
+
+    `time` as for `_movement_of_norms`; `rates`: residual rates at rest, rad/s, shape (k, 3).
+    """
     powers = _powers(time, len(time))
     spare = 3 * (len(time) - 1 - powers.shape[1])
     if spare < 3 * MIN_DRIFT_FREEDOM:
         return None
     rates = rates - rates.mean(axis=0)
     course = powers @ np.linalg.lstsq(powers, rates, rcond=None)[0]
-    scale = np.mean((rates - course) ** 2, axis=0) + 1e-300
-    square_before = np.sum(rates**2 / scale)
-    square_after = np.sum((rates - course) ** 2 / scale)
-    if not _shown(square_before, square_after, 3 * powers.shape[1], spare):
+    variance = np.mean((rates - course) ** 2, axis=0) + 1e-300
+    square_before = np.sum(rates**2 / variance)
+    square_after = np.sum((rates - course) ** 2 / variance)
+    if not _is_significant(square_before, square_after, 3 * powers.shape[1], spare):
         return None
+    # Drift and matrix are estimated from different data, rests and turns: no sd grows.
     return BiasMovement(course, np.ones(12))
 
 
-def _shown(before: float, after: float, added: int, spare: int) -> bool:
-    """Return whether the fall of a sum of squares by `added` columns is significant (F test)."""
-    ratio = (before - after) / max(added, 1) / max(after / spare, 1e-300)
-    return bool(added > 0 and fdtrc(added, spare, max(ratio, 0.0)) < DRIFT_P_VALUE)
+def _is_significant(square_before: float, square_after: float, n_added: int, spare: int) -> bool:
+    """
+    Return whether the decrease of a sum of squares by `n_added` columns is significant (F test).
+
+    `spare`: degrees of freedom of the residual with these columns.
+    """
+    ratio = (square_before - square_after) / max(n_added, 1) / max(square_after / spare, 1e-300)
+    return bool(n_added > 0 and fdtrc(n_added, spare, max(ratio, 0.0)) < DRIFT_P_VALUE)
 
 
 def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Poses:
     """
     Return the poses with the accelerometer's bias at its mean.
 
-    The gyroscope's may differ between poses anyway.
+    The gyroscope's bias is estimated in each pose.
     """
-    moved = movements.get('accelerometer')
-    return poses if moved is None else replace(poses, force=poses.force - moved.course)
+    movement = movements.get('accelerometer')
+    if movement is None:
+        return poses
+    return replace(poses, force=poses.force - movement.course)
 
 
 def with_movement(
     covariance: np.ndarray, model: HandModel, movements: Mapping[str, BiasMovement]
 ) -> np.ndarray:
     """
-    Return the covariance with the drift.
+    Return the covariance (n, n) of the parameters when the biases drift.
 
-    The bias at any time of the recording is within one sd of the reported mean.
+    The sds of a drifting sensor grow (`BiasMovement.growth`). Half the size of the drift is added
+    to the covariance of the bias as an sd, so that the bias at any time of the recording is within
+    one sd of the reported mean.
     """
     grown = covariance.copy()
     for sensor, movement in movements.items():

@@ -55,45 +55,51 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
         time.
 
     """
+    # Columns of the bias: a parabola, or with few poses a line, and the temperature.
     count = len(poses.force)
     time = (poses.time - poses.time.mean()) / max(np.ptp(poses.time), 1e-9)
-    course = np.column_stack([np.ones(count), time, time**2][: 3 if count >= 12 else 2])
-    if poses.temperature_c is not None and np.ptp(poses.temperature_c) > 0:
-        course = np.column_stack(
-            [
-                course,
-                (poses.temperature_c - poses.temperature_c.mean()) / np.ptp(poses.temperature_c),
-            ]
-        )
-    full = np.column_stack([course, poses.force / np.linalg.norm(poses.force, axis=1).mean()])
-    if count < full.shape[1] + MIN_PROCESS_FREEDOM:
+    bias_columns = [np.ones(count), time, time**2][: 3 if count >= 12 else 2]
+    temperature_c = poses.temperature_c
+    if temperature_c is not None and np.ptp(temperature_c) > 0:
+        bias_columns.append((temperature_c - temperature_c.mean()) / np.ptp(temperature_c))
+    bias_design = np.column_stack(bias_columns)
+
+    # Columns of the sensitivity: the force in units of its mean length.
+    up = poses.force / np.linalg.norm(poses.force, axis=1).mean()
+    full_design = np.column_stack([bias_design, up])
+    if count < full_design.shape[1] + MIN_PROCESS_FREEDOM:
         return dict(NO_EVIDENCE)
-    up = full[:, course.shape[1] :]
-    first = course.shape[1]
-    upwards = np.trace(np.linalg.lstsq(full, poses.rate, rcond=None)[0][first:]) / 3
-    rate = poses.rate - np.clip(upwards, -EARTH_RATE, EARTH_RATE) * up
-    apart = np.abs(time[:, None] - time)
-    candidates = (
-        (1 - share) * np.eye(count) + share * np.exp(-apart / tau)
-        for share, tau in product(SHARES, RELATIVE_TIMES)
-    )
-    covariance = min(candidates, key=lambda candidate: _loss(candidate, full, rate))
-    (least, kept_out), (rest, rest_out) = (
-        _left(covariance, design, rate) for design in (full, course)
-    )
-    dof = count - full.shape[1] - CHOSEN
-    scale = least / dof + 1e-300
-    ratio = float(np.mean((rest - least) / 3 / scale))
-    heldout = np.sqrt(np.sum(kept_out**2 / scale) / max(np.sum(rest_out**2 / scale), 1e-300))
+
+    # The Earth's rate is an equal response of every axis to the force along it.
+    response = np.linalg.lstsq(full_design, poses.rate, rcond=None)[0][bias_design.shape[1] :]
+    mean_response = np.trace(response) / 3
+    earth_rate = np.clip(mean_response, -EARTH_RATE, EARTH_RATE)
+    rate = poses.rate - earth_rate * up
+
+    # Covariance of the errors with the likeliest bias process.
+    elapsed = np.abs(time[:, None] - time)
+    candidates = []
+    for share, tau in product(SHARES, RELATIVE_TIMES):
+        candidates.append((1 - share) * np.eye(count) + share * np.exp(-elapsed / tau))
+    covariance = min(candidates, key=lambda candidate: _loss(candidate, full_design, rate))
+
+    # F test of nine sensitivities, three on each axis, and errors of poses held out.
+    full_squares, full_heldout = _squares_and_heldout(covariance, full_design, rate)
+    bias_squares, bias_heldout = _squares_and_heldout(covariance, bias_design, rate)
+    dof = count - full_design.shape[1] - CHOSEN
+    variance = full_squares / dof + 1e-300
+    ratio = float(np.mean((bias_squares - full_squares) / 3 / variance))
+    full_loss = np.sum(full_heldout**2 / variance)
+    bias_loss = np.sum(bias_heldout**2 / variance)
     return {
         'g_sensitivity_p_value': float(fdtrc(9, 3 * dof, max(ratio, 0.0))),
-        'g_sensitivity_heldout_ratio': float(heldout),
+        'g_sensitivity_heldout_ratio': float(np.sqrt(full_loss / max(bias_loss, 1e-300))),
     }
 
 
 def shown(evidence: dict) -> bool:
     """
-    Return whether the g-sensitivity is significant enough to enter the model without a request.
+    Return whether the `g_sensitivity_evidence` suffices for a g-sensitivity without a request.
     """
     return (
         evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE
@@ -102,29 +108,38 @@ def shown(evidence: dict) -> bool:
 
 
 def _loss(covariance: np.ndarray, design: np.ndarray, values: np.ndarray) -> float:
-    """Return minus twice the restricted log likelihood, with the best scale of each axis."""
+    """
+    Return minus twice the restricted log likelihood, with the best scale of each axis.
+
+    With the covariance C (k, k), the design A (k, p), the values y (k, 3) and their residuals r::
+
+        sum over axes of  (k - p) log(r' C^-1 r) + log |C| + log |A' C^-1 A|
+    """
+    n_columns = design.shape[1]
     factor = np.linalg.cholesky(covariance)
     white = scipy.linalg.solve_triangular(factor, np.hstack([design, values]), lower=True)
-    orthogonal, triangle = np.linalg.qr(white[:, : design.shape[1]])
-    rest = white[:, design.shape[1] :] - orthogonal @ (orthogonal.T @ white[:, design.shape[1] :])
-    spare = len(values) - design.shape[1]
-    logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(np.abs(np.diag(triangle))).sum()
-    return spare * np.log((rest**2).sum(axis=0) + 1e-300).sum() + values.shape[1] * logs
+    basis, triangle = np.linalg.qr(white[:, :n_columns])
+    residual = white[:, n_columns:] - basis @ (basis.T @ white[:, n_columns:])
+    spare = len(values) - n_columns
+    log_determinants = (
+        2 * np.log(np.diag(factor)).sum() + 2 * np.log(np.abs(np.diag(triangle))).sum()
+    )
+    log_squares = np.log((residual**2).sum(axis=0) + 1e-300).sum()
+    return spare * log_squares + values.shape[1] * log_determinants
 
 
-def _left(
+def _squares_and_heldout(
     covariance: np.ndarray, design: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the weighted residual sum of squares of a fit.
+    Return (weighted residual sum of squares, (3,); leave-one-out prediction errors, (k, 3)).
 
-    Shape (3,), and the leave-one-out prediction errors, shape (k, 3).
+    With the covariance C, the design A and the values y, they are ``y' P y`` and ``P y / diag(P)``
+    with ``P = C^-1 - C^-1 A (A' C^-1 A)^-1 A' C^-1``.
     """
     inverse = np.linalg.inv(covariance)
     weighted = inverse @ design
     projector = inverse - weighted @ np.linalg.solve(design.T @ weighted, weighted.T)
-    left = projector @ values
-    return (
-        np.einsum('ki,ki->i', values, left),
-        left / np.maximum(np.diag(projector), 1e-300)[:, None],
-    )
+    weighted_residual = projector @ values
+    squares = np.einsum('ki,ki->i', values, weighted_residual)
+    return squares, weighted_residual / np.maximum(np.diag(projector), 1e-300)[:, None]
