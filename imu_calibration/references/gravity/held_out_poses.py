@@ -108,7 +108,11 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         *,
         least_turns: int = 0,
     ) -> 'HeldOutPoses':
-        """Return the poses with the parameters of a solution without each part."""
+        """
+        Return the poses, with the parameters of a solution estimated without each part.
+
+        `masks` are True for the poses of each part, each of shape (n_poses,).
+        """
         without = values_without(hand, turns, masks)
         folds = applied_folds(hand, without, uncorrected_by_hand(hand).centre)
         return cls(hand, folds, masks, turns, least_turns)
@@ -117,27 +121,28 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
     def parts(self) -> list[HeldOutPart]:
         """The poses and turns that are evaluated, of each mask."""
         hand = self.solution
+        # Evaluated are poses after the effects that settle have settled.
         latest = latest_settling(hand.model, hand.values, hand.sd)
-        is_late = hand.poses.time >= judged_from_of(latest, end_by_hand(hand.poses))
+        is_settled = hand.poses.time >= judged_from_of(latest, end_by_hand(hand.poses))
         parts = []
         for out in self.masks:
             turns = []
             for turn in self.turns:
                 is_held_out = out[turn.first] or out[turn.last]
-                if turn.rotation is None and is_held_out and is_late[turn.first]:
+                if turn.rotation is None and is_held_out and is_settled[turn.first]:
                     turns.append(turn)
             if len(self.turns) - len(turns) < self.least_turns:
                 turns = []
-            parts.append(HeldOutPart(out & is_late, turns))
+            parts.append(HeldOutPart(out & is_settled, turns))
         return parts
 
     @cached_property
     def judged(self) -> dict[str, JudgedData]:
         """Sensor -> its poses or turns, each a block."""
-        found = {}
+        judged = {}
         n_poses = sum(int(part.judged.sum()) for part in self.parts)
         if n_poses:
-            found['accelerometer'] = JudgedData(
+            judged['accelerometer'] = JudgedData(
                 np.ones((n_poses, 1)),
                 UNITS['accelerometer'],
                 n_poses,
@@ -148,11 +153,15 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
             )
         n_turns = sum(len(part.turns) for part in self.parts)
         if n_turns >= TURNS_LEAST:
-            found['gyroscope'] = JudgedData(np.ones((n_turns, 1)), TURN_ANGLE_UNIT, n_turns, 1)
-        return found
+            judged['gyroscope'] = JudgedData(np.ones((n_turns, 1)), TURN_ANGLE_UNIT, n_turns, 1)
+        return judged
 
     def errors(self, sensor: str, folds: Sequence[np.ndarray]) -> HeldOutErrors:
-        """Return the errors of lengths, or of turns with the directions of the accelerometer."""
+        """
+        Return the errors of a sensor in each pose or turn, with the parameters of its fold.
+
+        They are `norm_errors` of the accelerometer, `turn_errors` of the gyroscope.
+        """
         errors = []
         for part, values in zip(self.parts, folds, strict=True):
             if sensor == 'accelerometer':
@@ -172,7 +181,7 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         return [np.where(of_sensor, nominal, values) for values in folds]
 
     def plain_equations(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEquations]:
-        """Yield the equations of a sensor."""
+        """Yield the equations of a sensor; `applied` has the parameters of the accelerometer."""
         hand = self.solution
         plan = plan_of(hand, sensor, hand.prior_mean)
         plan = replace(plan, fitted=plan.fitted & ~hand.hand_model.fixed)
@@ -185,10 +194,10 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         self, sensor: str, estimate: PlainEstimate, applied: np.ndarray
     ) -> Iterator[PlainFit]:
         """
-        Yield the errors on parts of the session.
+        Yield the plain fit of a sensor, with the errors on parts of the session held out in turn.
 
-        Its first and last part are predicted as another session is: no part of the same drift lies
-        on their other side.
+        The first and the last part are predicted like another session: data of the same drift lie
+        on one side of them only.
         """
         parts = HeldOutPoses.of(self.solution, self.turns, _parts_of_time(self.solution))
         if sensor in parts.judged:
@@ -198,7 +207,11 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
 
 
 def norm_errors(hand: HandCalibration, values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return ``|corrected force| - gravity`` of the poses of a mask, m/s^2."""
+    """
+    Return ``|corrected force| - gravity`` of the poses of a mask, m/s^2.
+
+    Readings are corrected with the parameters `values`.
+    """
     poses = hand.poses.select(mask)
     corrected = corrected_with(
         hand.hand_model, values, poses.force, temperature_c=poses.temperature_c
@@ -210,9 +223,10 @@ def values_without(
     hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """
-    Return the parameters without the poses of each mask and the turns that begin or end there.
+    Return the parameters (n,) estimated without the poses of each mask and the turns there.
 
-    One Gauss-Newton step.
+    They are one Gauss-Newton step from the solution. `folds`: True for the held-out poses, each of
+    shape (n_poses,).
     """
     model = hand.hand_model
     system = GravityRows(model, hand.used_poses, turns).linearise(
@@ -221,25 +235,28 @@ def values_without(
     scatter = np.array([hand.statistics[f'{name}_scatter_sd'] ** 2 for name in COMPONENTS])
     free = ~hand.held & ~model.fixed
     rows = flat(system.of_parameters(free).with_scatter(scatter).white())
-    prior = np.column_stack(
-        [np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors]
-    )[free][:, np.append(free, True)]
-    found = []
+
+    # Rows ``[columns | residual]`` of the priors of the free parameters.
+    prior_columns = np.diag(1.0 / model.priors)
+    prior_residual = (model.nominal - hand.values) / model.priors
+    prior = np.column_stack([prior_columns, prior_residual])[free][:, np.append(free, True)]
+
+    values_of_folds = []
     for out in folds:
         # Sums of biases have the group n_poses, which is never held out.
-        left_out = np.append(out, False)
-        is_out = left_out[system.group] | left_out[system.end_group]
+        is_held_out = np.append(out, False)
+        is_out = is_held_out[system.group] | is_held_out[system.end_group]
         factor = triangular_of_band(rows[~is_out])[system.n_nuisances :, system.n_nuisances :]
         kept = np.concatenate([factor, prior])
-        found.append(after_one_step(hand.values, kept[:, :-1], kept[:, -1], free=free))
-    return found
+        values_of_folds.append(after_one_step(hand.values, kept[:, :-1], kept[:, -1], free=free))
+    return values_of_folds
 
 
 def folds_by_hand(poses: Poses) -> list[np.ndarray]:
     """
-    Return masks of the poses to hold out in turn.
+    Return masks of the poses to hold out in turn, each of shape (n_poses,).
 
-    An eighth of them, or with few attitudes one pose; none with too few.
+    Each has an eighth of the poses, or with few attitudes one pose; no mask with too few attitudes.
     """
     n_poses = len(poses)
     for count, least in ((HAND_PROOF_FOLDS, ATTITUDES_LEAST), (n_poses, FEW_ATTITUDES)):
@@ -274,9 +291,9 @@ def corrected_with(
     temperature_c: np.ndarray | None = None,
 ) -> Corrected:
     """
-    Return readings corrected as by compensation with the parameters `values` of `model`.
+    Return readings (n, 3) corrected as by compensation with the parameters `values` of `model`.
 
-    Shape (n, 3); without `rate` at rest.
+    Without `rate` the sensor is at rest.
     """
     rate = np.zeros_like(force) if rate is None else rate
     known = Calibration(
@@ -290,7 +307,7 @@ def corrected_with(
 def turn_errors(
     model: HandModel, values: np.ndarray, poses: Poses, *, turns: Sequence[TurnData]
 ) -> np.ndarray:
-    """Return the angle errors of turns, rad."""
+    """Return `turn_error` of each turn with the parameters `values`, rad, shape (n_turns,)."""
     true = corrected_with(model, values, poses.force, temperature_c=poses.temperature_c).force
     up = unit_rows(true)
     errors = []
@@ -343,11 +360,12 @@ class _Lengths(PlainEquations):
     hand: HandCalibration
 
     def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        """Return the parameters after a step with some of the poses."""
-        free, poses = self.plan.fitted, self.hand.poses
-        # the rows are minus the derivative of the errors
-        errors, rows = self.hand.hand_model.norm_rows(values, poses.force, **poses.conditions)
-        return after_one_step(values, rows[kept][:, free], errors[kept], free=free)
+        """Return the parameters after a Gauss-Newton step with the poses of the mask `kept`."""
+        free = self.plan.fitted
+        poses = self.hand.poses
+        # The columns are minus the derivative of the errors.
+        errors, columns = self.hand.hand_model.norm_rows(values, poses.force, **poses.conditions)
+        return after_one_step(values, columns[kept][:, free], errors[kept], free=free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,15 +379,20 @@ class _Turns(PlainEquations):
     """Parameters of which those of the accelerometer determine the directions, shape (n,)."""
 
     def moved(self, values: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        """Return the parameters after a step with some of the poses, and the turns between them."""
+        """
+        Return the parameters estimated from the poses of the mask `kept` and the turns between.
+
+        The bias is the mean rate at rest, the matrix a Gauss-Newton step with the turns.
+        """
         hand = self.hand
         model = self.hand.hand_model
         fitted = self.plan.fitted
-        bias = np.zeros(len(values), bool)
-        bias[model.gyro_bias] = True
+        is_bias = np.zeros(len(values), bool)
+        is_bias[model.gyro_bias] = True
         moved = values.copy()
-        moved[bias & fitted] = hand.poses.rate[kept].mean(axis=0)[fitted[model.gyro_bias]]
+        moved[is_bias & fitted] = hand.poses.rate[kept].mean(axis=0)[fitted[model.gyro_bias]]
 
+        # Two equations for each turn, with the directions of the corrected accelerometer.
         force = corrected_with(
             model, self.reference, hand.poses.force, temperature_c=hand.poses.temperature_c
         ).force
@@ -380,6 +403,6 @@ class _Turns(PlainEquations):
                 used.append(turn)
         rows = GravityRows(model, hand.poses, used).linearise(state)
         of_turns = rows.component == COMPONENTS.index('turn')
-        free = fitted & ~bias
+        free = fitted & ~is_bias
         design = rows.columns[of_turns][:, free]
         return after_one_step(moved, design, rows.residual[of_turns], free=free)

@@ -19,15 +19,20 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 
 @dataclass(frozen=True, eq=False)
 class SearchParameters:
-    """Parameters of the rows: those of the baseline, then one run per column set."""
+    """
+    The q parameters of the rows.
+
+    They are those of the baseline, the Earth's rate about the vertical, and those of each effect
+    under test, of a warm-up for each time constant.
+    """
 
     parts: dict[str, slice]
     """
-    Label of each run of columns (effect name, for a warm-up with the number of its time constant)
-    -> its parameters.
+    Label of an effect under test (its name, for a warm-up with the number of its time constant) ->
+    its parameters.
     """
     prior_sd: np.ndarray
-    """Shape (q,); wide for the baseline, which is linearised at its own solution."""
+    """Prior sds, shape (q,); wide for the baseline, which is linearised at its own solution."""
 
     @property
     def size(self) -> int:
@@ -43,9 +48,7 @@ def build_rows(
     constants: np.ndarray,
 ) -> tuple[list[Rows], SearchParameters]:
     """
-    Return the rows at rest and of turns, and their parameters.
-
-    After those of the baseline the Earth's rate about the vertical is a parameter.
+    Return (blocks of rows: norms at rest, rates at rest, turns; their parameters).
 
     Parameters
     ----------
@@ -68,13 +71,13 @@ def build_rows(
 
     # Places of the parameters: baseline, Earth's rate, runs.
     parts = {}
-    widths = [FREE_SD_FACTOR * hand.hand_model.priors, np.array([EARTH_UPWARDS_SD])]
+    prior_sds = [FREE_SD_FACTOR * hand.hand_model.priors, np.array([EARTH_UPWARDS_SD])]
     start = hand.hand_model.size + 1
     for run in runs:
         parts[run.label] = slice(start, start + run.size)
-        widths.append(run.effect.prior_sds()[: run.size])
+        prior_sds.append(run.effect.prior_sds()[: run.size])
         start += run.size
-    space = SearchParameters(parts, np.concatenate(widths))
+    space = SearchParameters(parts, np.concatenate(prior_sds))
 
     # Columns at rest in the poses.
     true = hand.gravity * hand.state.up
@@ -97,13 +100,14 @@ def build_rows(
         _norm_block(hand, space, at_rest['accelerometer']),
         _rest_block(hand, space, at_rest['gyroscope']),
     ]
-    between = gravity_turns(turns)
-    if between:
+    turns_between_poses = gravity_turns(turns)
+    if turns_between_poses:
+        # A turn is short against the time constant of a warm-up.
         moving = []
         for run in runs:
             if run.effect.sensor == 'gyroscope' and run.time_constant is None:
                 moving.append(run.effect)
-        blocks.append(_turn_block(hand, between, space, at_rest['gyroscope'], moving))
+        blocks.append(_turn_block(hand, turns_between_poses, space, at_rest['gyroscope'], moving))
     return blocks, space
 
 
@@ -143,46 +147,52 @@ def _columns(
     temperature_c: np.ndarray | None,
 ) -> np.ndarray:
     """
-    Return the contribution of the effect's parameters to its sensor's output.
+    Return the derivative of a sensor's output by the parameters of an effect, shape (m, 3, p).
 
-    Shape (m, 3, p), at the baseline's solution.
+    It is computed at the baseline's solution, for true forces and rates of shape (m, 3); `tau`: the
+    time constant of a warm-up, s.
     """
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     sensors = replace(hand.model, accelerometer=BASE, gyroscope=BASE, point=point)
     sensors = sensors.with_effect(effect.sensor, effect.name)
     model = HandModel(sensors, hand.gravity)
     values = model.model.start_from(hand.model, hand.values)
-    return model.further(
+    _, columns = model.further(
         effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c
-    )[1]
+    )
+    return columns
 
 
-def _natural(poses: Poses, sensor: str) -> np.ndarray:
-    """Return the variance of the usual bias drift, shape (3,)."""
+def _natural_variance(poses: Poses, sensor: str) -> np.ndarray:
+    """Return the variance of the usual bias drift (`NATURAL`), shape (3,)."""
     return NATURAL**2 * poses.noise[sensor].white_variance * poses.period
 
 
 def _norm_block(
     hand: HandCalibration, space: SearchParameters, at_rest: Mapping[str, np.ndarray]
 ) -> Rows:
-    """One row per pose: ``|true force| - gravity``."""
+    """
+    Return one row per pose: ``|true force| - gravity``.
+
+    `at_rest`: label of an effect -> derivative of the reading in each pose, shape (k, 3, p).
+    """
     poses = hand.poses
     count = len(poses)
     residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
-    # The derivative of the norm by the reading, as by the bias.
-    back = base[:, 0:3]
+    # The derivative of the norm by the reading is, but for the sign, the column of the bias.
+    by_reading = base[:, 0:3]
     rows = np.zeros((count, space.size + 1))
     rows[:, : base.shape[1]] = base
     rows[:, -1] = residual
     for label, columns in at_rest.items():
-        rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
-    known = np.sum((back * poses.force_sem) ** 2, axis=1)
-    drift = back**2 @ _natural(poses, 'accelerometer')
+        rows[:, space.parts[label]] = np.einsum('ki,kip->kp', by_reading, columns)
+    variance = np.sum((by_reading * poses.force_sem) ** 2, axis=1)
+    drift = by_reading**2 @ _natural_variance(poses, 'accelerometer')
     return Rows(
         name='poses',
         sensor='accelerometer',
         equations=rows[:, None],
-        variance=known[:, None],
+        variance=variance[:, None],
         drift=drift[:, None],
         group=np.arange(count),
         time=poses.time,
@@ -192,7 +202,11 @@ def _norm_block(
 def _rest_block(
     hand: HandCalibration, space: SearchParameters, at_rest: Mapping[str, np.ndarray]
 ) -> Rows:
-    """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
+    """
+    Return three rows per pose: the rate at rest, with the Earth's rate about the vertical.
+
+    `at_rest` as for `_norm_block`.
+    """
     poses = hand.poses
     count = len(poses)
     residual, base = hand.rate_rows()
@@ -208,7 +222,7 @@ def _rest_block(
         sensor='gyroscope',
         equations=rows,
         variance=poses.rate_sem**2,
-        drift=np.tile(_natural(poses, 'gyroscope'), (count, 1)),
+        drift=np.tile(_natural_variance(poses, 'gyroscope'), (count, 1)),
         group=np.arange(count),
         time=poses.time,
     )
@@ -222,21 +236,22 @@ def _turn_block(
     moving: Sequence[Effect],
 ) -> Rows:
     """
-    Two rows per turn.
+    Return two rows per turn, rad/s: the error of rotated gravity over the duration T of the turn.
 
-    The direction after it against the direction before it rotated by the rates, over the turn's
-    duration.
+    With the directions u of the poses i and j and the tangents of u_j::
+
+        residual = -tangent' mat_ji u_i / T
 
     The bias in a turn is the mean of the rates at rest before and after it, which removes its
-    drift; the contributions of further effects at rest are removed with it. The variance of a row
-    is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the integrated rates, rad^2, the
-    duration T and the standard errors s of the two means.
+    drift; the contributions of the effects `moving` at rest (`at_rest`) are removed with it. The
+    variance of a row is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the integrated rates,
+    rad^2, and the standard errors s of the two means.
     """
     bias_f, matrix_f = hand.accelerometer
     matrix = hand.gyroscope[1]
     across = tangent(hand.state.up)
     rows = []
-    known = []
+    variances = []
     durations = []
     for turn in turns:
         # True inputs during the turn, and the columns of further effects less those at rest.
@@ -247,37 +262,38 @@ def _turn_block(
         further = [np.zeros((len(force), 3, 0))]
         for effect in moving:
             columns = _columns(hand, effect, None, force, rate, turn.time, turn.temperature_c)
-            own = at_rest[effect.name]
-            further.append(columns - 0.5 * (own[i] + own[j]))
+            columns_at_rest = at_rest[effect.name]
+            further.append(columns - 0.5 * (columns_at_rest[i] + columns_at_rest[j]))
 
         # The direction carried through the turn, and its derivative by a rotation psi.
-        found = integrate_turn(
+        integrated = integrate_turn(
             turn.time,
             turn.rate,
             bias=bias,
             matrix=matrix,
             further=(np.zeros_like(force), np.concatenate(further, axis=2)),
         )
-        carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
-        by_psi = across[j].T @ skew(carried) / found.duration
+        duration = integrated.duration
+        carried = between_middles(hand.poses, turn, integrated.mat_ji) @ hand.state.up[i]
+        by_psi = across[j].T @ skew(carried) / duration
 
         row = np.zeros((2, space.size + 1))
-        row[:, hand.hand_model.gyro_matrix] = by_psi @ found.by_matrix.reshape(3, 9)
+        row[:, hand.hand_model.gyro_matrix] = by_psi @ integrated.by_matrix.reshape(3, 9)
         start = 0
         for effect in moving:
             end = start + effect.size
-            row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, start:end]
+            row[:, space.parts[effect.name]] = by_psi @ integrated.by_further[:, start:end]
             start = end
-        row[:, -1] = -across[j].T @ carried / found.duration
+        row[:, -1] = -across[j].T @ carried / duration
         rows.append(row)
-        durations.append(found.duration)
-        of_bias = 0.25 * np.mean(hand.poses.rate_sem[[i, j]] ** 2, axis=1).sum()
-        known.append(np.full(2, turn.noise_variance / found.duration**2 + of_bias))
+        durations.append(duration)
+        bias_variance = 0.25 * np.mean(hand.poses.rate_sem[[i, j]] ** 2, axis=1).sum()
+        variances.append(np.full(2, turn.noise_variance / duration**2 + bias_variance))
     return Rows(
         name='turns',
         sensor='gyroscope',
         equations=np.array(rows),
-        variance=np.array(known),
+        variance=np.array(variances),
         group=np.array([turn.first for turn in turns]),
         time=np.array([turn.time.mean() for turn in turns]),
         duration=np.array(durations),
