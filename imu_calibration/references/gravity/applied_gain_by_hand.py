@@ -21,56 +21,58 @@ from imu_calibration.selection.questions import Question
 
 
 def gain_by_hand(
-    found: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str
+    search: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str
 ) -> Gain:
     """
-    Return the Gain of the findings `after` over the findings `before`.
-
-    The gain is that on the held-out poses and turns.
+    Return the Gain of the findings `after` over the findings `before` on held-out poses and turns.
 
     The errors are those of `HeldOutPoses` and, at rest, the corrected rate less that of
     the Earth about the vertical. Choice and estimate of each side exclude the poses; if no
     additional finding can be compensated, the residual is that of the model.
     """
-    compensated = compensated_findings(found, before, after)
+    compensated = compensated_findings(search, before, after)
     if compensated is None:
-        return found.problem.gain(found.held_out, before, after, sensor=sensor)
+        return search.problem.gain(search.held_out, before, after, sensor=sensor)
 
     # The rows in which the difference of the two choices is clearest.
-    block = found.problem.clearest(compensated.before, compensated.after, sensor)
-    poses = found.baseline.poses
+    block = search.problem.clearest(compensated.before, compensated.after, sensor)
+    poses = search.baseline.poses
     end = end_by_hand(poses)
     n_columns = 1 if block.duration is not None else block.variance.shape[1]
     errors_before = np.zeros((len(block.group), n_columns))
     errors_after = np.zeros((len(block.group), n_columns))
 
     # Each part of the recording is predicted by a fit to the other parts.
-    start = 0.0
-    for part in found.held_out:
-        rows = np.isin(block.group, part.groups)
+    settled_from = 0.0
+    for part in search.held_out:
+        is_held_out = np.isin(block.group, part.groups)
         for errors, chosen in (
             (errors_before, compensated.before),
             (errors_after, compensated.after),
         ):
             additional = part.named_in(chosen)
-            model, values, earth = found.extended(part.problem, additional)
-            moved = model.model.at(values)
-            latest = latest_settling(
-                moved, values, sd_of_chosen(part.problem.search, moved, additional)
+            model, values, earth = search.extended(part.problem, additional)
+            linearised = model.model.at(values)
+            sd = sd_of_chosen(part.problem.search, linearised, additional)
+            latest = latest_settling(linearised, values, sd)
+            settled_from = max(settled_from, judged_from_of(latest, end))
+
+            # Compensation replaces effects in time by a constant.
+            uncorrected = uncorrected_in_time(
+                linearised, values, poses.time, end=end, latest=latest
             )
-            start = max(start, judged_from_of(latest, end))
-            uncorrected = uncorrected_in_time(moved, values, poses.time, end=end, latest=latest)
-            applied = applied_values(moved, values, uncorrected.centre)
-            errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, applied, earth)
+            applied = applied_values(linearised, values, uncorrected.centre)
+            rows = np.flatnonzero(is_held_out)
+            errors[is_held_out] = _pose_errors(search, block, rows, model, applied, earth)
 
     # Only rows after the effects of both choices have settled.
-    settled = block.time >= start
+    settled = block.time >= settled_from
     pair = [errors_before[settled], errors_after[settled]]
     return gain_of_groups(block.select(settled), pair, APPLIED)
 
 
 def _pose_errors(
-    found: HandInvestigation,
+    search: HandInvestigation,
     block: Rows,
     rows: np.ndarray,
     model: HandModel,
@@ -78,20 +80,21 @@ def _pose_errors(
     earth: float,
 ) -> np.ndarray:
     """
-    Return the errors of some rows of a block after correction.
+    Return the errors of rows of a block after correction with the parameters `values` of a model.
 
-    Of poses m/s^2 or rad/s, of turns the angle over the duration, rad/s.
+    They are those of poses in m/s^2 or rad/s, with the Earth's rate `earth` about the vertical, of
+    turns the angle over the duration in rad/s. `rows`: indices, shape (m,).
     """
-    poses = found.baseline.poses
+    poses = search.baseline.poses
     if block.duration is not None:
-        missed = turn_errors(model, values, poses, turns=[found.turns[row] for row in rows])
-        return (missed / block.duration[rows])[:, None]
-    warm = None if poses.temperature_c is None else poses.temperature_c[rows]
+        angles = turn_errors(model, values, poses, turns=[search.turns[row] for row in rows])
+        return (angles / block.duration[rows])[:, None]
+    temperature_c = None if poses.temperature_c is None else poses.temperature_c[rows]
     corrected = corrected_with(
-        model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=warm
+        model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=temperature_c
     )
     # At rest the force is gravity, and points up: the vertical Earth's rate is along it.
     norm = np.linalg.norm(corrected.force, axis=1, keepdims=True)
     if block.sensor == 'accelerometer':
-        return norm - found.baseline.gravity
+        return norm - search.baseline.gravity
     return corrected.rate - earth * corrected.force / norm

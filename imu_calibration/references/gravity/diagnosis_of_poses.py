@@ -14,81 +14,84 @@ from imu_calibration.selection.gain import Gain
 
 
 def _with_residuals(hand: HandCalibration) -> HandCalibration:
-    """Return the HandCalibration with the rms residual of its poses."""
-    residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': hand.rate_rows()[0]}
+    """Return the HandCalibration with the rms residual of its poses, of each sensor."""
+    rate_residual, _ = hand.rate_rows()
+    norm_rms = np.sqrt(np.mean(hand.norm_residuals() ** 2))
+    rate_rms = np.sqrt(np.mean(rate_residual**2))
     return replace(
         hand,
-        residual_rms={
-            sensor: np.full(2, np.sqrt(np.mean(residual**2)))
-            for sensor, residual in residuals.items()
-        },
+        residual_rms={'accelerometer': np.full(2, norm_rms), 'gyroscope': np.full(2, rate_rms)},
     )
+
+
+def _errors(hand: HandCalibration) -> dict[str, np.ndarray]:
+    """Return sensor -> residual of each pose, (k, 3), of the accelerometer along gravity."""
+    along_gravity = hand.norm_residuals()[:, None] * hand.state.up
+    rate_residual, _ = hand.rate_rows()
+    return {'accelerometer': along_gravity, 'gyroscope': rate_residual}
 
 
 def traces_of_poses(baseline: HandCalibration, hand: HandCalibration) -> Traces:
     """
-    Return the `Traces` of two calibrations.
+    Return the `Traces` of two calibrations, with one point per pose.
 
-    One point per pose, the accelerometer's residual along gravity.
+    The residual of the accelerometer is along gravity.
     """
     poses = hand.poses
-    true = hand.gravity * hand.state.up
-    errors = [
-        {'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': h.rate_rows()[0]}
-        for h in (baseline, hand)
-    ]
     count = len(poses)
     return Traces(
         poses.time,
         np.full(count, 'static'),
         np.zeros((count, 0)),
-        true,
+        hand.gravity * hand.state.up,
         np.zeros((count, 3)),
         poses.temperature_c,
-        errors[0],
-        errors[1],
+        _errors(baseline),
+        _errors(hand),
         (poses.stop - poses.start).astype(float),
-        None,
+        dead_reckoning=None,
     )
 
 
-def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
+def diagnosis_by_hand(search: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     """
     Return the result of an investigation as a Diagnosis, without traces.
 
     `hand` is a calibration with all findings.
     """
-    problem = found.problem
-    named = list(found.named)
-    before = _with_residuals(found.baseline)
+    problem = search.problem
+    named = list(search.named)
+    before = _with_residuals(search.baseline)
     after = _with_residuals(hand)
 
     def gain_of(place: int) -> Gain:
+        """Return the gain of a finding over those before it."""
         return gain_by_hand(
-            found, named[:place], after=named[: place + 1], sensor=named[place].sensor
+            search, named[:place], after=named[: place + 1], sensor=named[place].sensor
         )
 
-    findings = tuple(
-        finding(
-            problem.search,
-            named,
-            place,
-            solution=after,
-            share=problem.explained.share,
-            gain_of=gain_of,
-            motion_of=motions_of,
+    findings = []
+    for place in range(len(named)):
+        findings.append(
+            finding(
+                problem.search,
+                named,
+                place,
+                solution=after,
+                share=problem.explained.share,
+                gain_of=gain_of,
+                motion_of=motions_of,
+            )
         )
-        for place in range(len(named))
-    )
     gain = None
     if named:
-        gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor)
-    count = len(found.baseline.poses)
+        gain = gain_by_hand(search, [], after=named, sensor=named[0].sensor)
+    count = len(search.baseline.poses)
     return Diagnosis(
-        findings,
-        found.unexplained,
+        tuple(findings),
+        search.unexplained,
         candidates_of(problem.search, named),
-        tuple(found.not_testable),
+        tuple(search.not_testable),
         before,
         after,
         gain,

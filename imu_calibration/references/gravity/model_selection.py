@@ -49,7 +49,7 @@ MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HandInvestigation(SelectedEffects):
-    """Result of a search, before its report."""
+    """Result of a search for effects in a recording by hand, before its report."""
 
     # The amplitudes of an effect are few, and a requested effect remains in the model.
     settings: ClassVar[SelectionSettings] = SelectionSettings(
@@ -58,7 +58,9 @@ class HandInvestigation(SelectedEffects):
     baseline: HandCalibration
     """The calibration under diagnosis."""
     problem: RowProblem
+    """Rows of poses and turns, with the search on them."""
     explained: Explained
+    """Excess over noise, and the share of it that effects remove."""
     held_out: Sequence[ChoiceWithout]
     """The complete search, repeated without each part of the poses."""
     constants: np.ndarray
@@ -98,40 +100,43 @@ class HandInvestigation(SelectedEffects):
 
     def point(self, problem: RowProblem, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """
-        Return effect -> initial values for its columns, of the warm-ups among the chosen effects.
+        Return the values at which the columns of the chosen warm-ups are linearised, by name.
 
-        From the rows of `problem`.
+        They are the amplitudes, estimated from the rows of `problem`, and the time constant.
         """
         fit = problem.search.values(chosen)
-        warm = [question for question in chosen if '@' in question.label]
-        return {
-            q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])])
-            for q in warm
-        }
+        point = {}
+        for question in chosen:
+            if '@' in question.label:  # a warm-up, with the number of its time constant
+                number = int(question.label.split('@')[1])
+                amplitudes = fit[list(question.parameters)]
+                point[question.name] = np.append(amplitudes, self.constants[number])
+        return point
 
     def extended(
         self, problem: RowProblem, chosen: Sequence[Question]
     ) -> tuple[HandModel, np.ndarray, float]:
         """
-        Return the baseline extended by some effects.
+        Return (model of the baseline and the chosen effects, its parameters, Earth's rate).
 
-        (model, parameters, the Earth's rate about the vertical, rad/s).
-
-        `problem` has the rows for the estimate, those of this investigation or fewer.
+        The Earth's rate is that about the vertical, rad/s. `problem` has the rows for the estimate,
+        those of this investigation or fewer.
         """
         hand = self.baseline
         point = self.point(problem, chosen)
+        # Changes of the baseline's parameters, the Earth's rate, then values of the effects.
         fit = problem.search.values(chosen)
-        base = hand.model
-        extended = base
+        n_baseline = hand.hand_model.size
+        extended = hand.model
         for question in chosen:
             extended = extended.with_effect(question.sensor, question.name)
-        model = replace(hand.hand_model, model=replace(extended, point={**base.point, **point}))
-        values = model.model.start_from(base, hand.values + fit[: hand.hand_model.size])
+        extended = replace(extended, point={**hand.model.point, **point})
+        model = replace(hand.hand_model, model=extended)
+        values = extended.start_from(hand.model, hand.values + fit[:n_baseline])
         for question in chosen:
-            if question.name not in point:
-                values[model.model.slices[question.effect.key]] = fit[list(question.parameters)]
-        return model, values, fit[hand.hand_model.size]
+            if question.name not in point:  # warm-ups start at the point
+                values[extended.slices[question.effect.key]] = fit[list(question.parameters)]
+        return model, values, fit[n_baseline]
 
 
 def investigate_by_hand(
@@ -165,15 +170,13 @@ def investigate_by_hand(
         raise too_few_poses(len(poses))
     accelerometer = options.accelerometer or BASE
     gyroscope = options.gyroscope or BASE
+    requested = replace(options, accelerometer=accelerometer, gyroscope=gyroscope)
     baseline = solved
-    if (
-        baseline is None
-        or baseline.model.accelerometer != accelerometer
-        or baseline.model.gyroscope != gyroscope
-    ):
-        baseline = solve_by_hand(
-            data, replace(options, accelerometer=accelerometer, gyroscope=gyroscope)
-        )
+    # The given solution may have an added g-sensitivity, or other effects.
+    if baseline is None:
+        baseline = solve_by_hand(data, requested)
+    elif (baseline.model.accelerometer, baseline.model.gyroscope) != (accelerometer, gyroscope):
+        baseline = solve_by_hand(data, requested)
     follows_gravity = shown(g_sensitivity_evidence(poses))
     effects, not_testable = sort_effects(
         baseline.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity)
@@ -210,6 +213,11 @@ def too_few_poses(count: int) -> NotObservableError:
 def _why_not(
     effect: Effect, poses: Poses, turns: Sequence[TurnData], follows_gravity: bool
 ) -> tuple[str, str] | None:
+    """
+    Return (reason, remedy) where an effect cannot be tested by hand; None where it can.
+
+    `follows_gravity`: whether the g-sensitivity is significant (`g_sensitivity.shown`).
+    """
     if effect.role is Role.LIMIT:
         return (
             'the true values of clipped samples are unknown; turns that reach a limit are excluded',
@@ -247,26 +255,28 @@ def _questions(
     not_testable: list[dict[str, str]],
 ) -> list[Question]:
     """
-    Return the questions.
+    Return a question for each effect, of a warm-up for each time constant.
 
-    An effect that is collinear with the baseline in these poses is moved to `not_testable`.
+    An effect that is collinear with the parameters `base` in these poses has none: it is added to
+    `not_testable`.
     """
-    by_name = {e.name: e for e in effects}
-    asked = []
-    probe = RowEvidence(blocks, space.prior_sd, {}, baseline=base)
+    by_name = {effect.name: effect for effect in effects}
+    questions = []
+    evidence = RowEvidence(blocks, space.prior_sd, {}, baseline=base)
     for label, part in space.parts.items():
         name = label.split('@')[0]
         parameters = tuple(range(part.start, part.stop))
-        rank = probe.rank(parameters, base)
+        rank = evidence.rank(parameters, base)
         if rank:
-            asked.append(Question(by_name[name], parameters, rank + ('@' in label), label))
-    lacking = sorted(by_name.keys() - {q.name for q in asked})
-    not_testable += [
-        {
-            'effect': name,
-            'why': 'in these poses bias and matrix imitate it',
-            'needs': 'more poses, in steps of 30 degrees about each axis',
-        }
-        for name in lacking
-    ]
-    return asked
+            # The time constant of a warm-up is a further degree of freedom.
+            freedom = rank + ('@' in label)
+            questions.append(Question(by_name[name], parameters, freedom, label))
+    for name in sorted(by_name.keys() - {question.name for question in questions}):
+        not_testable.append(
+            {
+                'effect': name,
+                'why': 'in these poses bias and matrix imitate it',
+                'needs': 'more poses, in steps of 30 degrees about each axis',
+            }
+        )
+    return questions

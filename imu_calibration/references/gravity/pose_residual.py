@@ -42,16 +42,18 @@ def unexplained_by_hand(
     sensor: str,
 ) -> Unexplained:
     """
-    Return the unexplained residual of one sensor.
+    Return the unexplained residual of one sensor, at rest or in turns.
 
-    Its rows at rest and its turns against the expectation from noise.
+    A block has the excess ``(chi^2 - dof) / sqrt(2 dof)`` over the expectation from noise, in
+    standard deviations. The block with the larger one determines sigma and rms; turns only if they
+    are significant.
 
     Parameters
     ----------
     hand : HandCalibration
         Of the baseline.
     blocks : sequence of Rows
-        Rows at rest and of turns.
+        Rows at rest and of turns; those at rest are the first of each sensor.
     evidence : RowEvidence
         Of these rows.
     used : sequence of int
@@ -62,72 +64,79 @@ def unexplained_by_hand(
     residuals = evidence.residuals(used)
     sigma = -np.inf
     rms = 0.0
-    chosen = None
+    largest = None
     for block, residual in zip(blocks, residuals):
         if block.sensor != sensor:
             continue
         spare = residual.size - np.linalg.matrix_rank(flat(block.equations)[:, used])
         if spare < 3:
             continue
-        own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
-        if block.name == 'poses' or own > max(sigma, SIGNIFICANT_SDS):
-            # The residual of a turn is an angle, of a pose a rate.
-            size = 1.0 if block.duration is None else block.duration[:, None] ** 2
-            excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
-            if own > sigma:
-                sigma = own
-                rms = float(np.sqrt(max(excess, 0.0)))
-                chosen = block
-    count = len(hand.poses)
-    first = next(k for k, block in enumerate(blocks) if block.sensor == sensor)
-    layers = residuals[first]
-    noise_sd = np.sqrt(blocks[first].floor)
-    significant = bool(sigma > SIGNIFICANT_SDS and count >= MIN_EXPLAINED_WINDOWS)
-    unit = None if chosen is None or chosen.duration is None else TURN_RESIDUAL_UNIT
-    sigma = float(max(sigma, -99.0))
-    found = Unexplained(significant, rms, sigma, None, 0.0, layers, noise_sd, unit)
+        sigma_of_block = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
+        if not sigma_of_block > sigma:
+            continue
+        if block.name != 'poses' and not sigma_of_block > SIGNIFICANT_SDS:
+            continue
+        # Rows of turns are angles over their duration, and their rms is one of angles.
+        square_unit = 1.0 if block.duration is None else block.duration[:, None] ** 2
+        noise_square = np.mean(block.floor * square_unit)
+        excess_square = np.sum(residual**2 * square_unit) / spare - noise_square
+        sigma = sigma_of_block
+        rms = float(np.sqrt(max(excess_square, 0.0)))
+        largest = block
+
+    at_rest = next(k for k, block in enumerate(blocks) if block.sensor == sensor)
+    noise_sd = np.sqrt(blocks[at_rest].floor)
+    significant = bool(sigma > SIGNIFICANT_SDS and len(hand.poses) >= MIN_EXPLAINED_WINDOWS)
+    unexplained = Unexplained(
+        significant,
+        rms,
+        float(max(sigma, -99.0)),
+        correlates_with=None,
+        share=0.0,
+        residual=residuals[at_rest],
+        noise_sd=noise_sd,
+        unit=None if largest is None or largest.duration is None else TURN_RESIDUAL_UNIT,
+    )
     if not significant:
-        return found
-    name, share = correlate(_explanations(hand), layers, noise_sd)
-    if chosen is not None and chosen.name == 'turns' and name is None:
+        return unexplained
+
+    # Where it is largest: the variable, the axes, and ranges of the variables.
+    name, share = correlate(_explanations(hand), residuals[at_rest], noise_sd)
+    if largest is not None and largest.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
-    heldout = evidence.heldout_residuals(used)[first]
+    heldout = evidence.heldout_residuals(used)[at_rest]
     excess = ((heldout / noise_sd) ** 2 - 1.0).sum(axis=0)
-    axes = largest_axes(excess) if len(excess) == len(AXES) and excess.max() > 0 else ()
-    regimes = regimes_by_hand(hand, blocks[first], heldout)
-    return replace(found, correlates_with=name, share=share, axes=axes, regimes=regimes)
+    axes = ()
+    if len(excess) == len(AXES) and excess.max() > 0:
+        axes = largest_axes(excess)
+    regimes = regimes_by_hand(hand, blocks[at_rest], heldout)
+    return replace(unexplained, correlates_with=name, share=share, axes=axes, regimes=regimes)
 
 
 def _explanations(hand: HandCalibration) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    poses, up = hand.poses, hand.state.up
+    """Yield (name, columns (k, m), mask of the poses (k,)) of the variables for `correlate`."""
+    poses = hand.poses
+    up = hand.state.up
     every = np.ones(len(up), bool)
-    yield from slow_explanations(
-        poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c
-    )
+    temperature_c = poses.temperature_c
+    if temperature_c is None:
+        temperature_c = np.full(len(up), np.nan)
+    yield from slow_explanations(poses.time, temperature_c)
     yield 'direction of gravity', up, every
-    yield (
-        'direction of gravity',
-        np.stack(
-            [
-                up[:, 0] ** 2 - up[:, 1] ** 2,
-                up[:, 2] ** 2,
-                up[:, 0] * up[:, 1],
-                up[:, 1] * up[:, 2],
-                up[:, 0] * up[:, 2],
-            ],
-            axis=1,
-        ),
-        every,
-    )
+
+    # Polynomials of the second degree on the sphere.
+    x, y, z = up.T
+    second_degree = np.stack([x**2 - y**2, z**2, x * y, y * z, x * z], axis=1)
+    yield 'direction of gravity', second_degree, every
 
 
 def regimes_by_hand(
     hand: HandCalibration, block: Rows, residual: np.ndarray
 ) -> tuple[RestRegime, ...]:
     """
-    Return the clearest regime of each axis.
+    Return for each axis the range of a variable in which the residual is offset most clearly.
 
-    Regimes of larger scatter are not reported, since every other range of few poses has it.
+    Ranges of larger scatter are not reported, since many ranges of few poses have it by chance.
 
     Parameters
     ----------
@@ -143,37 +152,35 @@ def regimes_by_hand(
     poses = np.arange(len(residual))
     exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
     search = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange)
-    found = []
+    regimes = []
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
-        rest = AxisResidual(
-            np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None],
-            np.zeros(1),
-            np.zeros(1),
-        )
-        found += search.offsets(
-            name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=REGIME_LEVEL / len(names)
-        )[:1]
-    return tuple(found)
+        # A constant and the residual, whitened.
+        white = np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None]
+        axis_residual = AxisResidual(white, np.zeros(1), np.zeros(1))
+        whiten = partial(np.multiply, 1.0 / sd[:, None])
+        offsets = search.offsets(name, axis_residual, whiten, level=REGIME_LEVEL / len(names))
+        regimes += offsets[:1]
+    return tuple(regimes)
 
 
 def _variables(hand: HandCalibration, block: Rows) -> list[Variable]:
     """
-    Return the variables of regimes of poses.
+    Return the variables whose ranges are regimes of poses.
 
-    The attitude, the previous attitude, the time and the temperature.
+    They are time, attitude, attitude of the pose before, and temperature.
     """
     force = hand.gravity * hand.state.up
-    before = np.concatenate([force[:1], force[:-1]])
-    of = partial(ranged, starts=np.arange(len(block.time)))
-    found = of('time', block.time, 's')
+    force_before = np.concatenate([force[:1], force[:-1]])
+    variables_of = partial(ranged, starts=np.arange(len(block.time)))
+    variables = variables_of('time', block.time, 's')
     for k, axis in enumerate(AXES):
-        found += of(f'specific force along {axis}', force[block.group, k], 'm/s^2', least=0.5)
-        found += of(
-            f'specific force along {axis} in the pose before',
-            before[block.group, k],
-            'm/s^2',
-            least=0.5,
+        name = f'specific force along {axis}'
+        variables += variables_of(name, force[block.group, k], 'm/s^2', least=0.5)
+        variables += variables_of(
+            f'{name} in the pose before', force_before[block.group, k], 'm/s^2', least=0.5
         )
-    warm = hand.poses.temperature_c
-    return found if warm is None else found + of('temperature', warm[block.group], 'C', least=0.5)
+    temperature_c = hand.poses.temperature_c
+    if temperature_c is not None:
+        variables += variables_of('temperature', temperature_c[block.group], 'C', least=0.5)
+    return variables
