@@ -101,8 +101,7 @@ class GravityReference:
         try:
             recording = read_recording(lenient, options.nominal, preflight)
             if not any(finding.severity == REFUSE for finding in recording.findings):
-                asked = hand_options(options)
-                poses = PoseRecording(PoseObservations.of(recording, asked))
+                poses = PoseRecording(PoseObservations.of(recording, hand_options(options)))
                 calibrated = conclude(poses.solved(options), options, is_judged=False)
         except ImuCalibrationError as error:
             if not any(finding.severity == REFUSE for finding in preflight.findings):
@@ -110,7 +109,7 @@ class GravityReference:
         return Inspection(preflight, preflight.findings, calibrated)
 
     def reasons(self, lacking: list[str], doubts: list[str]) -> list[str]:
-        """Return the doubts, which a complete calibration removes: it need not be the purpose."""
+        """Return the doubts if the calibration lacks parameters: a complete one removes them."""
         return doubts if lacking else []
 
     def used_lines(self, calibration: Calibration) -> list[str]:

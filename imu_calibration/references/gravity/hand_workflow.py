@@ -19,12 +19,13 @@ from imu_calibration.references.gravity.pose_observations import HandResult, Pos
 class PoseRecording:
     """A recording by hand, of which each solution uses the same poses and turns."""
 
-    data: PoseObservations
+    observations: PoseObservations
     """Poses and turns."""
 
     def solved(self, options: CalibrationOptions) -> Solved[HandCalibration]:
         """Return the solution of the model that options request (`solve_by_hand`)."""
-        return Solved(solve_by_hand(self.data.data, hand_options(options)), self.data)
+        solution = solve_by_hand(self.observations.data, hand_options(options))
+        return Solved(solution, self.observations)
 
 
 def gather_poses(
@@ -59,9 +60,7 @@ def calibrate_poses(
     stills: Sequence[slice] | None = None,
 ) -> HandResult:
     """
-    Return the HandResult of a recording that was read.
-
-    `stills` as in `calibrate_by_hand`.
+    Return the HandResult of a recording; `stills` as in `calibrate_by_hand`.
     """
     observations = PoseObservations.of(recording, hand_options(options), stills)
     return calibrate_by_evidence(PoseRecording(observations), options, provenance=provenance)

@@ -81,7 +81,11 @@ class PoseObservations:
     @cached_property
     def gathered(self) -> GatheredData:
         """Counts and conditions of the recording."""
-        imu, warm = self.recording.imu, self.recording.temperature_c
+        imu = self.recording.imu
+        temperature_c = self.recording.temperature_c
+        temperature_range = None
+        if temperature_c is not None:
+            temperature_range = (float(temperature_c.min()), float(temperature_c.max()))
         return GatheredData(
             counts=self.recording.counts,
             frame_id=imu.frame_id,
@@ -89,7 +93,7 @@ class PoseObservations:
             last_stamp_ns=int(imu.stamp_ns[-1]),
             largest_rate=float(np.sqrt(np.einsum('ij,ij->i', imu.rate_s, imu.rate_s).max())),
             largest_force=float(max(imu.force_s.max(), -imu.force_s.min())),
-            temperature_c=None if warm is None else (float(warm.min()), float(warm.max())),
+            temperature_c=temperature_range,
         )
 
     @property
@@ -173,6 +177,7 @@ class PoseObservations:
     ) -> Needs:
         """Return the needs of a solution, see `Observations.needs`."""
         undetermined = missing_motion(solution)
+        # Parameter -> (text of its need, no predicted sd); the first item of a parameter counts.
         motions: dict[str, tuple[str, float]] = {}
         for item in reversed(undetermined):
             for name in item['parameters']:
@@ -180,19 +185,22 @@ class PoseObservations:
         return Needs(motions, undetermined)
 
     def singular_values(self, result: HandResult) -> np.ndarray:
-        """Return none: directions are estimated too."""
+        """Return an empty array: directions are estimated too."""
         return np.zeros(0)
 
     def window_errors(self, result: HandResult) -> WindowErrors:
         """
-        Return the errors of the poses, after: held out.
+        Return the errors of the poses relative to gravity along its direction, and to zero rate.
 
-        Relative to gravity along its estimated direction, and to zero rate.
+        Errors after the calibration are those of poses held out in turn.
         """
-        hand, poses = result.applied, result.applied.poses
+        hand = result.applied
+        poses = hand.poses
         force, rate = poses.force, poses.rate
         true = hand.gravity * hand.state.up
         zero = np.zeros_like(rate)
+
+        # Corrected means, where possible with parameters estimated without the pose.
         corrected_force, corrected_rate = hand.compensate(
             force, rate, poses.time, temperature_c=poses.temperature_c
         )
@@ -201,23 +209,26 @@ class PoseObservations:
         for fit in result.fits:
             without = fit.merged(without)
         for out, values in zip(folds, without, strict=True):
-            corrected = hand.hand_model.compensate(values, force, rate, **poses.conditions)
-            corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
-        samples = max(int(poses.stop[-1]), 1)
-        time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)
-        scatter = [
-            float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')
-        ]
+            fold_force, fold_rate = hand.hand_model.compensate(
+                values, force, rate, **poses.conditions
+            )
+            corrected_force[out] = fold_force[out]
+            corrected_rate[out] = fold_rate[out]
+
+        n_samples = max(int(poses.stop[-1]), 1)
+        time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(n_samples - 1, 1)
+        pose_scatter = float(hand.statistics.get('pose_scatter_sd', 0.0))
+        drift_scatter = float(hand.statistics.get('drift_scatter_sd', 0.0))
         return WindowErrors(
-            time,
-            np.full(len(force), WindowKind.STATIC),
-            {'accelerometer': force, 'gyroscope': rate},
-            {'accelerometer': true, 'gyroscope': zero},
-            {'accelerometer': force - true, 'gyroscope': rate},
-            {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
-            {
-                'accelerometer': np.hypot(poses.force_sem, scatter[0]),
-                'gyroscope': np.hypot(poses.rate_sem, scatter[1]),
+            time=time,
+            kind=np.full(len(force), WindowKind.STATIC),
+            measured={'accelerometer': force, 'gyroscope': rate},
+            true={'accelerometer': true, 'gyroscope': zero},
+            before={'accelerometer': force - true, 'gyroscope': rate},
+            after={'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
+            floor={
+                'accelerometer': np.hypot(poses.force_sem, pose_scatter),
+                'gyroscope': np.hypot(poses.rate_sem, drift_scatter),
             },
         )
 
@@ -227,9 +238,7 @@ class PoseObservations:
 
     def error_budget(self, result: HandResult) -> ErrorBudget:
         """
-        Return noise and gravity, the only reference.
-
-        The sds contain the uncertainty of a gravity that was not given.
+        Return the sds of the parameters from noise, and from the uncertainty of gravity.
         """
         calibration = result.calibration
         is_known = result.options.gravity is not None

@@ -35,9 +35,7 @@ def errors_by_hand(
     options: CalibrationOptions = CalibrationOptions(),
 ) -> ReadingErrors:
     """
-    Return the errors of a calibration on a recording of its IMU held still in some attitudes.
-
-    With turns between them.
+    Return the errors of a calibration on a recording of its IMU held still, and turned in between.
 
     The error of the accelerometer is the length of its mean reading in a pose less gravity; that of
     the gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end
@@ -84,10 +82,10 @@ def errors_by_hand(
         return replace(errors, why=str(error))
     check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
 
-    warm = None
+    temperature = None
     if recording.temperature_c is not None:
-        warm = TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
-    corrected = compensate_samples(calibration, recording.imu, warm)
+        temperature = TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
+    corrected = compensate_samples(calibration, recording.imu, temperature)
 
     # Of an absent sensor either the readings or the parameters have no meaning.
     absent = require_sensor(calibration, recording.imu.absent)
@@ -104,9 +102,9 @@ def prove_hand_readings(
     absent: Collection[str] = (),
 ) -> Proof:
     """
-    Return the proof of corrected samples `after` against the raw ones.
+    Return the errors of the raw samples `before` and of the corrected samples `after`, by sensor.
 
-    None of the sensors `absent`.
+    Sensors in `absent` are omitted.
     """
     poses = data.poses
     raw = _rest_means(before, poses)
@@ -116,11 +114,9 @@ def prove_hand_readings(
     seconds = float(np.sum(poses.stop - poses.start) * poses.period)
     proof: dict[str, ProofEntry] = {}
     if 'accelerometer' not in absent:
-        lengths = [
-            np.linalg.norm(mean, axis=1, keepdims=True) - gravity
-            for mean in (raw.force, corrected.force)
-        ]
-        rest = entry_of(UNITS['accelerometer'], *lengths, seconds=seconds)
+        raw_norm = np.linalg.norm(raw.force, axis=1, keepdims=True) - gravity
+        corrected_norm = np.linalg.norm(corrected.force, axis=1, keepdims=True) - gravity
+        rest = entry_of(UNITS['accelerometer'], raw_norm, corrected_norm, seconds=seconds)
         proof['accelerometer'] = replace(rest, regimes={'rest': rest})
     if 'gyroscope' not in absent:
         rest = entry_of(UNITS['gyroscope'], raw.rate, corrected.rate, seconds=seconds)
@@ -130,9 +126,10 @@ def prove_hand_readings(
     turns = [turn for turn in data.turns if turn.rotation is None]
     if not absent and len(turns) >= TURNS_LEAST:
         up = unit_rows(corrected.force)
-        angles = [_turn_errors(imu, poses, turns, up) for imu in (before, after)]
-        turning = float(sum(turn.time[-1] - turn.time[0] for turn in turns))
-        entry = entry_of(TURN_ANGLE_UNIT, *angles, seconds=turning)
+        raw_angles = _turn_errors(before, poses, turns, up)
+        corrected_angles = _turn_errors(after, poses, turns, up)
+        turn_seconds = float(sum(turn.time[-1] - turn.time[0] for turn in turns))
+        entry = entry_of(TURN_ANGLE_UNIT, raw_angles, corrected_angles, seconds=turn_seconds)
         regimes = {**proof['gyroscope'].regimes, 'turns': entry}
         proof['gyroscope'] = replace(entry, regimes=regimes)
     return proof

@@ -40,8 +40,11 @@ class HandStore:
 
     def __init__(self, most: int):
         self.most = most
+        # The samples, in order of time.
         self._parts: list[ImuSamples] = []
+        # Shifts the stamps after a clock reset, so that they increase.
         self._stamps = ContinuedStamps(INSERTED_PAUSE_NS)
+        # Number of samples that were discarded.
         self.forgotten = 0
 
     def __len__(self) -> int:
@@ -50,17 +53,16 @@ class HandStore:
     def copy(self) -> 'HandStore':
         """Return a copy that shares the samples."""
         twin = HandStore(self.most)
-        twin.__dict__ |= self.__dict__ | {
-            '_parts': list(self._parts),
-            '_stamps': copy(self._stamps),
-        }
+        twin._parts = list(self._parts)
+        twin._stamps = copy(self._stamps)
+        twin.forgotten = self.forgotten
         return twin
 
     def add(self, accepted: Iterable[tuple[int, ImuSamples]]) -> None:
         """
-        Add the output of a StreamCheck: (epoch, ImuSamples), ...
+        Add the output of a StreamCheck: (epoch of the clock, samples).
 
-        Stamps continue to increase at a clock reset.
+        At a clock reset a new epoch begins; stamps continue to increase.
         """
         for epoch, samples in accepted:
             if not len(samples):
@@ -77,23 +79,22 @@ class HandStore:
             )
 
     def samples(self) -> ImuSamples | None:
-        """Return all samples, or None."""
+        """Return all samples, or None without any."""
         if not self._parts:
             return None
-        if len(self._parts) > 1:
+        if len(self._parts) > 1:  # joined once, not in every call
             self._parts = [ImuSamples.concatenate(self._parts)]
         return self._parts[0]
 
     def true_stamps(self, stamp_ns: np.ndarray) -> np.ndarray:
-        """Return the header stamps of samples of the present epoch."""
+        """Return the header stamps of samples of the present epoch, given their stored stamps."""
         return stamp_ns - self._stamps.shift_ns
 
     def forget(self, rests: Sequence[slice], most_rests: int) -> bool:
         """
-        Discard samples above the limit.
+        Discard samples above the limit, and return whether any were discarded.
 
-        The inside of the longest rest if that suffices, otherwise the oldest; return whether any
-        were.
+        They are the inside of the longest rest if that suffices, otherwise the oldest.
 
         Parameters
         ----------
@@ -107,30 +108,37 @@ class HandStore:
         if imu is None:
             return False
         if len(rests) > most_rests:
-            self._drop(imu, slice(0, rests[len(rests) - int(SHARE_KEPT * most_rests)].start))
-        elif len(self) > self.most:
-            self._drop(imu, self._least_telling(imu, rests, len(imu) - int(SHARE_KEPT * self.most)))
-        else:
-            return False
-        return True
+            first_kept = rests[len(rests) - int(SHARE_KEPT * most_rests)]
+            self._discard(imu, slice(0, first_kept.start))
+            return True
+        if len(self) > self.most:
+            count = len(imu) - int(SHARE_KEPT * self.most)
+            self._discard(imu, self._least_informative(imu, rests, count))
+            return True
+        return False
 
-    def _least_telling(self, imu: ImuSamples, rests: Sequence[slice], count: int) -> slice:
-        """Return `count` samples inside the longest rest, or the oldest where it is too short."""
+    def _least_informative(self, imu: ImuSamples, rests: Sequence[slice], count: int) -> slice:
+        """
+        Return the range of `count` samples inside the longest rest, or of the oldest.
+
+        The oldest are returned if `REST_KEPT` at both ends of the rest would not remain.
+        """
         longest = max(
             _across_holes(imu.stamp_ns, rests),
             key=lambda rest: rest.stop - rest.start,
             default=slice(0, 0),
         )
-        kept = int(REST_KEPT * 1e9 / max(np.median(np.diff(imu.stamp_ns)), 1))
-        if longest.stop - longest.start < count + 2 * kept:
+        n_kept = int(REST_KEPT * 1e9 / max(np.median(np.diff(imu.stamp_ns)), 1))
+        if longest.stop - longest.start < count + 2 * n_kept:
             return slice(0, count)
-        return slice(longest.start + kept, longest.start + kept + count)
+        return slice(longest.start + n_kept, longest.start + n_kept + count)
 
-    def _drop(self, imu: ImuSamples, gone: slice) -> None:
-        keep = np.ones(len(imu), bool)
-        keep[gone] = False
-        self.forgotten += int(np.count_nonzero(~keep))
-        self._parts = [imu.select(keep)]
+    def _discard(self, imu: ImuSamples, discarded: slice) -> None:
+        """Store the samples without a range of them, and count it."""
+        is_kept = np.ones(len(imu), bool)
+        is_kept[discarded] = False
+        self.forgotten += int(np.count_nonzero(~is_kept))
+        self._parts = [imu.select(is_kept)]
 
     def to_bytes(self) -> bytes:
         """Return the samples as an npz archive."""
@@ -201,19 +209,20 @@ class HandStore:
 
 def _across_holes(stamp_ns: np.ndarray, rests: Sequence[slice]) -> list[slice]:
     """
-    Return the ranges at rest, joined across short interruptions.
+    Return the ranges at rest, joined across holes of discarded samples.
 
-    They are joined where only discarded samples and the time excluded after a hole lie between
-    them.
+    Two ranges are joined if a hole is between them, and otherwise less than `HELD_OUT`, the time
+    that is excluded after a hole.
     """
     joined: list[slice] = []
-    hole = 5 * np.median(np.diff(stamp_ns)) * 1e-9
+    least_hole = 5 * np.median(np.diff(stamp_ns)) * 1e-9
     for rest in rests:
-        between = np.zeros(0)
         if joined:
-            between = np.diff(stamp_ns[joined[-1].stop - 1 : rest.start + 1]) * 1e-9
-        if len(between) and between.max() > hole and between.sum() - between.max() < HELD_OUT:
-            joined[-1] = slice(joined[-1].start, rest.stop)
-        else:
-            joined.append(rest)
+            # Steps of time from the end of the range before to the start of this one, s.
+            steps = np.diff(stamp_ns[joined[-1].stop - 1 : rest.start + 1]) * 1e-9
+            largest = steps.max(initial=0.0)
+            if largest > least_hole and steps.sum() - largest < HELD_OUT:
+                joined[-1] = slice(joined[-1].start, rest.stop)
+                continue
+        joined.append(rest)
     return joined
