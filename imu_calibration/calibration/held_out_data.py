@@ -69,13 +69,13 @@ class PlainEstimate:
     replaced: np.ndarray
     """True for the parameters that the fit replaces in a solution, shape (n_params,)."""
     fitted: np.ndarray
-    """True for those that it estimates, shape (n_params,)."""
+    """True for the parameters that the fit estimates, shape (n_params,)."""
     dropped: tuple[str, ...]
-    """Names of the effects that it leaves at their prior."""
+    """Names of the effects that are at their prior in the fit."""
     values: np.ndarray
     """Parameters from all data, shape (n_params,); of use where `replaced`."""
     folds: list[np.ndarray]
-    """The same without the data of each fold."""
+    """Parameters without the data of each fold, each shape (n_params,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +106,9 @@ class PlainFit:
     sensor: str
     """The sensor."""
     estimate: PlainEstimate
-    """Its bias and matrix."""
+    """Bias and matrix of the sensor."""
     error: float
-    """Rms error on held-out data, in `unit`."""
+    """Rms error of the plain estimate on held-out data, in `unit`."""
     error_of_solution: float
     """Rms error of the solution on the same data."""
     unit: str
@@ -166,18 +166,21 @@ class HeldOutData(ABC, Generic[Estimate]):
     @abstractmethod
     def plain_equations(self, sensor: str, applied: np.ndarray) -> Iterator[PlainEquations]:
         """
-        Yield the equations of a plain fit of a sensor, with the reference as described first.
+        Yield the equations of a plain fit of a sensor, those with the reference as described first.
 
-        Without any, the solution is applied.
-
-        `applied`: parameters of the solution and of plain fits of other sensors, shape (n_params,).
+        A reference that yields none has no plain fits. `applied`: parameters of the solution and of
+        plain fits of other sensors, shape (n_params,).
         """
 
     @abstractmethod
     def fits_elsewhere(
         self, sensor: str, estimate: PlainEstimate, applied: np.ndarray
     ) -> Iterator[PlainFit]:
-        """Yield the errors on regimes and parts of the session that no estimate has seen."""
+        """
+        Yield plain fits with the errors on complete regimes, or parts of the session, held out.
+
+        `estimate`: the plain estimate of the sensor; `applied` as for `plain_equations`.
+        """
 
 
 def masks_in_turn(n_parts: int, n_folds: int) -> list[np.ndarray]:

@@ -49,10 +49,13 @@ def better_plain_fits(
     held_out: HeldOutData[Any], *, under_test: Collection[str], as_asked: bool = False
 ) -> tuple[PlainFit, ...]:
     """
-    Return the plain fits to apply: no solution predicts each kind of held-out data better.
+    Return the plain fits to apply, at most one for each sensor.
 
-    Data are held out in turn, and as complete regimes and parts of the session: an effect that
-    stands in for another cause predicts the motions from which it was estimated only.
+    Errors are compared on data held out in turn, and as complete regimes and parts of the session:
+    an effect that imitates another cause predicts only the motions from which it was estimated. For
+    a sensor under test, one comparison in which the plain fit is not clearly worse suffices. For
+    another one, whose effects without a compensation remain in other sessions, the plain fit must
+    be better on regimes or parts.
 
     Parameters
     ----------
@@ -76,12 +79,12 @@ def better_plain_fits(
         fit = compared_fit(held_out, sensor, applied)
         if fit is None:
             continue
-        elsewhere = held_out.fits_elsewhere(sensor, fit.estimate, applied)
+        fits_elsewhere = held_out.fits_elsewhere(sensor, fit.estimate, applied)
         if is_under_test:
-            is_better = fit.is_close or any(each.is_close for each in elsewhere)
+            is_applied = fit.is_close or any(other.is_close for other in fits_elsewhere)
         else:
-            is_better = any(each.is_better for each in elsewhere)
-        if is_better:
+            is_applied = any(other.is_better for other in fits_elsewhere)
+        if is_applied:
             better.append(fit)
     return tuple(better)
 
@@ -90,17 +93,15 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
     """
     Return the plain fit of a sensor with the errors of both estimates on held-out data.
 
-    None for a reference without plain equations.
-
-    `applied`: parameters of the other sensor, shape (n_params,).
+    None for a reference without plain equations. `applied`: parameters of the other sensor, which
+    are the same in all folds, shape (n_params,).
     """
     judged = held_out.judged[sensor]
-    # The parameters of the other sensor are as applied in all folds.
     model = held_out.solution.model
     is_of_other = model.mask(lambda effect: effect.sensor not in (sensor, 'reference'))
 
     folds = [np.where(is_of_other, applied, values) for values in held_out.folds]
-    of_solution = judged.rms(smallest_errors(held_out, sensor, folds))
+    solution_error = judged.rms(smallest_errors(held_out, sensor, folds))
     chosen: PlainFit | None = None
     for equations in held_out.plain_equations(sensor, applied):
         estimate = equations.estimate(held_out.masks)
@@ -108,7 +109,7 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
         error = judged.rms(held_out.errors(sensor, folds))
         # Estimates of the table and the clock have to pay: the residual may have moved them.
         if chosen is None or error < CLEARLY_BETTER * chosen.error:
-            chosen = PlainFit(sensor, estimate, error, of_solution, judged.unit)
+            chosen = PlainFit(sensor, estimate, error, solution_error, judged.unit)
     return chosen
 
 
@@ -123,6 +124,7 @@ def with_plain_fits(solution: Estimate, fits: Sequence[PlainFit]) -> Estimate:
         estimate = fit.estimate
         values = np.where(estimate.replaced, estimate.values, solution.values)
         change = values - solution.values
+        # At their prior: those that were there and are not fitted, and the dropped effects.
         at_prior = np.isin(names, solution.replaced) & ~estimate.fitted
         at_prior |= estimate.replaced & ~estimate.fitted & ~solution.held
         solution = replace(
@@ -147,16 +149,14 @@ def plain_entries(fits: Sequence[PlainFit]) -> dict[str, dict[str, dict[str, Any
     """Return the part of a document's statistics: sensor -> held-out errors of both estimates."""
     if not fits:
         return {}
-    return {
-        'least_squares': {
-            fit.sensor: {
-                'error': fit.error,
-                'error_of_model': fit.error_of_solution,
-                'unit': fit.unit,
-            }
-            for fit in fits
+    entries = {}
+    for fit in fits:
+        entries[fit.sensor] = {
+            'error': fit.error,
+            'error_of_model': fit.error_of_solution,
+            'unit': fit.unit,
         }
-    }
+    return {'least_squares': entries}
 
 
 def changes_with(changes: ModelChanges, fits: Sequence[PlainFit]) -> ModelChanges:
@@ -173,7 +173,12 @@ def changes_with(changes: ModelChanges, fits: Sequence[PlainFit]) -> ModelChange
 
 
 def plan_of(solution: Solution, sensor: str, reference: np.ndarray) -> PlainEstimate:
-    """Return which parameters a plain fit estimates and replaces, at the values of `reference`."""
+    """
+    Return the plan of a plain fit of a sensor: the parameters to estimate and to replace.
+
+    Its values, from which the fit begins, are those of `reference`, shape (n_params,); parameters
+    without information keep those of the solution.
+    """
     model = solution.model
     replaced = np.zeros(len(reference), bool)
     fitted = np.zeros(len(reference), bool)

@@ -22,14 +22,15 @@ MIN_REGIME_BLOCKS = 3
 
 def prove(held_out: HeldOutData[Any]) -> Proof:
     """
-    Return for each sensor its errors on held-out data before and after, and by regime.
+    Return sensor -> its rms error on held-out data before and after the calibration, by regime.
 
-    Before: with nominal parameters of the sensor. After: with the parameters without each fold. On
-    each side the smaller error counts of the reference as it was estimated and as it was described.
+    Each fold of the data is predicted with parameters estimated without it ("after"), and with the
+    nominal parameters of the sensor in their place ("before").
     """
     proof = {}
     for sensor, judged in held_out.judged.items():
-        before = smallest_errors(held_out, sensor, held_out.nominal(sensor, held_out.folds))
+        nominal_folds = held_out.nominal(sensor, held_out.folds)
+        before = smallest_errors(held_out, sensor, nominal_folds)
         after = smallest_errors(held_out, sensor, held_out.folds)
         proof[sensor] = proof_entry(judged, before, after)
     return proof
@@ -38,8 +39,16 @@ def prove(held_out: HeldOutData[Any]) -> Proof:
 def smallest_errors(
     held_out: HeldOutData[Any], sensor: str, folds: Sequence[np.ndarray]
 ) -> HeldOutErrors:
-    """Return the errors of a sensor with the description of the reference that suits it best."""
-    return smallest(held_out.errors(sensor, each) for each in held_out.descriptions(folds))
+    """
+    Return the errors of a sensor with the parameters `folds` of each fold, each shape (n_params,).
+
+    The parameters of the reference are those estimated or those described, of which the ones with
+    the smaller error count.
+    """
+    candidates = []
+    for described_folds in held_out.descriptions(folds):
+        candidates.append(held_out.errors(sensor, described_folds))
+    return smallest(candidates)
 
 
 def smallest(candidates: Iterable[HeldOutErrors]) -> HeldOutErrors:
@@ -48,7 +57,11 @@ def smallest(candidates: Iterable[HeldOutErrors]) -> HeldOutErrors:
 
 
 def proof_entry(judged: JudgedData, before: HeldOutErrors, after: HeldOutErrors) -> ProofEntry:
-    """Return the errors of one sensor in all motions, and by regime with enough blocks."""
+    """
+    Return the rms errors of one sensor in total, and in each regime with enough blocks.
+
+    With an estimated delay, the share of the squared error that it explains is given as well.
+    """
     regimes = {}
     for k, name in enumerate(judged.regimes):
         counts = judged.counts[:, k]
@@ -75,21 +88,24 @@ def proof_entry(judged: JudgedData, before: HeldOutErrors, after: HeldOutErrors)
 def entry_of(
     unit: str, before: np.ndarray, after: np.ndarray, *, seconds: float | None = None
 ) -> ProofEntry:
-    """Return the entry of errors before and after, shape (n, components), of `seconds` of data."""
+    """
+    Return the entry of errors before and after, each of shape (n, components).
+
+    Errors of different rows are independent. `seconds`: length of the data.
+    """
     n, components = before.shape
     judged = JudgedData(np.ones((n, 1)), unit, n, components)
-    return replace(
-        proof_entry(judged, errors_of_rows(before), errors_of_rows(after)), seconds=seconds
-    )
+    entry = proof_entry(judged, errors_of_rows(before), errors_of_rows(after))
+    return replace(entry, seconds=seconds)
 
 
 def _compared(
     judged: JudgedData, before: np.ndarray, after: np.ndarray, counts: np.ndarray
 ) -> RegimeErrors:
     """
-    Return the rms errors per component, and the interval of their ratio.
+    Return the rms errors per component, and the 95 % interval of their ratio.
 
-    The interval is over resamples of complete blocks.
+    The interval is that of resamples of complete blocks (bootstrap).
 
     Parameters
     ----------
@@ -100,13 +116,13 @@ def _compared(
         Number of errors in each sum, per component.
 
     """
-    held = counts > 0
-    before = before[held]
-    after = after[held]
-    counts = counts[held]
-    draw = np.random.default_rng(1).integers(0, len(counts), (BLOCK_RESAMPLES, len(counts)))
+    has_errors = counts > 0
+    before = before[has_errors]
+    after = after[has_errors]
+    counts = counts[has_errors]
+    drawn = np.random.default_rng(1).integers(0, len(counts), (BLOCK_RESAMPLES, len(counts)))
     with np.errstate(divide='ignore', invalid='ignore'):
-        ratio = np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))
+        ratio = np.sqrt(after[drawn].sum(axis=1) / before[drawn].sum(axis=1))
     low, high = np.nan_to_num(np.quantile(ratio, (0.025, 0.975)), nan=1.0, posinf=1e9)
     n_errors = judged.components * counts.sum()
     seconds = None
