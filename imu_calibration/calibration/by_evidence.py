@@ -52,16 +52,15 @@ def solve_by_evidence(
     solved, searches = _with_significant(source, options, first, searches)
 
     # The other choices of effects, and a limit of a sensor, change the covariance.
-    found = searches[0]
+    main_search = searches[0]
     extension = replace(
         solved.extension,
         changes=_changes(searches, solved.extension.added),
-        moves=_moves(found),
-        clipped=found.clipped_solution(),
+        moves=_moves(main_search),
+        clipped=main_search.clipped_solution(),
     )
-    return replace(
-        solved, solution=extension.applied(solved.solution), extension=extension, found=found
-    )
+    solution = extension.applied(solved.solution)
+    return replace(solved, solution=solution, extension=extension, found=main_search)
 
 
 def _with_significant(
@@ -71,7 +70,7 @@ def _with_significant(
     searches: Sequence[SelectedEffects],
 ) -> tuple[Solved[Estimate], list[SelectedEffects]]:
     """
-    Return the solution with the effects that are significant in it, and the searches with these.
+    Return (solution with the effects that are significant in it, searches without other findings).
 
     Backward elimination: solve with all effects, remove the insignificant ones, solve again.
 
@@ -86,27 +85,28 @@ def _with_significant(
         Of each recording, the largest one first.
 
     """
-    found, *others = searches
-    rivals = _findings_of_others_only(found, others)
+    main_search, *other_searches = searches
+    rivals = _findings_of_others_only(main_search, other_searches)
     while True:
         # An effect of the requested model is judged with the added effects in the solution: the
         # misfit of a missing delay or encoder zero widens every standard deviation.
-        added = _missing_effects((*found.adopted, *rivals), first.model)
-        solved = _solved_with(source, options, first, added, (*others, found))
+        added = _missing_effects((*main_search.adopted, *rivals), first.model)
+        solved = _solved_with(source, options, first, added, (*other_searches, main_search))
 
         # Findings of other recordings first: they may be collinear with those of the largest one,
         # which can become significant without them.
         significant = []
         for rival in rivals:
-            if not _is_insignificant(solved.solution, rival, found.settings):
+            if not _is_insignificant(solved.solution, rival, main_search.settings):
                 significant.append(rival)
         if len(significant) < len(rivals):
             rivals = significant
             continue
 
-        found = _without_insignificant(found, solved.solution, first.model)
-        if len(_missing_effects((*found.adopted, *rivals), first.model)) == len(added):
-            return solved, [found, *others]
+        main_search = _without_insignificant(main_search, solved.solution, first.model)
+        remaining = _missing_effects((*main_search.adopted, *rivals), first.model)
+        if len(remaining) == len(added):  # all added effects are significant
+            return solved, [main_search, *other_searches]
 
 
 def _solved_with(
@@ -119,7 +119,8 @@ def _solved_with(
     """
     Return the solution with added effects, linearised at their estimates.
 
-    The estimates of the last search have priority. `first`: the solution without these effects.
+    The estimates of the last search have priority. `first`: the solution without these effects. An
+    effect is added together with its effect of lower order, where the model lacks that.
     """
     if not added:
         return first
@@ -128,9 +129,9 @@ def _solved_with(
         point |= search.point_of_adopted
     keys = [question.effect.key for question in added]
     for question in added:
-        lower = (question.sensor, question.effect.lower_order)
-        if question.effect.lower_order and lower not in (*keys, *first.model.slices):
-            keys.append(lower)
+        lower_key = (question.sensor, question.effect.lower_order)
+        if question.effect.lower_order and lower_key not in (*keys, *first.model.slices):
+            keys.append(lower_key)
     extension = ModelExtension(tuple(keys), point)
     return replace(source.solved(extension.options(options)), extension=extension)
 
@@ -139,9 +140,9 @@ def ask_kept(
     solved: Solved[Estimate], options: CalibrationOptions, *, known: ModelExtension
 ) -> Solved[Estimate]:
     """
-    Return the supported effects when columns cannot be recomputed.
+    Return the solution with the effects that a search supports, if columns cannot be recomputed.
 
-    Missing effects are reported and widen the covariance.
+    Supported effects that the model lacks are reported, and widen the covariance.
 
     Parameters
     ----------
@@ -153,33 +154,32 @@ def ask_kept(
         The effects that were supported when the columns were computed.
 
     """
-    solution, model = solved.solution, solved.model
-    found = next(solved.data.searches(solution, options), None)
-    if found is None:
+    solution = solved.solution
+    model = solved.model
+    search = next(solved.data.searches(solution, options), None)
+    if search is None:
         return replace(solved, extension=known)
-    found = _without_insignificant(found, solution, model)
+    search = _without_insignificant(search, solution, model)
 
-    # The columns of effects that the model lacks are not stored: they are reported, and widen the
-    # covariance. After a limit was found, the solution is that of the search.
-    missing = [] if found.limits else _missing_effects(found.adopted, model)
-    changes = replace(
-        _changes([found], known.added), lacking=tuple(question.name for question in missing)
-    )
+    # The columns of effects that the model lacks are not stored. After a limit was found, the
+    # solution is that of the search, which has them.
+    missing = [] if search.limits else _missing_effects(search.adopted, model)
+    changes = _changes([search], known.added)
     extension = ModelExtension(
-        known.added,
-        known.point,
-        changes,
-        (*known.moves, *_moves(found, missing)),
-        found.clipped_solution(),
+        added=known.added,
+        point=known.point,
+        changes=replace(changes, lacking=tuple(question.name for question in missing)),
+        moves=(*known.moves, *_moves(search, missing)),
+        clipped=search.clipped_solution(),
     )
-    return replace(solved, solution=extension.applied(solution), extension=extension, found=found)
+    return replace(solved, solution=extension.applied(solution), extension=extension, found=search)
 
 
 def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str]]) -> ModelChanges:
     """
-    Return the changes of the requested model by searches, and their effects.
+    Return the names of effects and the residuals of searches, for the document.
 
-    The first search has priority.
+    `added`: (sensor, effect) in addition to the requested model. The first search has priority.
     """
     first = searches[0]
     added_names = []
@@ -194,20 +194,23 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
         for sensor, residual in search.unexplained_rests().items():
             if residual.significant:
                 unexplained[sensor] = residual.entry
-    times = (search.changed_at for search in searches)
+    changed_at = None
+    for search in searches:
+        if changed_at is None:
+            changed_at = search.changed_at
     return ModelChanges(
-        tuple(added_names),
-        tuple(question.name for question in first.unstable),
-        _implausible_shares(searches),
+        added=tuple(added_names),
+        unstable=tuple(question.name for question in first.unstable),
+        implausible=_implausible_shares(searches),
         unexplained=unexplained,
         stamp_jitter=dict(first.jitter_entry),
-        changed_at=next((time for time in times if time is not None), None),
+        changed_at=changed_at,
     )
 
 
-def _missing_effects(named: Iterable[Question], model: SensorModel) -> list[Question]:
-    """Return the findings that a model lacks."""
-    return [question for question in named if question.effect.key not in model.slices]
+def _missing_effects(findings: Iterable[Question], model: SensorModel) -> list[Question]:
+    """Return the findings whose effects a model lacks."""
+    return [question for question in findings if question.effect.key not in model.slices]
 
 
 def _is_insignificant(
@@ -220,35 +223,42 @@ def _is_insignificant(
 
 
 def _without_insignificant(
-    found: SelectedEffects, solution: Solution, requested: SensorModel
+    search: SelectedEffects, solution: Solution, requested: SensorModel
 ) -> SelectedEffects:
-    """Return the search without findings that are in a solution but not significant."""
+    """
+    Return the search without findings that are in a solution but not significant.
+
+    They are then unstable. Effects of the requested model are judged by some references only.
+    """
     significant = []
     insignificant = []
-    for question in found.named:
-        is_judged = found.settings.judge_requested or question.effect.key not in requested.slices
-        if is_judged and _is_insignificant(solution, question, found.settings):
+    for question in search.named:
+        is_requested = question.effect.key in requested.slices
+        is_judged = search.settings.judge_requested or not is_requested
+        if is_judged and _is_insignificant(solution, question, search.settings):
             insignificant.append(question)
         else:
             significant.append(question)
     if not insignificant:
-        return found
-    return replace(found, named=significant, unstable=[*found.unstable, *insignificant])
+        return search
+    return replace(search, named=significant, unstable=[*search.unstable, *insignificant])
 
 
 def _findings_of_others_only(
-    found: SelectedEffects, others: Sequence[SelectedEffects]
+    main_search: SelectedEffects, other_searches: Sequence[SelectedEffects]
 ) -> list[Question]:
     """
-    Return the effects that the search found in other recordings only, larger recordings first.
+    Return the adopted effects of other recordings that the search in the largest one lacks.
+
+    Each has one finding, that of the largest recording that has it.
     """
-    known = {question.effect.key for question in found.adopted}
-    from_others = {}
-    for other in others:
-        for question in other.adopted:
+    known = {question.effect.key for question in main_search.adopted}
+    findings = {}  # key of the effect -> finding
+    for search in other_searches:
+        for question in search.adopted:
             if question.effect.key not in known:
-                from_others.setdefault(question.effect.key, question)
-    return list(from_others.values())
+                findings.setdefault(question.effect.key, question)
+    return list(findings.values())
 
 
 def stands_out(solution: Solution, question: Question, *, joint_test: bool = True) -> bool:
@@ -300,14 +310,15 @@ def _implausible_shares(searches: Sequence[SelectedEffects]) -> dict[str, float]
 
 
 def _moves(
-    found: SelectedEffects, missing: Sequence[Question] = ()
+    search: SelectedEffects, missing: Sequence[Question] = ()
 ) -> tuple[tuple[Mapping[str, float], float], ...]:
     """
-    Return (changes of parameters by other choices of effects, weight).
+    Return (parameter -> its change by another choice of effects, weight of the choice), of each.
 
-    Rejected, doubtful, implausible or missing effects, and what the search found besides.
+    Another choice has an unstable, rejected, implausible or missing effect in addition to the
+    findings, or is one of `further_moves`.
     """
     moves = []
-    for question in (*found.unstable, *found.rejected, *found.implausible, *missing):
-        moves.append((found.search.moved_by(found.named, question, found.param_names), 1.0))
-    return (*moves, *found.further_moves)
+    for question in (*search.unstable, *search.rejected, *search.implausible, *missing):
+        moves.append((search.search.moved_by(search.named, question, search.param_names), 1.0))
+    return (*moves, *search.further_moves)

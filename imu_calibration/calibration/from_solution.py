@@ -68,22 +68,20 @@ class ModelChanges:
     """
 
     def to_mapping(self) -> dict:
-        """Return the part of a document's statistics."""
-        found = {}
+        """Return the entries of a document's statistics: the fields that are not empty."""
+        entries = {}
         for name, value in vars(self).items():
-            if value:
-                found[{'unstable': 'denied'}.get(name, name)] = (
-                    list(value) if isinstance(value, tuple) else value
-                )
-        return found
+            if not value:
+                continue
+            key = 'denied' if name == 'unstable' else name
+            entries[key] = list(value) if isinstance(value, tuple) else value
+        return entries
 
 
 @dataclass(frozen=True, eq=False)
 class ModelExtension:
     """
-    Effects that a recording supports.
-
-    The result of a search as needed for further solutions of the same and more windows.
+    Effects that a recording supports, as needed for further solutions of the same and more windows.
     """
 
     added: tuple[tuple[str, str], ...] = ()
@@ -91,39 +89,38 @@ class ModelExtension:
     point: dict[str, np.ndarray] = field(default_factory=dict)
     """Effect -> values of the first linearisation."""
     changes: ModelChanges = ModelChanges()
-    """The same as text, for the document."""
+    """Names of effects, and residuals, for the document."""
     moves: tuple[tuple[Mapping[str, float], float], ...] = ()
     """(parameter -> its change under another choice of effects, weight of that choice)."""
     clipped: Solution | None = None
     """The solution without saturated samples if the search found a limit of a sensor."""
 
-    def options(self, asked: CalibrationOptions) -> CalibrationOptions:
-        """Return the options of the model that is solved."""
-        return replace(asked, added=self.added, point=self.point)
+    def options(self, requested: CalibrationOptions) -> CalibrationOptions:
+        """Return the options of the requested model with the added effects."""
+        return replace(requested, added=self.added, point=self.point)
 
     def disagreement(self, names: Sequence[str]) -> np.ndarray:
         """
-        Return the covariance of the changes of parameters by other choices of effects.
+        Return the covariance of parameters due to other choices of effects, (n_params, n_params).
 
-        Shape (n_params, n_params).
+        With the change d of the parameters and the weight w of each choice: ``sum w d d'``.
         """
-        total = np.zeros((len(names),) * 2)
-        for moved, weight in self.moves:
-            shift = np.array([moved.get(name, 0.0) for name in names])
-            total += weight * np.outer(shift, shift)
-        return total
+        covariance = np.zeros((len(names),) * 2)
+        for change_of, weight in self.moves:
+            change = np.array([change_of.get(name, 0.0) for name in names])
+            covariance += weight * np.outer(change, change)
+        return covariance
 
     def applied(self, solution: Estimate) -> Estimate:
         """
-        Return a solution of `options`, or that without clipped samples.
+        Return a solution with the covariance of other choices of effects as a term.
 
-        With the covariance of rejected and collinear effects.
+        If the search found a limit of a sensor, its solution without clipped samples is used.
         """
         # A clipped solution is of the same reference.
-        found = cast('Estimate', self.clipped or solution)
-        return replace(
-            found, terms=with_term(found.terms, REJECTED, self.disagreement(found.param_names))
-        )
+        used = cast('Estimate', self.clipped or solution)
+        disagreement = self.disagreement(used.param_names)
+        return replace(used, terms=with_term(used.terms, REJECTED, disagreement))
 
     @property
     def is_nothing(self) -> bool:
@@ -173,11 +170,14 @@ def document(
         Units and axes of the recording; None: SI, axes not stated.
 
     """
-    final = solution.model.at(solution.values)
-    values, slope = centred(final, solution.values, uncorrected.centre)
+    # Effects in time that compensation replaces by a constant are centred: values v become
+    # functions of v with the derivative `slope`.
+    model = solution.model.at(solution.values)
+    values, slope = centred(model, solution.values, uncorrected.centre)
     terms = {name: slope @ term @ slope.T for name, term in solution.terms.items()}
-    moved = replace(solution, values=values, terms=terms)
-    found = {
+    centred_solution = replace(solution, values=values, terms=terms)
+
+    all_statistics = {
         **statistics,
         'preflight': [finding.to_mapping() for finding in visible_findings(gathered.findings)],
         'unusable': unusable(gathered.findings),
@@ -185,14 +185,14 @@ def document(
         **uncorrected.to_mapping(),
     }
     calibration = Calibration(
-        replace(final, centre=dict(uncorrected.centre)),
+        replace(model, centre=dict(uncorrected.centre)),
         values,
-        moved.covariance,
-        statuses(moved.judged_sd, moved.held, tolerances),
+        centred_solution.covariance,
+        statuses(centred_solution.judged_sd, centred_solution.held, tolerances),
         gathered.frame_id,
         gauge,
         undetermined,
-        found,
+        all_statistics,
         conditions(gathered, gravity),
         {'software': imu_calibration.__version__, **(provenance or {})},
         proof=proof or {},
@@ -216,15 +216,14 @@ def noise_entry(noise: SensorNoise) -> SensorEntry:
 
 
 def conditions(gathered: GatheredData, gravity: float) -> dict:
-    """Return the conditions section."""
-    date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime(
-        '%Y-%m-%dT%H:%M:%SZ'
-    )
+    """Return the section `conditions` of the document; `gravity` in m/s^2."""
+    first_second = (gathered.first_stamp_ns or 0) // 10**9
+    date = datetime.fromtimestamp(first_second, timezone.utc)
     return {
         'temperature_range_c': gathered.temperature_c,
         'largest_rate': gathered.largest_rate,
         'largest_force': gathered.largest_force,
         'gravity': gravity,
         'duration_s': gathered.duration,
-        'date': date,
+        'date': date.strftime('%Y-%m-%dT%H:%M:%SZ'),
     }
