@@ -8,6 +8,7 @@ import numpy as np
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.document.outcome import parameter_count
+from imu_calibration.effects.base import Effect
 from imu_calibration.effects.motions import ALL_MOTIONS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.sphere import DIRECTIONS
@@ -18,16 +19,27 @@ MIN_CELL_WORTH = 0.02
 
 def sd_excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
     """
-    Return the excess of standard deviations over their tolerances.
+    Return the excess ``sum log max(sd / tolerance, 1)`` of standard deviations.
 
-    ``sum log max(sd / tolerance, 1)``; leading axes are kept.
+    Parameters
+    ----------
+    sd : array, shape (..., n)
+    tolerances : array, shape (n,)
+
+    Returns
+    -------
+    array, shape (...)
+        0 when each standard deviation is within its tolerance.
+
     """
     return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
 
 
 def share_gained(before: float | np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the share of the excess that is removed, 0 to 1."""
-    return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
+    """Return the share of the excess `before` that is removed, 0 to 1, shape of `after`."""
+    if before > 0:
+        return np.clip((before - after) / before, 0.0, 1.0)
+    return np.zeros_like(after)
 
 
 class Progress(StrEnum):
@@ -49,74 +61,87 @@ class GroupState:
     effect: str
     """Name of the effect."""
     status: Progress
-    """That of the worst of its parameters."""
+    """Worst status of the parameters of the effect."""
     parameter: str
     """The parameter with the largest standard deviation in tolerances."""
     sd: float
-    """Its standard deviation, SI; NaN before the first solution."""
+    """Standard deviation of `parameter`, SI; NaN before the first solution."""
     tolerance: float
-    """Its tolerance, SI."""
+    """Tolerance of `parameter`, SI."""
     unit: str
-    """Unit of both."""
+    """Unit of `sd` and `tolerance`."""
     needs: str = ''
     """The motion that is still needed."""
     predicted_sd: float = float('nan')
     """Standard deviation after one minute of that motion; NaN when it cannot be predicted."""
     counts: bool = True
-    """Whether a parameter of it was requested; those of the reference do not count."""
+    """Whether a parameter of the effect was requested; those of the reference do not count."""
 
 
 def group_states(result: CalibrationResult) -> list[GroupState]:
     """Return the GroupState of every effect of the present sensors, in the order of the model."""
-    calibration, states = result.calibration, []
-    names, sd = calibration.param_names, calibration.own_sd
+    calibration = result.calibration
+    states = []
     for effect in calibration.model.effects:
-        if effect.sensor in calibration.absent:
-            continue
-        part = calibration.model.slices[effect.key]
-        worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
-        status = calibration.status[part]
-        # The worst.
-        state = next(
-            (word for word in (Progress.HELD, Progress.WEAK) if word in status), Progress.DETERMINED
-        )
-        lacking = () if state == Progress.DETERMINED else (names[worst], *names[part])
-        known = [result.needed[name] for name in lacking if name in result.needed]
-        text, predicted = known[0] if known else ('', float('nan'))
-        states.append(
-            GroupState(
-                effect.sensor,
-                effect.name,
-                state,
-                names[worst],
-                float(sd[worst]),
-                float(result.tolerances[worst]),
-                effect.unit_of(worst - part.start),
-                text,
-                predicted,
-                any(name in calibration.requested for name in names[part]),
-            )
-        )
+        if effect.sensor not in calibration.absent:
+            states.append(_group_state(result, effect))
     return states
+
+
+def _group_state(result: CalibrationResult, effect: Effect) -> GroupState:
+    """Return the state of one effect: that of its worst parameter."""
+    calibration = result.calibration
+    names = calibration.param_names
+    sd = calibration.own_sd
+    part = calibration.model.slices[effect.key]
+    worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
+
+    statuses = calibration.status[part]
+    progress = Progress.DETERMINED
+    if Progress.WEAK in statuses:
+        progress = Progress.WEAK
+    if Progress.HELD in statuses:
+        progress = Progress.HELD
+
+    # The need of the worst parameter, or of the first one that has a need.
+    needs = ''
+    predicted_sd = float('nan')
+    if progress != Progress.DETERMINED:
+        for name in (names[worst], *names[part]):
+            if name in result.needed:
+                needs, predicted_sd = result.needed[name]
+                break
+    return GroupState(
+        effect.sensor,
+        effect.name,
+        progress,
+        parameter=names[worst],
+        sd=float(sd[worst]),
+        tolerance=float(result.tolerances[worst]),
+        unit=effect.unit_of(worst - part.start),
+        needs=needs,
+        predicted_sd=predicted_sd,
+        counts=any(name in calibration.requested for name in names[part]),
+    )
 
 
 def waiting_groups(model: SensorModel) -> list[GroupState]:
     """Return the GroupState of every effect of a model without data."""
-    found = []
-    for e in model.effects:
-        found.append(
+    states = []
+    for effect in model.effects:
+        states.append(
             GroupState(
-                e.sensor,
-                e.name,
+                effect.sensor,
+                effect.name,
                 Progress.WAITING,
-                e.param_names()[0],
-                float('nan'),
-                e.tolerance,
-                e.unit_of(0),
-                ALL_MOTIONS[e.motion[0]],
+                parameter=effect.param_names()[0],
+                sd=float('nan'),
+                tolerance=effect.tolerance,
+                unit=effect.unit_of(0),
+                needs=ALL_MOTIONS[effect.motion[0]],
             )
         )
-    return found
+    return states
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,11 +200,9 @@ def is_done(result: CalibrationResult) -> bool:
 
 
 RADIUS = 0.5
-"""
-Of the sphere, m; the picture has no scale of its own but that of the arms, which are drawn larger.
-"""
+"""Radius of the sphere in the picture, m."""
 ARMS_TIMES = 10.0
-"""Arms are millimetres."""
+"""Factor by which arms, some millimetres long, are drawn larger."""
 WANTED, VISITED, DONE_COLOUR, ARROW, NOW, TEXT_COLOUR = (
     (0.95, 0.55, 0.1),
     (0.25, 0.6, 0.95),
@@ -189,34 +212,32 @@ WANTED, VISITED, DONE_COLOUR, ARROW, NOW, TEXT_COLOUR = (
     (0.9, 0.9, 0.9),
 )
 SEEN_DIAMETER = 0.03
+"""Diameter of the mark of an earlier up direction, m."""
 
 
 def sphere_cells(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...], float]]:
     """
-    Yield (place, colour, diameter) of each cell.
+    Yield (place, colour, diameter) of each of `DIRECTIONS`.
 
-    Orange and large where a rest still has a gain, green and small elsewhere.
+    A cell is orange and large where a rest still has a gain, green and small elsewhere.
     """
-    most = max(float(coverage.worth.max()), MIN_CELL_WORTH)
+    largest = max(float(coverage.worth.max()), MIN_CELL_WORTH)
     for direction, worth in zip(DIRECTIONS, coverage.worth, strict=True):
-        share = 0.0 if coverage.done or worth < MIN_CELL_WORTH else float(worth) / most
-        yield (
-            RADIUS * direction,
-            tuple(
-                share * wanted + (1 - share) * done
-                for wanted, done in zip(WANTED, DONE_COLOUR, strict=True)
-            ),
-            0.06 + 0.1 * share,
-        )
+        share = 0.0 if coverage.done or worth < MIN_CELL_WORTH else float(worth) / largest
+        colour = []
+        for wanted, done in zip(WANTED, DONE_COLOUR, strict=True):
+            colour.append(share * wanted + (1 - share) * done)
+        yield RADIUS * direction, tuple(colour), 0.06 + 0.1 * share
 
 
 def arrows_of(
     coverage: Coverage,
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray, tuple[float, ...]]]:
     """
-    Yield (name, start, end, colour) of each arrow.
+    Yield (name, start, end, colour) of each arrow, m in the sensor frame.
 
-    Up direction now, direction or axis of the next motion, arms that are not zero.
+    They are the up direction now, the direction or axis of the next motion, and arms that are not
+    zero.
     """
     step = coverage.next
     centre = np.zeros(3)
@@ -226,9 +247,9 @@ def arrows_of(
         yield 'next', centre, 1.25 * RADIUS * step.up, ARROW
     elif step.axis is not None:
         yield 'next', -1.25 * RADIUS * step.axis, 1.25 * RADIUS * step.axis, ARROW
-    for colour, arm in zip(
-        0.9 * np.eye(3), [] if coverage.arms is None else coverage.arms, strict=False
-    ):
+    if coverage.arms is None:
+        return
+    for colour, arm in zip(0.9 * np.eye(3), coverage.arms, strict=False):
         if arm.any():
             yield 'arms', centre, ARMS_TIMES * arm, tuple(colour)
 
@@ -240,13 +261,10 @@ def seen_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], float]:
 
 def label_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], str]:
     """Return (place, colour, line of text) of the label above the sphere."""
-    colour, line = DONE_COLOUR, 'all parameters are determined: save the calibration'
-    if not coverage.done:
-        left = (
-            ''
-            if np.isnan(coverage.seconds) or not coverage.seconds
-            else f', about {coverage.seconds:.0f} s left'
-        )
-        colour = TEXT_COLOUR
-        line = (coverage.next.text or 'go on') + left
-    return np.array([0.0, 0.0, 1.6 * RADIUS]), colour, line
+    place = np.array([0.0, 0.0, 1.6 * RADIUS])
+    if coverage.done:
+        return place, DONE_COLOUR, 'all parameters are determined: save the calibration'
+    line = coverage.next.text or 'go on'
+    if coverage.seconds and not np.isnan(coverage.seconds):
+        line += f', about {coverage.seconds:.0f} s left'
+    return place, TEXT_COLOUR, line

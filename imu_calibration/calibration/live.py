@@ -107,20 +107,22 @@ class LiveByHandSettings:
     @property
     def place(self) -> Place:
         """The local gravity (None: unknown) and its standard deviation, m/s^2."""
-        gravity, spread = gravity_of_settings(self.gravity, self.latitude, self.height)
-        return gravity or None, spread
+        gravity, gravity_sd = gravity_of_settings(self.gravity, self.latitude, self.height)
+        return gravity or None, gravity_sd
 
     def at_place(self, options: CalibrationOptions) -> CalibrationOptions:
         """Return the options with the gravity of these settings and its standard deviation."""
-        gravity, spread = self.place
-        return replace(options, gravity=gravity, gravity_sd=spread)
+        gravity, gravity_sd = self.place
+        return replace(options, gravity=gravity, gravity_sd=gravity_sd)
 
 
 class SolvePacer:
     """Schedules the next solution so that solving uses at most a given share of the time."""
 
     def __init__(self, share: float):
-        self._share, self._next = share, -np.inf
+        self._share = share
+        # Time from which the next solution is due, s.
+        self._next = -np.inf
 
     def due(self, now: float) -> bool:
         """Return whether enough time has passed; `now` in s of a steady clock."""
