@@ -12,7 +12,7 @@ from imu_calibration.selection.search import Search, SelectedEffects
 
 @dataclass(frozen=True)
 class CompensatedFindings:
-    """Two choices of effects, without implausible findings, which are not in the model."""
+    """Two choices of effects without the implausible ones, which are in no model."""
 
     before: list[Question]
     """The smaller choice."""
@@ -21,15 +21,15 @@ class CompensatedFindings:
 
 
 def compensated_findings(
-    found: SelectedEffects, before: Sequence[Question], after: Sequence[Question]
+    search: SelectedEffects, before: Sequence[Question], after: Sequence[Question]
 ) -> CompensatedFindings | None:
     """
-    Return the findings of two choices that belong into the model.
+    Return the plausible findings of two choices.
 
-    Or None if compensation corrects no additional one.
+    None if compensation can undo no additional one of the larger choice `after`.
     """
-    adopted_before = [question for question in before if question in found.adopted]
-    adopted_after = [question for question in after if question in found.adopted]
+    adopted_before = [question for question in before if question in search.adopted]
+    adopted_after = [question for question in after if question in search.adopted]
     for question in adopted_after:
         if question not in adopted_before and question.effect.compensation == 'exact':
             return CompensatedFindings(adopted_before, adopted_after)
@@ -38,9 +38,10 @@ def compensated_findings(
 
 def sd_of_chosen(search: Search, model: SensorModel, chosen: Sequence[Question]) -> np.ndarray:
     """
-    Return the standard deviations of the parameters of some effects; of other ones zero.
+    Return the sds of the parameters of a model in a search, shape (n_params,).
 
-    A warm-up that was only tried at a bank of time constants has none for its own.
+    They are zero for parameters of effects that are not chosen, and for time constants that the
+    search chose from a list.
     """
     used = search.indices(chosen)
     _, covariance = search.evidence.fit(used)

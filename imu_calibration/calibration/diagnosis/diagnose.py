@@ -87,20 +87,20 @@ class _FormulaModels:
     """Calibrations of the model with formulas of the residual."""
 
     proposed: Calibration | None
-    """With all formulas; None without one."""
+    """Calibration with all formulas; None without a formula."""
     transferable: Calibration | None
-    """With those that help and that compensation of another recording can undo."""
+    """Calibration with the formulas that help and that compensation of another recording undoes."""
     unhelpful: tuple[str, ...]
     """Formulas that compensation could undo, but which do not help."""
 
 
 def _formula_models(source: ModelSource[Any], extension: 'ProposedExtension') -> _FormulaModels:
     """Return the calibrations with the formulas of a diagnosis."""
-    # All of them describe this recording.
+    # All formulas describe this recording.
     effects = proposed_effects(extension.diagnosis)
     proposed = _with_proposals(source, extension, effects)
 
-    # Compensation of another recording: those that it can undo, and of these the ones that help.
+    # For other recordings: formulas that compensation can undo, and of these the ones that help.
     transferable = proposed
     transferable_effects = [effect for effect in effects if is_transferable(effect)]
     if len(transferable_effects) < len(effects):
@@ -120,8 +120,8 @@ def helpful_formulas(
     """
     Return the formulas with which the error of their sensor on held-out windows is smaller.
 
-    It has to be clearly smaller in total, and not larger in a regime of motion, also not than that
-    of plain least squares.
+    The error has to be clearly smaller in total, and not larger in a regime of motion. The solution
+    with formulas must also predict better than plain least squares.
 
     Parameters
     ----------
@@ -143,12 +143,11 @@ def helpful_formulas(
             continue
         if after.after > CLEARLY_BETTER * before.after:
             continue
-        known = before.regimes
-        grown = []
+        is_larger_in_a_regime = False
         for name, errors in after.regimes.items():
-            if name in known and errors.after > HARM * known[name].after:
-                grown.append(name)
-        if not grown:
+            if name in before.regimes and errors.after > HARM * before.regimes[name].after:
+                is_larger_in_a_regime = True
+        if not is_larger_in_a_regime:
             helpful.append(effect)
     return helpful
 
@@ -171,9 +170,7 @@ def _with_proposals(
     source: ModelSource[Any], extension: ProposedExtension, effects: Sequence[Effect]
 ) -> Calibration | None:
     """
-    Return the calibration of the extended model with the proposed formulas `effects`.
-
-    Or None without a formula.
+    Return the calibration of the extended model with the formulas `effects`; None without any.
     """
     if not effects:
         return None

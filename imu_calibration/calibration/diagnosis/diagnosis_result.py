@@ -70,11 +70,11 @@ class Candidate:
     gain_alone: float
     """Held-out gain of log likelihood in addition to the baseline, nats."""
     p_value_alone: float
-    """Its p-value there, times the number of effects under test."""
+    """Its p-value in addition to the baseline, times the number of effects under test."""
     gain_beside: float | None
-    """The same in addition to the findings; None for a finding."""
+    """Held-out gain in addition to the findings, nats; None for a finding."""
     p_value_beside: float | None
-    """Its p-value there."""
+    """Its p-value in addition to the findings, times the number of effects under test."""
     verdict: str
     """
     ``found``, ``as good as NAME``, ``not needed beside the findings``, ``no evidence``, or the
@@ -86,12 +86,12 @@ class Candidate:
 class Diagnosis:
     """Result of a diagnosis for reports, documents and nodes."""
 
-    findings: tuple
+    findings: tuple[Finding, ...]
     """Findings in order of strength."""
-    unexplained: dict
-    """Sensor -> `unexplained.Unexplained`, in addition to the findings."""
-    candidates: tuple
-    """Every effect under test (Candidate), in order of strength."""
+    unexplained: dict[str, Unexplained]
+    """Sensor -> residual that the findings do not explain."""
+    candidates: tuple[Candidate, ...]
+    """Every effect under test, in order of strength."""
     not_testable: tuple
     """{'effect', 'why', 'needs'} of the effects without a test."""
     baseline: Solution
@@ -131,13 +131,12 @@ def parameters_of(
     """Return parameter name -> (value, sd, unit) of one effect."""
     declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
     part = solution.model.slices[sensor, effect]
-    sd = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
-    found = {}
-    for k, (name, value, spread) in enumerate(
-        zip(declared.param_names(), solution.values[part], sd)
-    ):
-        found[name] = (float(value), float(spread), declared.unit_of(k))
-    return found
+    values = solution.values[part]
+    sds = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
+    parameters = {}
+    for k, name in enumerate(declared.param_names()):
+        parameters[name] = (float(values[k]), float(sds[k]), declared.unit_of(k))
+    return parameters
 
 
 DIAGNOSIS_FORMAT = 'imu_calibration/diagnosis/1'
@@ -147,28 +146,29 @@ def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     """
     Return the content of diagnosis.json.
 
-    Plain dicts, lists, strings and numbers, None for NaN and infinity.
+    It has plain dicts, lists, strings and numbers, None for NaN and infinity.
     """
+    baseline = {}
+    unexplained = {}
+    for sensor, residual in diagnosis.unexplained.items():
+        baseline[sensor] = _baseline(diagnosis.baseline, sensor)
+        unexplained[sensor] = residual_mapping(
+            sensor, residual, diagnosis.formula_gains.get(sensor)
+        )
+    distances = {}
+    for sensor, distance in diagnosis.traces.distances.items():
+        distances[sensor] = distance.to_mapping()
     return json_types(
         {
             'format': DIAGNOSIS_FORMAT,
-            'baseline': {
-                sensor: _baseline(diagnosis.baseline, sensor) for sensor in diagnosis.unexplained
-            },
+            'baseline': baseline,
             'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
             'stamp_jitter_s': diagnosis.stamp_jitter.to_mapping().get('sd_s'),
             'findings': [_finding(finding) for finding in diagnosis.findings],
             'gain': None if diagnosis.gain is None else _gain(diagnosis.gain),
             'dead_reckoning': diagnosis.traces.dead_reckoning,
-            'simulation_distance': {
-                sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()
-            },
-            'unexplained': {
-                sensor: residual_mapping(
-                    sensor, diagnosis.unexplained[sensor], diagnosis.formula_gains.get(sensor)
-                )
-                for sensor in diagnosis.unexplained
-            },
+            'simulation_distance': distances,
+            'unexplained': unexplained,
             'not_testable': diagnosis.not_testable,
             'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
             'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked},
@@ -177,7 +177,8 @@ def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:
-    beside = {
+    """Return an effect under test as plain data."""
+    in_addition_to_findings = {
         'heldout_log_likelihood_gain': candidate.gain_beside,
         'p_value': candidate.p_value_beside,
     }
@@ -187,11 +188,12 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
         'verdict': candidate.verdict,
         'heldout_log_likelihood_gain': candidate.gain_alone,
         'p_value': candidate.p_value_alone,
-        'beside_findings': beside,
+        'beside_findings': in_addition_to_findings,
     }
 
 
 def _baseline(solution: Solution, sensor: str) -> dict[str, Any]:
+    """Return effects, residuals and noise of one sensor in the baseline as plain data."""
     model = solution.model
     return {
         'effects': getattr(model, sensor),
@@ -203,6 +205,7 @@ def _baseline(solution: Solution, sensor: str) -> dict[str, Any]:
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
+    """Return a finding as plain data."""
     parameters = {}
     for name, (value, sd, unit) in finding.parameters.items():
         parameters[name] = {'value': value, 'sd': sd, 'unit': unit}
@@ -228,6 +231,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
 
 
 def _gain(gain: Gain) -> dict[str, Any]:
+    """Return a gain as plain data."""
     names = (
         'sensor',
         'of',
@@ -241,33 +245,35 @@ def _gain(gain: Gain) -> dict[str, Any]:
     return {name: getattr(gain, name) for name in names}
 
 
-def residual_mapping(sensor: str, rest: Unexplained, formula_gain: Gain | None) -> dict[str, Any]:
+def residual_mapping(
+    sensor: str, residual: Unexplained, formula_gain: Gain | None
+) -> dict[str, Any]:
     """
     Return the unexplained residual of a sensor as plain data.
 
-    `sigma` is None where structure makes it significant and not its size.
+    `sigma` is None where structure makes it significant and not its size. `formula_gain`: gain of
+    the formula that the residual follows.
     """
-    unit = rest.unit or UNITS[sensor]
+    proposals = []
+    if residual.proposal is not None and formula_gain is not None:
+        proposals.append(residual.proposal.to_mapping() | {'gain': _formula_gain(formula_gain)})
     return {
-        'significant': rest.significant,
-        'rms': rest.rms,
-        'unit': unit,
-        'sigma': None if rest.by_structure else rest.sigma,
-        'by_structure': rest.by_structure,
-        'correlates_with': rest.correlates_with,
-        'share': rest.share,
-        'where': '; '.join(regime.text for regime in rest.regimes) or None,
-        'axes': rest.axes,
-        'regimes': [regime.to_mapping() for regime in rest.regimes],
-        'tones': [tone.to_mapping() for tone in rest.tones],
-        'proposals': (
-            []
-            if rest.proposal is None or formula_gain is None
-            else [rest.proposal.to_mapping() | {'gain': _formula_gain(formula_gain)}]
-        ),
+        'significant': residual.significant,
+        'rms': residual.rms,
+        'unit': residual.unit or UNITS[sensor],
+        'sigma': None if residual.by_structure else residual.sigma,
+        'by_structure': residual.by_structure,
+        'correlates_with': residual.correlates_with,
+        'share': residual.share,
+        'where': '; '.join(regime.text for regime in residual.regimes) or None,
+        'axes': residual.axes,
+        'regimes': [regime.to_mapping() for regime in residual.regimes],
+        'tones': [tone.to_mapping() for tone in residual.tones],
+        'proposals': proposals,
     }
 
 
 def _formula_gain(gain: Gain) -> dict[str, Any]:
+    """Return the gain of a formula as plain data, with the rms beyond the noise at rest."""
     before, after = gain.beyond_noise
     return _gain(gain) | {'beyond_noise_before': before, 'beyond_noise_after': after}

@@ -75,26 +75,24 @@ class DiagnosisResult:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Return the content of diagnosis.json."""
-        lags = {
-            sensor: {'value': value, 'sd': sd, 'unit': 's'}
-            for sensor, (value, sd) in self.lags.items()
-        }
+        """Content of diagnosis.json."""
+        lags = {}
+        for sensor, (value, sd) in self.lags.items():
+            lags[sensor] = {'value': value, 'sd': sd, 'unit': 's'}
         return diagnosis_mapping(self.diagnosis) | {'lags': lags, 'notes': self.notes}
 
     @property
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        words = [
-            f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms'
-            for sensor, (value, sd) in self.lags.items()
-        ]
-        lag = [f'total lag: {", ".join(words)}'] if words else []
-        return [
-            *diagnosis_lines(self.diagnosis),
-            *(f'note: {note}' for note in (*self.notes, *self.session_terms)),
-            *lag,
-        ]
+        lines = diagnosis_lines(self.diagnosis)
+        for note in (*self.notes, *self.session_terms):
+            lines.append(f'note: {note}')
+        lags = []
+        for sensor, (value, sd) in self.lags.items():
+            lags.append(f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms')
+        if lags:
+            lines.append(f'total lag: {", ".join(lags)}')
+        return lines
 
     @property
     def session_terms(self) -> list[str]:
@@ -123,13 +121,14 @@ class DiagnosisResult:
         """
         if self.diagnosis.onset is not None:
             return []
-        quiet = {
-            sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant
-        }
+        explained_sensors = set()
+        for sensor, residual in self.diagnosis.unexplained.items():
+            if not residual.significant:
+                explained_sensors.add(sensor)
         wandering = unsteady(self.calibration, self.tolerances)
         notes = []
         for reason in (*motion_misfits(self.calibration), *wandering):
-            if not quiet.issuperset(reason.sensors):
+            if not explained_sensors.issuperset(reason.sensors):
                 continue
             # Noise that is larger in motion has no effect that could explain it.
             needs_cause = reason in wandering or reason.key == 'diagnose'
@@ -142,17 +141,15 @@ class DiagnosisResult:
         """
         Sensor -> (total lag of its output, standard deviation), s.
 
-        Independent of how collinear lag effects share it.
+        The total does not depend on the shares of collinear lag effects.
         """
-        found = self.calibration
-        return total_lags(found.param_names, found.values, found.covariance)
+        calibration = self.calibration
+        return total_lags(calibration.param_names, calibration.values, calibration.covariance)
 
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     """
-    Return the findings, the unexplained residual of each sensor and the effects without a test.
-
-    As lines.
+    Return the lines on findings, on the unexplained residuals and on effects without a test.
     """
     lines = timing_lines(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
@@ -171,98 +168,95 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
             f'refused: {refused.effect} ({_gain_of(refused):.0f} nats on held-out windows):'
             f' {WHY_NOT[refused.verdict]}'
         )
-    for sensor, rest in diagnosis.unexplained.items():
-        if rest.significant:
-            with_what = (
-                f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
-            )
-            lines.append(
-                f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the'
-                f' {sensor}{with_what}'
-            )
-        lines += [
-            f'   {line}' if rest.significant else line
-            for line in (
-                *beyond_lines(sensor, rest),
-                *_formula_lines(sensor, rest, diagnosis.formula_gains.get(sensor)),
-            )
-        ]
+    for sensor, residual in diagnosis.unexplained.items():
+        indent = ''
+        if residual.significant:
+            indent = '   '
+            variable = ''
+            if residual.correlates_with:
+                variable = f'; it correlates with {residual.correlates_with}'
+            rms = in_words(residual.rms, sensor, residual.unit)
+            lines.append(f'unexplained: {rms} rms in the {sensor}{variable}')
+        details = beyond_lines(sensor, residual)
+        details += _formula_lines(sensor, residual, diagnosis.formula_gains.get(sensor))
+        lines += [indent + line for line in details]
     if diagnosis.not_testable:
-        lines.append(
-            'not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable)
-        )
+        names = [entry['effect'] for entry in diagnosis.not_testable]
+        lines.append(f'not testable here: {", ".join(names)}')
     return lines
 
 
 def timing_lines(diagnosis: Diagnosis) -> list[str]:
     """
-    Return the moment at which parameters change.
-
-    With their values before and after, and errors of the stamps, as lines.
+    Return the lines on the moment at which parameters change, and on errors of the stamps.
     """
     return [*_onset_lines(diagnosis.onset), *diagnosis.stamp_jitter.lines]
 
 
 def _onset_lines(onset: Onset | None) -> list[str]:
+    """Return the time of a change of parameters, with their values before and after, as lines."""
     if onset is None:
         return []
     by_size = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))
-    # the largest of each sensor: their units differ
+    # The largest changes of each sensor: their units differ.
     largest = []
-    for owner in sorted({name.partition('.')[0] for name in by_size}):
-        largest += [name for name in by_size if name.partition('.')[0] == owner][:MOST_SHOWN]
+    for sensor in sorted({name.partition('.')[0] for name in by_size}):
+        of_sensor = [name for name in by_size if name.partition('.')[0] == sensor]
+        largest += of_sensor[:MOST_SHOWN]
     changes = []
     for name in largest:
         before = in_words(onset.before[name], onset.what, onset.units[name]).removesuffix(' 1')
         after = in_words(onset.after[name], onset.what, onset.units[name]).removesuffix(' 1')
         changes.append(f'{name} {before} before, {after} after')
     values = '; '.join(changes)
-    of_sensors = [
-        f'{sensor} {" and ".join(own)}' for sensor, own in onset.sensor_axes.items() if own
-    ]
-    axes = f' ({", ".join(of_sensors)})' if of_sensors else ''
-    separable = []
-    if onset.temperature_c is not None:
-        separable.append(
-            f'   the temperature passed {onset.temperature_c:.1f} degC at this moment only: a step'
-            ' above or below it is not separable in this recording'
-        )
-    return [
-        f'change at {onset.time:.1f} +- {onset.time_sd:.1g} s of {onset.what}{axes}: {values}',
+    axes_of_sensors = []
+    for sensor, axes in onset.sensor_axes.items():
+        if axes:
+            axes_of_sensors.append(f'{sensor} {" and ".join(axes)}')
+    where = f' ({", ".join(axes_of_sensors)})' if axes_of_sensors else ''
+    lines = [
+        f'change at {onset.time:.1f} +- {onset.time_sd:.1g} s of {onset.what}{where}: {values}',
         (
             f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the'
             ' longer part; record again without the change'
         ),
-        *separable,
     ]
+    if onset.temperature_c is not None:
+        lines.append(
+            f'   the temperature passed {onset.temperature_c:.1f} degC at this moment only: a step'
+            ' above or below it is not separable in this recording'
+        )
+    return lines
 
 
-def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
+def beyond_lines(sensor: str, residual: Unexplained) -> list[str]:
     """Return the axes, conditions and tones of an unexplained residual, as lines."""
-    lines = [f'{sensor} axis {" and ".join(rest.axes)}'] if rest.axes else []
-    lines += [
-        f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)'
-        for regime in rest.regimes
-    ]
-    return [*lines, *(f'spectrum: {tone.text}' for tone in rest.tones)]
+    lines = []
+    if residual.axes:
+        lines.append(f'{sensor} axis {" and ".join(residual.axes)}')
+    for regime in residual.regimes:
+        share = f'{100 * regime.share:.0f} % of it'
+        lines.append(f'where: {sensor} {regime.axis}, {regime.text} ({share})')
+    for tone in residual.tones:
+        lines.append(f'spectrum: {tone.text}')
+    return lines
 
 
-def _formula_lines(sensor: str, rest: Unexplained, gain: Gain | None) -> list[str]:
+def _formula_lines(sensor: str, residual: Unexplained, gain: Gain | None) -> list[str]:
     """Return the formula that an unexplained residual follows and its gain, as lines."""
-    if rest.proposal is None or gain is None:
+    if residual.proposal is None or gain is None:
         return []
     # The interval of the reduction is that of the rms with noise, as for effects of the catalogue.
     share = ' to '.join(f'{100 * end:.2g}' for end in gain.ci95)
-    before, after, only_before, only_after = (
-        in_words(rms, sensor)
-        for rms in (gain.heldout_rms_before, gain.heldout_rms_after, *gain.beyond_noise)
-    )
+    before = in_words(gain.heldout_rms_before, sensor)
+    after = in_words(gain.heldout_rms_after, sensor)
+    rms_beyond_noise = [in_words(rms, sensor) for rms in gain.beyond_noise]
     return [
-        f'formula: {rest.proposal.sentence}',
+        f'formula: {residual.proposal.sentence}',
         (
             f'gain of the formula: {gain.of} ({sensor}, held-out {gain.measure}, rms) {before}'
             f' before, {after} after, a reduction of {share} % (95 %); beyond the noise at rest'
-            f' {only_before} before, {only_after} after'
+            f' {rms_beyond_noise[0]} before, {rms_beyond_noise[1]} after'
         ),
     ]
 
@@ -270,9 +264,9 @@ def _formula_lines(sensor: str, rest: Unexplained, gain: Gain | None) -> list[st
 def proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
     """Return the formulas of a diagnosis as effects."""
     effects: list[Effect] = []
-    for rest in diagnosis.unexplained.values():
-        if rest.proposal is not None:
-            effects += rest.proposal.effects
+    for residual in diagnosis.unexplained.values():
+        if residual.proposal is not None:
+            effects += residual.proposal.effects
     return effects
 
 
@@ -292,12 +286,12 @@ def nothing_named(diagnosis: Diagnosis) -> str:
 
     No effect exceeds noise, or the best one is refused.
     """
-    row = strongest_refused(diagnosis)
-    if row is None:
+    refused = strongest_refused(diagnosis)
+    if refused is None:
         return 'nothing found: no effect of the catalogue explains more than noise'
     return (
-        f'nothing named: {row.effect} explains much ({_gain_of(row):.0f} nats on held-out windows),'
-        f' but {WHY_NOT[row.verdict]}'
+        f'nothing named: {refused.effect} explains much ({_gain_of(refused):.0f} nats on held-out'
+        f' windows), but {WHY_NOT[refused.verdict]}'
     )
 
 
@@ -308,14 +302,15 @@ def strongest_refused(diagnosis: Diagnosis) -> Candidate | None:
     None where no refused effect is significant.
     """
     refused = []
-    for row in diagnosis.candidates:
-        if row.verdict in WHY_NOT and _gain_of(row) > MIN_GAIN_NATS:
-            refused.append(row)
+    for candidate in diagnosis.candidates:
+        if candidate.verdict in WHY_NOT and _gain_of(candidate) > MIN_GAIN_NATS:
+            refused.append(candidate)
     return max(refused, key=_gain_of, default=None)
 
 
-def _gain_of(row: Candidate) -> float:
-    return row.gain_alone if row.gain_beside is None else row.gain_beside
+def _gain_of(candidate: Candidate) -> float:
+    """Return the held-out gain in addition to the findings, of a finding to the baseline, nats."""
+    return candidate.gain_alone if candidate.gain_beside is None else candidate.gain_beside
 
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:

@@ -22,14 +22,12 @@ from imu_calibration.selection.search import FAMILY_WISE, Score, Search
 
 
 def motions_of(question: Question, mate: Question) -> str:
-    """Return the motions that two effects declare as theirs."""
-    return '; '.join(
-        dict.fromkeys(
-            ALL_MOTIONS[name]
-            for name in question.effect.motion + mate.effect.motion
-            if name in ALL_MOTIONS
-        )
-    )
+    """Return the motions that excite either of two effects, as text."""
+    texts = []
+    for name in question.effect.motion + mate.effect.motion:
+        if name in ALL_MOTIONS and ALL_MOTIONS[name] not in texts:
+            texts.append(ALL_MOTIONS[name])
+    return '; '.join(texts)
 
 
 LEAVES_MOST = 'rejected: most of the residual would remain'
@@ -64,14 +62,15 @@ def sentence(
         Samples at a limit.
 
     """
-    values = [(name.split('.')[-1], *entry) for name, entry in parameters.items()]
-    amplitudes = effect.amplitudes(values)
-    # A parameter that is collinear with another, such as the bias, is not a size.
-    known = [entry for entry in amplitudes if abs(entry[1]) > 2 * entry[2]]
-    label, value, sd, unit = max(known or amplitudes, key=lambda v: abs(v[1]))
+    # (name, value, sd, unit) of each parameter, the moment or time constant last.
+    entries = [(name.split('.')[-1], *entry) for name, entry in parameters.items()]
+    amplitudes = effect.amplitudes(entries)
+    # The largest is the size. A parameter that is collinear with another, such as the bias, is not.
+    significant = [entry for entry in amplitudes if abs(entry[1]) > 2 * entry[2]]
+    label, value, sd, unit = max(significant or amplitudes, key=lambda entry: abs(entry[1]))
     factor, unit = for_people(unit, effect.sensor)
     size = _with_unit(' +- '.join(with_sd(value * factor, sd * factor)), unit)
-    if not known and len(values) > 1:
+    if not significant and len(entries) > 1:
         size = f'known here in combinations only, none of its values by itself: {size}'
     if n_clipped is not None:
         limit = _with_unit(f'{value * factor:.4g}', unit)
@@ -80,7 +79,7 @@ def sentence(
             ' samples were excluded.'
         )
     which = '' if len(amplitudes) == 1 else f' (largest: {label})'
-    when = f' at {values[-1][1]:.1f} s' if effect.located else ''
+    when = f' at {entries[-1][1]:.1f} s' if effect.located else ''
     text = f'{effect.explanation} Its size is {size}{which}{when}.'
     if gain is not None and gain.reduction > 0:
         text += (
@@ -91,10 +90,12 @@ def sentence(
 
 
 def _percent(share: float) -> str:
+    """Return a share in per cent, with one digit below one per cent."""
     return f'{100 * share:.0f} %' if share >= 0.01 else f'{100 * share:.1g} %'
 
 
 def _with_unit(number: str, unit: str) -> str:
+    """Return a number with its unit, but for a ratio."""
     return number if unit == '1' else f'{number} {unit}'
 
 
@@ -107,53 +108,65 @@ def candidates_of(
     replaced: Sequence[Question] = (),
 ) -> tuple[Candidate, ...]:
     """
-    Return every effect that a search tested in addition to the findings, the strongest first.
+    Return every effect that a search tested, the strongest first; of a warm-up one time constant.
 
-    Of a warm-up its best time constant.
+    The time constant of a warm-up is the one with the largest gain.
 
-    `agree(chosen, question)` is whether the windows agree on one of the chosen effects; `withdrawn`
-    are effects that the search chose and the halves of the recording or the calibration refused,
-    `replaced` those that another explanation of the residual replaces.
+    Parameters
+    ----------
+    search : Search
+    named : sequence of Question
+        Findings.
+    agree : callable, optional
+        ``agree(chosen, question)``: whether the windows agree on one of the chosen effects.
+    withdrawn : sequence of Question
+        Effects that the search chose, and that the halves of the recording or the calibration
+        refused.
+    replaced : sequence of Question
+        Effects that another explanation of the residual replaces.
+
     """
-    superseded = {question.name for question in replaced}
-    refused_later = {question.name for question in withdrawn}
-    found = {question.name for question in named}
-    mates = {}
-    rows = {}
+    replaced_names = {question.name for question in replaced}
+    withdrawn_names = {question.name for question in withdrawn}
+    finding_names = {question.name for question in named}
+    mates = {}  # effect -> the finding with which it is collinear
     for question in named:
         for mate, _ in search.confounded(named, question):
             mates.setdefault(mate.name, question.name)
+
+    candidates: dict[str, Candidate] = {}
     for question in search.questions:
+        name = question.name
         alone = search.score([], question)
-        if question.name in rows and rows[question.name].gain_alone >= alone.gain:
+        if name in candidates and candidates[name].gain_alone >= alone.gain:
             continue
-        beside = None if question.name in found else search.score(named, question)
-        verdict = _verdict_of(question.name, alone, beside, found=found, mates=mates)
+        in_addition = None if name in finding_names else search.score(named, question)
+        verdict = _verdict_of(name, alone, in_addition, finding_names=finding_names, mates=mates)
         if verdict == LEAVES_MOST:
-            if question.name in superseded:
+            if name in replaced_names:
                 verdict = REPLACED
             elif agree is not None and not agree([*named, question], question):
                 verdict = DISAGREED
-            elif question.name in refused_later:
+            elif name in withdrawn_names:
                 verdict = UNCERTAIN
-        rows[question.name] = Candidate(
-            question.name,
+        candidates[name] = Candidate(
+            name,
             question.sensor,
-            alone.gain,
-            alone.p_value,
-            None if beside is None else beside.gain,
-            None if beside is None else beside.p_value,
-            verdict,
+            gain_alone=alone.gain,
+            p_value_alone=alone.p_value,
+            gain_beside=None if in_addition is None else in_addition.gain,
+            p_value_beside=None if in_addition is None else in_addition.p_value,
+            verdict=verdict,
         )
-    return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
+    return tuple(sorted(candidates.values(), key=lambda candidate: -candidate.gain_alone))
 
 
 def _verdict_of(
     name: str,
     alone: Score,
-    beside: Score | None,
+    in_addition: Score | None,
     *,
-    found: Collection[str],
+    finding_names: Collection[str],
     mates: Mapping[str, str],
 ) -> str:
     """
@@ -166,24 +179,24 @@ def _verdict_of(
     ----------
     name : str
         Effect.
-    alone, beside : Score
-        Evidence on top of the baseline, and on top of the findings (None for a finding).
-    found : set of str
-        Findings.
+    alone, in_addition : Score
+        Evidence in addition to the baseline, and to the findings (None for a finding).
+    finding_names : set of str
+        Effects that are findings.
     mates : dict
-        Effects that would do as well -> finding.
+        Effect -> the finding with which it is collinear.
 
     """
-    if name in found:
+    if name in finding_names:
         return 'found'
     if name in mates:
         return f'as good as {mates[name]}'
     if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
         return IMPOSSIBLE
-    if beside is not None and beside.significant:
+    if in_addition is not None and in_addition.significant:
         return LEAVES_MOST
     if alone.significant:
-        return 'not needed in addition to the findings' if found else LEAVES_MOST
+        return 'not needed in addition to the findings' if finding_names else LEAVES_MOST
     return 'no evidence'
 
 
@@ -217,20 +230,16 @@ def finding(
     motion_of : callable
         ``motion_of(question, mate)``: the motion that would separate two effects.
     shows : callable
-        ``shows(place, mate, gain)``: whether an effect in the place of this one shows in the sensor
-        that shows this one.
+        ``shows(place, mate, gain)``: whether an effect in the place of this one affects the sensor
+        on which the gain of this one was computed.
     rivals : sequence of Question
         Effects known to do nearly as well in its place.
 
     """
     question = named[place]
-
-    def in_its_place(mate: Question) -> dict[str, tuple[float, float, str]]:
-        return fitted(search, with_exchanged(named, place, mate), mate)
-
-    score = search.score([q for q in named if q is not question], question)
+    score = search.score([other for other in named if other is not question], question)
     gain = gain_of(place)
-    explained = share(named, question)
+    explained_share = share(named, question)
     if question.effect.key in solution.model.slices:
         parameters = parameters_of(solution, question.sensor, question.name)
     else:
@@ -238,8 +247,11 @@ def finding(
     text = sentence(question.effect, parameters, gain)
     if score.implausible:
         text += (
-            f' It {beyond_known(explained, question.sensor)}. It is in no model unless requested.'
+            f' It {beyond_known(explained_share, question.sensor)}. It is in no model unless'
+            ' requested.'
         )
+
+    # Effects that are collinear with it, and their sizes in its place.
     mates = list(rivals)
     rival_names = {rival.name for rival in rivals}
     for mate, _ in search.confounded(named, question):
@@ -247,31 +259,36 @@ def finding(
             mates.append(mate)
     sizes_of_mates = {}
     for mate in mates:
-        in_place = in_its_place(mate)
-        sizes_of_mates[mate.name] = {n: (value, unit) for n, (value, _, unit) in in_place.items()}
+        sizes = {}
+        estimates = fitted(search, with_exchanged(named, place, mate), mate)
+        for name, (value, _, unit) in estimates.items():
+            sizes[name] = (value, unit)
+        sizes_of_mates[mate.name] = sizes
     return Finding(
         question.name,
         question.sensor,
-        text,
-        parameters,
-        score.p_value,
-        score.gain,
-        explained,
-        gain,
-        tuple(mate.name for mate in mates),
-        motion_of(question, mates[0]) if mates else '',
-        question.effect.against,
-        sizes_of_mates,
-        score.implausible,
+        explanation=text,
+        parameters=parameters,
+        p_value=score.p_value,
+        heldout_gain=score.gain,
+        share=explained_share,
+        gain=gain,
+        indistinguishable_from=tuple(mate.name for mate in mates),
+        separating_motion=motion_of(question, mates[0]) if mates else '',
+        against=question.effect.against,
+        sizes_of_mates=sizes_of_mates,
+        implausible=score.implausible,
     )
 
 
 def fitted(
     search: Search, named: Sequence[Question], question: Question
 ) -> dict[str, tuple[float, float, str]]:
-    """Return parameter name -> (value, sd, unit) of a chosen effect as the search fitted it."""
-    names = question.effect.param_names()
-    return {
-        name: (float(value), float(sd), question.effect.unit_of(k))
-        for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))
-    }
+    """
+    Return parameter name -> (value, sd, unit) of an effect, fitted with the choice `named`.
+    """
+    values, sds = search.estimate(named, question)
+    parameters = {}
+    for k, name in enumerate(question.effect.param_names()[: len(values)]):
+        parameters[name] = (float(values[k]), float(sds[k]), question.effect.unit_of(k))
+    return parameters

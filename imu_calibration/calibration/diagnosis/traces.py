@@ -46,24 +46,22 @@ class Distance:
 
     def bands(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """
-        Return (band, rms beyond noise, rms of the noise) of window means and decades.
+        Return (band, rms beyond noise, rms of the noise) of the window means and of each decade.
 
-        The rms beyond noise has shape (2, 3) and that of the noise (3,), in m/s^2 or rad/s. There
-        is a result for the window means and for each decade, up to the last edge below the Nyquist
-        frequency.
-
-        ``sqrt(max(mean square of measured - simulated - that of the noise, 0))``.
+        The rms beyond noise, before and after, is ``sqrt(max(mean square of the residual - mean
+        square of the noise, 0))``, shape (2, 3); that of the noise has the shape (3,), both in
+        m/s^2 or rad/s. Decades end at the last edge below the Nyquist frequency.
         """
         mean_squares = [('window means', self.means, self.means_noise)]
         decade = np.floor(np.log10(self.edges[:-1]) + 1e-9).astype(int)
-        for each in np.unique(decade):
-            rows = decade == each
-            rows[-1] = False  # the Nyquist frequency cuts it
-            if self.power[0, rows].any():
-                highest = self.edges[1:][rows].max()
-                power = self.power[:, rows].sum(axis=1)
-                noise = self.noise[rows].sum(axis=0)
-                mean_squares.append((f'{10.0**each:g} to {highest:.3g} Hz', power, noise))
+        for exponent in np.unique(decade):
+            in_decade = decade == exponent
+            in_decade[-1] = False  # the Nyquist frequency is within the last band
+            if self.power[0, in_decade].any():
+                highest = self.edges[1:][in_decade].max()
+                power = self.power[:, in_decade].sum(axis=1)
+                noise = self.noise[in_decade].sum(axis=0)
+                mean_squares.append((f'{10.0**exponent:g} to {highest:.3g} Hz', power, noise))
         return [
             (name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise))
             for name, power, noise in mean_squares
@@ -71,26 +69,23 @@ class Distance:
 
     def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        Return (frequency, amplitude density of the residual, that of the noise).
+        Return (frequency, amplitude density of the residual, amplitude density of the noise).
 
-        The shapes are (k,), (2, k, 3) and (k, 3). The densities are per sqrt(Hz).
-
-        Bands without data and the last one are left out.
+        The shapes are (k,), (2, k, 3) and (k, 3). The densities are per sqrt(Hz). Bands without
+        data and the last one, within which the Nyquist frequency is, are omitted.
         """
-        rows = self.power[0].any(axis=1)
-        rows[-1] = False  # the Nyquist frequency cuts it
-        width = np.diff(self.edges)[rows, None]
+        is_used = self.power[0].any(axis=1)
+        is_used[-1] = False
+        width = np.diff(self.edges)[is_used, None]
         return (
-            np.sqrt(self.edges[:-1] * self.edges[1:])[rows],
-            np.sqrt(self.power[:, rows] / width),
-            np.sqrt(self.noise[rows] / width),
+            np.sqrt(self.edges[:-1] * self.edges[1:])[is_used],
+            np.sqrt(self.power[:, is_used] / width),
+            np.sqrt(self.noise[is_used] / width),
         )
 
     def to_mapping(self) -> dict:
         """
-        Return plain data.
-
-        Rms beyond noise before and after, and of the noise, by band, in SI units.
+        Return plain data: rms beyond noise before and after, rms of the noise, by band, and gains.
         """
         bands = []
         for name, (before, after), noise in self.bands():
@@ -113,13 +108,20 @@ class DistanceSums:
 
     def __init__(self) -> None:
         count = len(BAND_EDGES) - 1
+        # Sums over windows of squares within windows by model (before, after) and band.
         self._power = {sensor: np.zeros((2, count, 3)) for sensor in SENSORS}
-        self._rest = {sensor: np.zeros((count, 3)) for sensor in SENSORS}
+        # The same of windows at rest, after.
+        self._rest_power = {sensor: np.zeros((count, 3)) for sensor in SENSORS}
+        # Sums over windows of squared means, before and after.
         self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
-        self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
+        # Sums of the noise variance of window means.
         self._noise = {sensor: np.zeros(3) for sensor in SENSORS}
-        self._freedom = np.zeros((2, count))  # of all windows, of windows at rest
-        self._samples = self._windows = 0
+        # Of each window: samples, at rest, then before and after: squares within it, of its mean.
+        self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
+        # Degrees of freedom by band, of all windows and of windows at rest.
+        self._freedom = np.zeros((2, count))
+        self._n_samples = 0
+        self._n_windows = 0
 
     def add(
         self,
@@ -128,9 +130,9 @@ class DistanceSums:
         noise: Mapping[str, SensorNoise],
     ) -> None:
         """
-        Add a window with its residuals and the noise of each sensor.
+        Add a window with its residuals before and after, and the noise of each sensor.
 
-        The residuals are (before, after: sensor -> (n, 3)).
+        Both residuals are sensor -> measured minus predicted, shape (n, 3).
         """
         n = len(window)
         at_rest = window.kind == 'static'
@@ -145,10 +147,10 @@ class DistanceSums:
         if n % 2 == 0:
             freedom[-1] = 1.0
         self._freedom[: 2 if at_rest else 1] += np.bincount(band, freedom, n_bands)
-        self._samples += n
-        self._windows += 1
-        for sensor, own_noise in noise.items():
-            self._noise[sensor] += own_noise.low_variance / n
+        self._n_samples += n
+        self._n_windows += 1
+        for sensor, sensor_noise in noise.items():
+            self._noise[sensor] += sensor_noise.low_variance / n
             row = [n, at_rest]
             for k, of_model in enumerate(residuals):
                 residual = of_model[sensor]
@@ -161,45 +163,53 @@ class DistanceSums:
                 self._means[sensor][k] += mean**2
                 row += [power.sum(), mean @ mean]
                 if at_rest and k == len(residuals) - 1:
-                    self._rest[sensor] += power
+                    self._rest_power[sensor] += power
             self._rows[sensor].append(row)
 
     def distances(self) -> dict[str, Distance]:
         """Return sensor -> Distance of the windows up to now."""
-        edge = int(np.max(np.flatnonzero(self._freedom[0]), initial=0)) + 2
-        return {sensor: self._distance(sensor, edge) for sensor, rows in self._rows.items() if rows}
+        # Up to the upper edge of the highest band with data.
+        n_edges = int(np.max(np.flatnonzero(self._freedom[0]), initial=0)) + 2
+        distances = {}
+        for sensor, rows in self._rows.items():
+            if rows:
+                distances[sensor] = self._distance(sensor, n_edges)
+        return distances
 
-    def _distance(self, sensor: str, edge: int) -> Distance:
+    def _distance(self, sensor: str, n_edges: int) -> Distance:
+        """Return the Distance of one sensor in the bands between the first edges."""
+        n_bands = n_edges - 1
         # Noise of a band: its power per degree of freedom at rest, in the nearest band with data.
-        noise = np.zeros((edge - 1, 3))
+        noise = np.zeros((n_bands, 3))
         known = np.flatnonzero(self._freedom[1])
         if len(known):
-            density = self._rest[sensor][known] / self._freedom[1][known, None]
-            nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1)
-            noise = density[nearest] * self._freedom[0][: edge - 1, None]
+            density = self._rest_power[sensor][known] / self._freedom[1][known, None]
+            nearest = np.abs(np.arange(n_bands)[:, None] - known).argmin(axis=1)
+            noise = density[nearest] * self._freedom[0][:n_bands, None]
         return Distance(
-            BAND_EDGES[:edge],
-            self._power[sensor][:, : edge - 1] / self._samples,
-            noise / self._samples,
-            self._means[sensor] / self._windows,
-            self._noise[sensor] / self._windows,
-            self.gains(sensor),
+            edges=BAND_EDGES[:n_edges],
+            power=self._power[sensor][:, :n_bands] / self._n_samples,
+            noise=noise / self._n_samples,
+            means=self._means[sensor] / self._n_windows,
+            means_noise=self._noise[sensor] / self._n_windows,
+            gains=self.gains(sensor),
         )
 
     def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
         """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
-        n, rest, *squares = np.array(self._rows[sensor]).T
-        models = (squares[:2], squares[2:])
-        still = rest > 0
-        pairs = (
-            [(within + n * mean, 3 * n) for within, mean in models],
-            [(mean, 0 * n + 3) for _, mean in models],
-            [(within, 3 * (n - 1)) for within, _ in models],
-            [(mean[still], 3 + 0 * mean[still]) for _, mean in models],
-        )
-        return {
-            measure: gain_of(sensor, measure, pair, of=of) for measure, pair in zip(MEASURES, pairs)
-        }
+        n, at_rest, *squares = np.array(self._rows[sensor]).T
+        is_at_rest = at_rest > 0
+        # For before and after: sums of squares in each window, and their numbers of values.
+        samples, means, within_windows, means_at_rest = [], [], [], []
+        for within, mean in (squares[:2], squares[2:]):
+            samples.append((within + n * mean, 3 * n))
+            means.append((mean, 0 * n + 3))
+            within_windows.append((within, 3 * (n - 1)))
+            means_at_rest.append((mean[is_at_rest], 3 + 0 * mean[is_at_rest]))
+        gains = {}
+        for measure, pair in zip(MEASURES, (samples, means, within_windows, means_at_rest)):
+            gains[measure] = gain_of(sensor, measure, pair, of=of)
+        return gains
 
 
 @dataclass(frozen=True, eq=False)
