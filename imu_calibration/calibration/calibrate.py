@@ -94,7 +94,8 @@ def conclude(
         When the readings are clearly in another unit.
 
     """
-    data, changes = solved.data, solved.extension.changes
+    data = solved.data
+    changes = solved.extension.changes
     tolerances = tolerances_of(solved.solution.model, options.tolerances)
 
     # Findings that follow from the solution; errors of the reference enter its covariance.

@@ -53,7 +53,7 @@ class CheckResult:
     @property
     def changed(self) -> tuple[RegimeChange, ...]:
         """The changes that are significantly larger than the limit."""
-        return tuple(each for each in self.changes if each.exceeds(self.change_limit))
+        return tuple(change for change in self.changes if change.exceeds(self.change_limit))
 
     @property
     def helps(self) -> bool:
@@ -71,8 +71,10 @@ class CheckResult:
         if not self.proof:
             return self.lines
         lines = [self._line(sensor) for sensor in self.judged if sensor not in self.helped]
-        changed = {each.sensor for each in self.changed}
-        lines += [line for sensor, line in self._change_lines().items() if sensor in changed]
+        changed_sensors = {change.sensor for change in self.changed}
+        for sensor, line in self._change_lines().items():
+            if sensor in changed_sensors:
+                lines.append(line)
         if self.dropped:
             lines.append(self.dropped)
         return lines
@@ -80,14 +82,14 @@ class CheckResult:
     def _change_lines(self) -> dict[str, str]:
         """Return sensor -> how its error compares with that on the day of the calibration."""
         lines = {}
-        for sensor in dict.fromkeys(each.sensor for each in self.changes):
-            changed = [each for each in self.changed if each.sensor == sensor]
-            if changed:
-                parts = ', '.join(f'{each.regime}: {each.text}' for each in changed)
+        for sensor in dict.fromkeys(change.sensor for change in self.changes):
+            exceeding = [change for change in self.changed if change.sensor == sensor]
+            if exceeding:
+                parts = ', '.join(f'{change.regime}: {change.text}' for change in exceeding)
                 lines[sensor] = f'{sensor}: the error has changed since the calibration, {parts}'
                 continue
-            of_sensor = [each for each in self.changes if each.sensor == sensor]
-            largest = max(of_sensor, key=lambda each: each.factor)
+            of_sensor = [change for change in self.changes if change.sensor == sensor]
+            largest = max(of_sensor, key=lambda change: change.factor)
             lines[sensor] = (
                 f'{sensor}: the error is as on the day of the calibration, at most'
                 f' {largest.text} in {largest.regime}'
@@ -102,6 +104,7 @@ class CheckResult:
         return most_cautious(decisions)
 
     def _line(self, sensor: str) -> str:
+        """Return the decision on a sensor with its reason: that of its limit, or of its errors."""
         decision = self.decision(sensor)
         why = reason_of(self.proof.get(sensor))
         limit = self.limits.get(sensor)
@@ -111,10 +114,12 @@ class CheckResult:
 
     @property
     def helped(self) -> Proof:
-        """The entries of the proof of the sensors that it helps."""
-        return {
-            sensor: entry for sensor, entry in self.proof.items() if self.decision(sensor) is HELPS
-        }
+        """Sensor -> entry of the proof, of the sensors that the calibration helps."""
+        helped = {}
+        for sensor, entry in self.proof.items():
+            if self.decision(sensor) is HELPS:
+                helped[sensor] = entry
+        return helped
 
     @property
     def lines(self) -> list[str]:
@@ -131,15 +136,15 @@ class CheckResult:
         ]
 
     def __str__(self) -> str:
-        helped = ', '.join(self.helped)
-        answer = (
-            'the calibration helps'
-            if self.helps
-            else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
-        )
-        below = [*self.lines, *self.notes]
+        if self.helps:
+            first_line = 'the calibration helps'
+        elif self.helped:
+            first_line = f'it helps the {", ".join(self.helped)} only'
+        else:
+            first_line = 'it helps no sensor'
+        further_lines = [*self.lines, *self.notes]
         if self.dropped:
-            below.append(self.dropped)
-        return '\n'.join([answer, *(f'  {line}' for line in below)])
+            further_lines.append(self.dropped)
+        return '\n'.join([first_line, *(f'  {line}' for line in further_lines)])
 
     __repr__ = __str__

@@ -19,8 +19,8 @@ class GatheredData:
     """Largest rate of the reference, rad/s."""
     largest_force: float = 0.0
     """Largest measured component of specific force, m/s^2."""
-    temperature_c: tuple | None = None
-    """Lowest and highest temperature."""
+    temperature_c: tuple[float, float] | None = None
+    """Lowest and highest temperature; None without temperatures."""
     findings: tuple = ()
     """Findings of the checks of the recording before the estimate (`CheckFinding`)."""
     unusable: dict[str, str] = field(default_factory=dict)
@@ -30,9 +30,7 @@ class GatheredData:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last IMU stamp, recordings added."""
-        return (
-            0.0
-            if self.first_stamp_ns is None or self.last_stamp_ns is None
-            else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
-        )
+        """Seconds from the first to the last IMU stamp, recordings added; 0 without a stamp."""
+        if self.first_stamp_ns is None or self.last_stamp_ns is None:
+            return 0.0
+        return (self.last_stamp_ns - self.first_stamp_ns) * 1e-9

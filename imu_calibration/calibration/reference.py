@@ -34,9 +34,9 @@ class Inspection:
     """Checks of a recording, and a calibration that shows what its motions determine."""
 
     preflight: Preflight
-    """The checks, after the whole recording."""
+    """The checks, after the complete recording."""
     findings: tuple[CheckFinding, ...]
-    """Theirs, and those of the calibration."""
+    """Findings of the checks and of the calibration."""
     calibrated: CalibrationResult[Any] | ImuCalibrationError | None
     """The calibration, or its error; None where it would be wrong."""
 

@@ -60,24 +60,24 @@ class ErrorBudget:
 
     param_names: tuple
     """Names in the order of the rows."""
-    causes: dict
+    causes: dict[str, np.ndarray]
     """Cause -> standard deviations, shape (n_params,); 'noise' first."""
-    texts: dict
+    texts: dict[str, str]
     """Cause -> assumption."""
 
     @property
     def total(self) -> np.ndarray:
-        """All causes together, shape (n_params,)."""
-        return np.sqrt(sum(part**2 for part in self.causes.values()))
+        """Root of the sum of squares of all causes, shape (n_params,)."""
+        return np.sqrt(sum(sd**2 for sd in self.causes.values()))
 
 
 @dataclass(frozen=True, eq=False)
 class Needs:
-    """What a recording does not determine, and what would."""
+    """Parameters that a recording does not determine, and the motions that determine them."""
 
     motions: dict[str, tuple[str, float]]
     """
-    Parameter that is not determined -> (the motion that would serve it best, its sd after a minute
+    Parameter that is not determined -> (the motion that determines it best, its sd after a minute
     of that motion, NaN when unknown).
     """
     undetermined: tuple[dict[str, Any], ...]
@@ -85,7 +85,7 @@ class Needs:
 
 
 class Observations(Protocol[Estimate]):
-    """What a reference gathered in recordings of one IMU, and what it knows of its own errors."""
+    """Data that a reference gathered in recordings of one IMU, with its errors."""
 
     unit: ClassVar[str]
     """Unit of the data: 'windows' or 'poses'."""
@@ -194,11 +194,11 @@ class CalibrationResult(Generic[Estimate]):
     options: CalibrationOptions = CalibrationOptions()
     """Options of the requested model."""
     solution: Estimate
-    """The estimate by weights."""
+    """The estimate with weights by noise, and with all effects."""
     applied: Estimate
-    """The estimate that the document has: with the plain fits that predict better."""
+    """The estimate in the document: `solution` with the values of `fits`."""
     fits: tuple[PlainFit, ...] = ()
-    """These fits."""
+    """Plain fits that predict held-out data better than the solution."""
     found: Any = None
     """Result of the search for the model; None without a search."""
 

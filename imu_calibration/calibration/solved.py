@@ -24,7 +24,7 @@ class Solved(Generic[Estimate]):
 
     @property
     def model(self) -> SensorModel:
-        """The model of the data, of which the solved one may be a part."""
+        """The model of the solution."""
         return self.solution.model
 
 
