@@ -4,7 +4,7 @@ Position of one IMU relative to another on the same rigid body.
 By a robust fit with Student-t errors and noisy columns.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.between_imus.pair import (
     PairedImu,
+    RelativeRotation,
     make_windows,
     relative_rotation,
     require_overlap,
@@ -23,6 +24,7 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.kinematics.rotations import skew
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
 
 TAIL_DOF = 3
 """Degrees of freedom of Student's t of the residuals: knocks cause long tails."""
@@ -63,8 +65,12 @@ class ArmRows:
     """Length of the windows, s."""
 
 
-def _lever_rows(alpha, products):
-    """``[alpha x] + omega omega^T - |omega|^2``, shape (n, 3, 3)."""
+def _lever_rows(alpha: np.ndarray, products: np.ndarray) -> np.ndarray:
+    """
+    Return ``W = [alpha x] + omega omega^T - |omega|^2``, shape (n, 3, 3): ``W r`` at the arm r.
+
+    `products` has ``omega omega^T``.
+    """
     return skew(alpha) + products - np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3)
 
 
@@ -84,39 +90,35 @@ class Fit:
     """Derivative of each weight by the square of its residual, negated, shape (n,)."""
     hessian: np.ndarray
     """Derivative of the estimating equations by the values, shape (8, 8)."""
-    seen: tuple
+    signal_shares: np.ndarray
     """
-    Signal shares of the arm's information without the noise of the columns, with their directions.
+    Shares of the arm's information that are not due to the noise of the columns, of three
+    directions, shape (3,).
     """
+    directions: np.ndarray
+    """Arms of these directions, in the columns, shape (3, 3)."""
 
     def weighted(self, index: np.ndarray | slice) -> np.ndarray:
         """
-        Return design' times the derivative of the weighted residual by the residual.
+        Return design' times the derivative of the weighted residual, (n, p, 3), of n windows.
 
-        For some windows, shape (n, p, 3).
+        With the weight w and the residual r of a window: ``d(w r)/dr = w - weight_fall r r'``.
         """
-        turned = np.swapaxes(self.design[index], 1, 2)
+        transposed = np.swapaxes(self.design[index], 1, 2)
         residual = self.residual[index]
-        along = np.einsum('npi,ni->np', turned, residual) * self.weight_fall[index, None]
-        return turned * self.weights[index, None, None] - along[:, :, None] * residual[:, None, :]
+        along = np.einsum('npi,ni->np', transposed, residual) * self.weight_fall[index, None]
+        weighted_design = transposed * self.weights[index, None, None]
+        return weighted_design - along[:, :, None] * residual[:, None, :]
 
     def curvature(self, index: np.ndarray | slice) -> np.ndarray:
-        """Return the contribution of some windows to the Hessian, shape (p, p)."""
+        """Return the contribution of the windows `index` to the Hessian, shape (p, p)."""
         rows = np.swapaxes(self.weighted(index), 1, 2).reshape(-1, self.design.shape[2])
         return rows.T @ self.design[index].reshape(rows.shape)
 
 
-def _fit_arm(rows):
+def _fit_arm(rows: ArmRows) -> Fit:
     """
     Solve ``difference = W(alpha, rate) @ arm + bias + delay terms`` with Student-t errors.
-
-    Parameters
-    ----------
-    rows : ArmRows
-
-    Returns
-    -------
-    Fit
 
     Raises
     ------
@@ -126,40 +128,54 @@ def _fit_arm(rows):
     """
     lever = _lever_rows(rows.alpha, rows.products)
     lever_slope = _lever_rows(rows.jerk, rows.products_slope)
-    count = len(lever)
+    bias_columns = np.tile(np.eye(3), (len(lever), 1, 1))
+    force_delay_column = -rows.force_slope[:, :, None]
     arm = np.zeros(3)
-    for number in range(3):  # the delay column needs the arm
-        clocks = [-rows.force_slope[:, :, None], (lever_slope @ arm)[:, :, None]]
-        design = np.concatenate([lever, np.tile(np.eye(3), (count, 1, 1)), *clocks], axis=2)
+    for number in range(3):
+        # The column of the rates' delay needs the arm: the first fit has none.
+        rate_delay_column = (lever_slope @ arm)[:, :, None]
+        design = np.concatenate(
+            [lever, bias_columns, force_delay_column, rate_delay_column], axis=2
+        )
         used = design if number else design[:, :, :-1]
-        values, weights, weight_fall, excess = _robust_fit(used, rows.difference, rows.alpha_noise)
-        arm = values[:3]
-    normal = _normal(design, weights, excess)
-    raw = _normal(design, weights, 0.0)
+        robust = _robust_fit(used, rows.difference, rows.alpha_noise)
+        arm = robust.values[:3]
+
+    # Information of the arm with and without the correction for the noise of the columns.
+    corrected = _normal(design, robust.weights, robust.excess)
+    uncorrected = _normal(design, robust.weights, 0.0)
     try:
-        seen = scipy.linalg.eigh(_reduced(normal), _reduced(raw))
+        shares, directions = scipy.linalg.eigh(_reduced(corrected), _reduced(uncorrected))
     except np.linalg.LinAlgError as error:
         raise NotObservableError(
             'the motion must show the whole arm, one direction has no signal; '
             'twist fast about all axes'
         ) from error
-    partial = Fit(
-        values, design, rows.difference - design @ values, weights, weight_fall, normal, seen
+    fit = Fit(
+        values=robust.values,
+        design=design,
+        residual=rows.difference - design @ robust.values,
+        weights=robust.weights,
+        weight_fall=robust.weight_fall,
+        hessian=corrected,
+        signal_shares=shares,
+        directions=directions,
     )
-    hessian = partial.curvature(slice(None)) + (normal - raw)
-    return replace(partial, hessian=hessian)
+    hessian = fit.curvature(slice(None)) + (corrected - uncorrected)
+    return replace(fit, hessian=hessian)
 
 
-def _reduced(normal):
+def _reduced(normal: np.ndarray) -> np.ndarray:
     """Return the normal matrix of the arm after elimination of the other parameters."""
     return normal[:3, :3] - normal[:3, 3:] @ np.linalg.solve(normal[3:, 3:], normal[3:, :3])
 
 
-def _normal(design, weights, excess):
+def _normal(design: np.ndarray, weights: np.ndarray, excess: float) -> np.ndarray:
     """
-    Weighted normal matrix, corrected for errors in variables.
+    Return the weighted normal matrix, corrected for errors in variables, shape (p, p).
 
-    The contribution of the noise of the angular acceleration is subtracted (errors in variables).
+    The contribution of the noise of the angular acceleration, `excess`, is subtracted from the
+    diagonal of the arm.
     """
     flat = (design * np.sqrt(weights)[:, None, None]).reshape(-1, design.shape[2])
     normal = flat.T @ flat
@@ -168,63 +184,83 @@ def _normal(design, weights, excess):
     return normal + np.diag(ridge)
 
 
-def _robust_fit(design, target, alpha_noise):
-    """
-    Student-t regression by reweighting.
+@dataclass(frozen=True, eq=False)
+class _RobustFit:
+    """Student-t regression."""
 
-    Returns (values, weights, negated derivative of the weights, excess of the normal matrix).
+    values: np.ndarray
+    """Parameters, shape (p,)."""
+    weights: np.ndarray
+    """Weight of each window, shape (n,)."""
+    weight_fall: np.ndarray
+    """Derivative of each weight by the square of its residual, negated, shape (n,)."""
+    excess: float
+    """Contribution of the noise of the angular acceleration to the normal matrix of the arm."""
+
+
+def _robust_fit(design: np.ndarray, target: np.ndarray, alpha_noise: float) -> _RobustFit:
+    """
+    Return the Student-t regression of ``target = design @ values`` by reweighting.
 
     The weight decreases with the residual, so the derivative of a weighted residual is smaller than
     its weight: ``weight - weight_fall residual^2``. The noise in the columns biases the values in
     this proportion.
+
+    Parameters
+    ----------
+    design : array, shape (n, 3, p)
+    target : array, shape (n, 3)
+    alpha_noise : float
+        Variance of the angular acceleration in the columns of the arm.
+
     """
     weights = np.ones(len(design))
     weight_fall = np.zeros(len(design))
-    size = np.zeros(len(design))
+    squares = np.zeros(len(design))  # squared residual of each window
     flat = design.reshape(-1, design.shape[2])
     values = np.full(design.shape[2], np.inf)
     for _ in range(30):
-        excess = 2 * alpha_noise * np.sum(weights - weight_fall * size / 3)
-        right = flat.T @ (target * weights[:, None]).ravel()
+        excess = 2 * alpha_noise * np.sum(weights - weight_fall * squares / 3)
+        right_side = flat.T @ (target * weights[:, None]).ravel()
         before = values
-        values = np.linalg.solve(_normal(design, weights, excess), right)
-        size = np.sum((target.ravel() - flat @ values).reshape(-1, 3) ** 2, axis=1)
+        values = np.linalg.solve(_normal(design, weights, excess), right_side)
+        squares = np.sum((target.ravel() - flat @ values).reshape(-1, 3) ** 2, axis=1)
         # The median of chi-square with three degrees of freedom.
-        scale = np.median(size) / 2.366 + 1e-300
-        weights = (TAIL_DOF + 3) / (TAIL_DOF + size / scale)
+        scale = np.median(squares) / 2.366 + 1e-300
+        weights = (TAIL_DOF + 3) / (TAIL_DOF + squares / scale)
         weight_fall = 2 * weights**2 / ((TAIL_DOF + 3) * scale)
         if np.all(np.abs(values - before) <= 1e-9 * np.abs(values)):
             break
-    return values, weights, weight_fall, excess
+    return _RobustFit(values, weights, weight_fall, excess)
 
 
-def _jackknife_covariance(fit, centres):
+def _jackknife_covariance(fit: Fit, centres: np.ndarray) -> np.ndarray:
     """
-    Delete-one-cluster jackknife over stretches of time.
+    Return the covariance of the values by a delete-one-cluster jackknife, shape (p, p).
 
-    Errors within a stretch may have any correlation.
+    Clusters are stretches of time: errors within a stretch may have any correlation.
     """
-    label = np.unique(np.floor((centres - centres[0]) / CLUSTER).astype(int), return_inverse=True)[
-        1
-    ]
-    shifts = []
-    for group in range(label.max() + 1):
-        inside = label == group
+    stretch = np.floor((centres - centres[0]) / CLUSTER).astype(int)
+    _, cluster = np.unique(stretch, return_inverse=True)
+    changes = []  # of the values when a cluster is omitted
+    for number in range(cluster.max() + 1):
+        inside = cluster == number
         score = np.einsum(
             'nip,ni,n->p', fit.design[inside], fit.residual[inside], fit.weights[inside]
         )
-        shifts.append(np.linalg.solve(fit.hessian - fit.curvature(inside), score))
-    shifts = np.array(shifts) - np.mean(shifts, axis=0)
-    return (len(shifts) - 1) / len(shifts) * shifts.T @ shifts
+        changes.append(np.linalg.solve(fit.hessian - fit.curvature(inside), score))
+    changes = np.array(changes) - np.mean(changes, axis=0)
+    return (len(changes) - 1) / len(changes) * changes.T @ changes
 
 
 def response(fit: Fit, columns: np.ndarray) -> np.ndarray:
     """
-    Return the derivative of the values by small changes of the left-hand side, columns (n, 3, k).
+    Return the derivative of the values by changes of the left-hand side, shape (p, k).
+
+    `columns`: derivative of the left-hand side by k quantities, shape (n, 3, k).
     """
-    return np.linalg.solve(
-        fit.hessian, np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True)
-    )
+    score = np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True)
+    return np.linalg.solve(fit.hessian, score)
 
 
 NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
@@ -258,12 +294,11 @@ class RelativeArm:
     """Rotation, B's frame to A's, shape (3, 3)."""
     time_offset: float
     """Delay of B's stamps relative to A's, s."""
-    statuses: tuple
+    statuses: tuple[str, ...]
     """'determined' (sd within 1 mm) or 'weak' for x, y, z."""
     diagnostics: dict
     """
-    Plain numbers: windows, clipped share, residuals, nuisances, contribution of the calibration to
-    the sd.
+    Plain numbers by name: windows, clipped share, residuals, nuisances, parts of the sd.
     """
 
     @property
@@ -272,19 +307,20 @@ class RelativeArm:
         return np.sqrt(np.diag(self.covariance))
 
     def lines(self) -> Iterator[str]:
-        """Return the remarks for the user."""
-        d = self.diagnostics
+        """Yield the remarks for the user."""
+        numbers = self.diagnostics
         turn = np.degrees(Rotation.from_matrix(self.mat_ab).magnitude())
         yield (
             f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f}'
             ' ms late'
         )
         yield (
-            f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f}'
-            ' % of the moving time left out as clipped; the arm explains the difference of the'
-            f' accelerometers from {d["signal_rms"]:.2f} down to {d["residual_rms"]:.2f} m/s^2'
+            f'{numbers["windows"]} windows of {1e3 * numbers["window"]:.0f} ms,'
+            f' {100 * numbers["clipped_share"]:.0f} % of the moving time left out as clipped; the'
+            ' arm explains the difference of the accelerometers from'
+            f' {numbers["signal_rms"]:.2f} down to {numbers["residual_rms"]:.2f} m/s^2'
         )
-        if not d['calibrated']:
+        if not numbers['calibrated']:
             yield (
                 'no poses at rest to calibrate the two IMUs with: scale errors of a consumer'
                 ' gyroscope are in the sd'
@@ -324,23 +360,31 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
     """
     require_overlap(imu_a, imu_b)
     start = int(imu_a.stamp_ns[0])
-    a, b = (PairedImu.make(imu, start) for imu in (imu_a, imu_b))
+    a = PairedImu.make(imu_a, start)
+    b = PairedImu.make(imu_b, start)
     rotation = relative_rotation(a, b)
     delay = 0.0
     for _ in range(DELAY_ROUNDS):
         rows = _build_rows(a, b, rotation, delay)
         fit = _fit_arm(rows)
-        delay += fit.values[-1]
-        if abs(fit.values[-1]) < 1e-5:
+        remaining_delay = fit.values[-1]
+        delay += remaining_delay
+        if abs(remaining_delay) < 1e-5:
             break
     return _result(rows, fit, delay, rotation, (a, b))
 
 
-def _build_rows(a, b, rotation, delay):
+def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: float) -> ArmRows:
     """
-    Integrate both sides over windows without clipping.
+    Return both sides of the equation, integrated over windows of strong motion without clipping.
 
     The rates are `delay` seconds later on their clocks.
+
+    Raises
+    ------
+    NotObservableError
+        With too few windows.
+
     """
     # Windows at the same true times on the clocks of both.
     length = window_length(a, b)
@@ -364,117 +408,141 @@ def _build_rows(a, b, rotation, delay):
     rate_squared = np.trace(products, axis1=1, axis2=2)
     strength = np.sqrt(alpha_squared + rate_squared**2)
     moving = strength > MOTION_SHARE * np.quantile(strength, 0.99)
-    keep = free & moving
-    if keep.sum() < WINDOWS_LEAST:
+    used = free & moving
+    if used.sum() < WINDOWS_LEAST:
         raise NotObservableError(
             f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got'
-            f' {keep.sum()}; twist both IMUs together about all axes for 20 s or more, below the'
+            f' {used.sum()}; twist both IMUs together about all axes for 20 s or more, below the'
             ' range of the gyroscopes'
         )
 
     # The derivative of alpha, for the small column of the delay only.
     lag = 0.1 * (centres[1] - centres[0])
-    kept = centres[keep] + delay
-    alpha_later = make_windows(a.time, kept + lag, length).slope(a.rate)
-    alpha_sooner = make_windows(a.time, kept - lag, length).slope(a.rate)
+    used_centres = centres[used] + delay
+    alpha_later = make_windows(a.time, used_centres + lag, length).slope(a.rate)
+    alpha_sooner = make_windows(a.time, used_centres - lag, length).slope(a.rate)
 
     # Half of the difference of two gyroscopes is the error of their mean, if their errors are
     # independent.
-    noise = np.mean((alpha_b - alpha_a)[keep] ** 2) / 4
-    force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
+    alpha_noise = np.mean((alpha_b - alpha_a)[used] ** 2) / 4
+    force = force_b.select(used).mean(b.force @ rotation.mat_ab.T)
     return ArmRows(
-        centres[keep],
-        force - force_a.select(keep).mean(a.force),
-        0.5 * (alpha_a + alpha_b)[keep],
-        products[keep],
-        (alpha_later - alpha_sooner) / (2 * lag),
-        _products(rate_a.select(keep).slope, a.rate),
-        force_a.select(keep).slope(a.force),
-        force,
-        float(noise),
-        float(np.mean(~free[moving])),
-        length,
+        centres=centres[used],
+        difference=force - force_a.select(used).mean(a.force),
+        alpha=0.5 * (alpha_a + alpha_b)[used],
+        products=products[used],
+        jerk=(alpha_later - alpha_sooner) / (2 * lag),
+        products_slope=_products(rate_a.select(used).slope, a.rate),
+        force_slope=force_a.select(used).slope(a.force),
+        force=force,
+        alpha_noise=float(alpha_noise),
+        clipped_share=float(np.mean(~free[moving])),
+        length=length,
     )
 
 
-def _products(integrate, rate):
-    """Return the integrals of ``rate rate^T``, shape (n_windows, 3, 3)."""
+def _products(integrate: Callable[[np.ndarray], np.ndarray], rate: np.ndarray) -> np.ndarray:
+    """
+    Return the integrals of ``rate rate^T`` over windows, shape (n_windows, 3, 3).
+
+    `integrate`: `Windows.mean` or `Windows.slope` of the windows.
+    """
     return integrate((rate[:, :, None] * rate[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
 
 
-def _calibration_covariance(fit, rows, a, b):
+def _calibration_covariance(fit: Fit, rows: ArmRows, a: PairedImu, b: PairedImu) -> np.ndarray:
     """
-    Contribution of the uncertainty of the gyroscopes' matrices.
+    Return the covariance of the arm due to errors of the gyroscopes' matrices, (3, 3).
 
-    ``rate -> (1 - E) rate`` with the sd of E.
+    An error E of the matrix changes ``rate -> (1 - E) rate``, and with it the columns of the arm.
     """
-    columns = []
+    columns = []  # change of the left-hand side by each element of E
     for p in range(3):
         for q in range(3):
-            turn = np.zeros((3, 3))
-            turn[p, q] = 1.0
-            product = rows.products @ turn.T
-            columns.append(
-                -_lever_rows(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2))
-                @ fit.values[:3]
-            )
-    shift = response(fit, np.stack(columns, axis=2))
+            error = np.zeros((3, 3))
+            error[p, q] = 1.0
+            product = rows.products @ error.T
+            lever_change = _lever_rows(rows.alpha @ error.T, product + np.swapaxes(product, 1, 2))
+            columns.append(-lever_change @ fit.values[:3])
+    by_error = response(fit, np.stack(columns, axis=2))
     # The mean of both rates is used.
-    spread = sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4
-    return (shift @ spread @ shift.T)[:3, :3]
+    error_cov = sum(_matrix_covariance(imu.calibration) for imu in (a, b)) / 4
+    return (by_error @ error_cov @ by_error.T)[:3, :3]
 
 
-def _matrix_covariance(calibration):
+def _matrix_covariance(calibration: HandCalibration | None) -> np.ndarray:
+    """Return the covariance of the matrix of a gyroscope, row by row, shape (9, 9)."""
     if calibration is None:
         return UNCALIBRATED_SCALE_SD**2 * np.eye(9)
     index = [calibration.param_names.index(name) for name in linear_names('gyroscope').ravel()]
     return calibration.covariance[np.ix_(index, index)]
 
 
-def _result(rows, fit, delay, rotation, streams):
-    motion = _jackknife_covariance(fit, rows.centres)[:3, :3]
-    shift = response(fit, -skew(rows.force))
-    calibration = _calibration_covariance(fit, rows, *streams)
-    turned = (shift @ rotation.cov @ shift.T)[:3, :3]
-    total = motion + calibration + turned
-    sd = np.sqrt(np.diag(total))
-    _require_seen(fit.seen, sd)
+def _result(
+    rows: ArmRows,
+    fit: Fit,
+    delay: float,
+    rotation: RelativeRotation,
+    imus: tuple[PairedImu, PairedImu],
+) -> RelativeArm:
+    """
+    Return the arm with its covariance: from the motion, the calibrations and the relative rotation.
+
+    Raises
+    ------
+    NotObservableError
+        When a direction of the arm is not determined.
+
+    """
+    motion_cov = _jackknife_covariance(fit, rows.centres)[:3, :3]
+    calibration_cov = _calibration_covariance(fit, rows, *imus)
+    by_rotation = response(fit, -skew(rows.force))
+    rotation_cov = (by_rotation @ rotation.cov @ by_rotation.T)[:3, :3]
+    covariance = motion_cov + calibration_cov + rotation_cov
+    sd = np.sqrt(np.diag(covariance))
+    _require_signal(fit, sd)
+    nuisances = {}
+    for name, value in zip(NUISANCE, [*fit.values[3:7], delay]):
+        nuisances[name] = float(value)
     diagnostics = {
         'windows': len(rows.centres),
         'window': rows.length,
         'clipped_share': rows.clipped_share,
-        'calibrated': all(s.calibration is not None for s in streams),
+        'calibrated': all(imu.calibration is not None for imu in imus),
         'largest_rate': float(np.sqrt(np.max(np.trace(rows.products, axis1=1, axis2=2)))),
         'signal_rms': float(np.sqrt(np.mean(rows.difference**2))),
         'residual_rms': float(np.sqrt(np.mean(fit.residual**2))),
         'residual_median': float(np.sqrt(np.median(np.sum(fit.residual**2, axis=1)))),
-        'attenuation': float(1 - fit.seen[0].min()),
-        'motion_sd': np.sqrt(np.diag(motion)).tolist(),
-        'calibration_sd': np.sqrt(np.diag(calibration)).tolist(),
-        'rotation_sd': np.sqrt(np.diag(turned)).tolist(),
-        **{name: float(v) for name, v in zip(NUISANCE, [*fit.values[3:7], delay])},
+        'attenuation': float(1 - fit.signal_shares.min()),
+        'motion_sd': np.sqrt(np.diag(motion_cov)).tolist(),
+        'calibration_sd': np.sqrt(np.diag(calibration_cov)).tolist(),
+        'rotation_sd': np.sqrt(np.diag(rotation_cov)).tolist(),
+        **nuisances,
     }
-    statuses = tuple('determined' if s <= ARM_TOLERANCE else 'weak' for s in sd)
     return RelativeArm(
-        fit.values[:3], total, rotation.mat_ab, rotation.offset, statuses, diagnostics
+        arm=fit.values[:3],
+        covariance=covariance,
+        mat_ab=rotation.mat_ab,
+        time_offset=rotation.offset,
+        statuses=tuple('determined' if s <= ARM_TOLERANCE else 'weak' for s in sd),
+        diagnostics=diagnostics,
     )
 
 
-def _require_seen(seen, sd):
-    """
-    Refuse when the signal of a direction of the arm is the gyroscopes' noise, or hardly above it.
-    """
-    shares, directions = seen
-    direction = directions[:, np.argmin(shares)]
-    worst = (
-        int(np.argmax(np.abs(direction)))
-        if shares.min() < 0.5
-        else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
+def _require_signal(fit: Fit, sd: np.ndarray) -> None:
+    """Refuse an arm of which a direction has less signal than noise, or too large an sd."""
+    least_share = fit.signal_shares.min()
+    if least_share < 0.5:
+        # Mostly noise of the gyroscopes: the axis that contributes most to the direction.
+        direction = fit.directions[:, np.argmin(fit.signal_shares)]
+        axis = 'xyz'[int(np.argmax(np.abs(direction)))]
+    elif not np.all(sd < 0.5 * ARM_PRIOR):
+        axis = 'xyz'[int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))]
+    else:
+        return
+    raise NotObservableError(
+        f'the motion must show the whole arm, along {axis} only'
+        f' {max(least_share, 0):.0%} of the signal is not noise and the sd is {np.max(sd):.2g}'
+        f' m; rotate fast also about the axes perpendicular to {axis}',
+        code='arm_not_observable',
     )
-    if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
-        raise NotObservableError(
-            f'the motion must show the whole arm, along {"xyz"[worst]} only'
-            f' {max(shares.min(), 0):.0%} of the signal is not noise and the sd is {np.max(sd):.2g}'
-            f' m; rotate fast also about the axes perpendicular to {"xyz"[worst]}',
-            code='arm_not_observable',
-        )

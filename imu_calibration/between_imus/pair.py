@@ -49,7 +49,7 @@ class Windows(AlignedArrays):
     """
 
     index: np.ndarray
-    """Samples of each window, padded with the last one, shape (n_windows, width)."""
+    """Indices of the samples of each window, padded, shape (n_windows, width)."""
     weight: np.ndarray
     """Quadrature weights of `mean`, zero for padding, shape (n_windows, width)."""
     weight_slope: np.ndarray
@@ -72,7 +72,9 @@ class Windows(AlignedArrays):
 
 def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Windows:
     """
-    Lay windows of `length` seconds around `centres` over the samples at `time`.
+    Return the windows of `length` seconds around `centres` over the samples at `time`.
+
+    The weight of a window is ``phi(t) = sin^6(pi (t - begin) / length) / (5/16) / length``.
 
     Parameters
     ----------
@@ -103,19 +105,24 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
     return Windows(index, weight, slope)
 
 
-def _weighted(index, weight, values):
-    block = max(1, MAX_GATHERED_NUMBERS // (index.shape[1] * values.shape[1]))  # bounds memory
-    parts = [
-        np.einsum('mw,mwk->mk', weight[k : k + block], values[index[k : k + block]])
-        for k in range(0, len(index), block)
-    ]
-    return np.concatenate(parts) if parts else np.zeros((0, values.shape[1]))
+def _weighted(index: np.ndarray, weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """
+    Return the weighted sums of values (n, k) over windows, shape (n_windows, k).
+
+    They are computed in blocks of windows, which bounds the memory.
+    """
+    block = max(1, MAX_GATHERED_NUMBERS // (index.shape[1] * values.shape[1]))
+    sums = [np.zeros((0, values.shape[1]))]
+    for start in range(0, len(index), block):
+        part = slice(start, start + block)
+        sums.append(np.einsum('mw,mwk->mk', weight[part], values[index[part]]))
+    return np.concatenate(sums)
 
 
 def holes(time: np.ndarray, longest: float) -> np.ndarray:
     """Return flags of samples next to a step longer than `longest` seconds, shape (n,)."""
-    wide = np.diff(time) > longest
-    return np.concatenate([wide, [False]]) | np.concatenate([[False], wide])
+    is_hole = np.diff(time) > longest
+    return np.concatenate([is_hole, [False]]) | np.concatenate([[False], is_hole])
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +132,9 @@ class PairedImu:
     time: np.ndarray
     """Seconds since A's first sample on its own clock, shape (n,)."""
     force: np.ndarray
-    """Specific force, own frame, m/s^2, shape (n, 3)."""
+    """Specific force in the frame of this IMU, m/s^2, shape (n, 3)."""
     rate: np.ndarray
-    """Angular rate, own frame, rad/s, shape (n, 3)."""
+    """Angular rate in the frame of this IMU, rad/s, shape (n, 3)."""
     flagged: np.ndarray
     """Samples at the end of the range or next to a hole, shape (n,)."""
     calibration: HandCalibration | None
@@ -153,7 +160,9 @@ class PairedImu:
             calibration = calibrate_by_hand(imu, HandOptions(), still)
             force, rate = calibration.compensate(imu.force_s, imu.rate_s)
         except NotObservableError:
-            bias = np.mean([imu.rate_s[s].mean(0) for s in still], axis=0) if still else np.zeros(3)
+            bias = np.zeros(3)
+            if still:
+                bias = np.mean([imu.rate_s[rest].mean(0) for rest in still], axis=0)
             calibration = None
             force = imu.force_s
             rate = imu.rate_s - bias
@@ -229,10 +238,10 @@ class RelativeRotation:
 
 def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
     """
-    Return the rotation and the offset.
+    Return the rotation and the time offset of B relative to A.
 
-    The rotation is from the directions at rest if both were calibrated, otherwise from the rates.
-    The offset is from the rates.
+    The offset is estimated from the rates. So is the rotation, unless both IMUs were calibrated:
+    then it is estimated from the directions of gravity at rest.
     """
     offset = 0.0
     length = window_length(a, b)
@@ -240,40 +249,50 @@ def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
         centres = window_centres(a, b, offset=offset, length=length)
         over_a = make_windows(a.time, centres, length)
         over_b = make_windows(b.time, centres + offset, length)
-        free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
-        over_a = over_a.select(free)
-        over_b = over_b.select(free)
+        is_used = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
+        over_a = over_a.select(is_used)
+        over_b = over_b.select(is_used)
         rate_a = over_a.mean(a.rate)
         rate_b = over_b.mean(b.rate)
         alpha = over_a.slope(a.rate)
         mat_ab = nearest_rotation(rate_a.T @ rate_b)
-        offset -= float(
-            np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300)
-        )
+        # The delay d of B changes its rate by ``-d alpha``: least squares.
+        difference = rate_b @ mat_ab.T - rate_a
+        offset -= float(np.sum(difference * alpha) / max(np.sum(alpha * alpha), 1e-300))
+
+    # Windows of rates overlap, so that their errors are not independent.
+    vectors_a, vectors_b, overlap = rate_a, rate_b, SAMPLES_LEAST
     at_rest = _directions_at_rest(a, b, offset)
-    pairs, overlap = ((rate_a, rate_b), SAMPLES_LEAST) if at_rest is None else (at_rest, 1)
-    mat_ab = nearest_rotation(pairs[0].T @ pairs[1])
-    residual = pairs[0] - pairs[1] @ mat_ab.T
-    cross = skew(pairs[0])
+    if at_rest is not None:
+        vectors_a, vectors_b = at_rest
+        overlap = 1
+    mat_ab = nearest_rotation(vectors_a.T @ vectors_b)
+    residual = vectors_a - vectors_b @ mat_ab.T
+    cross = skew(vectors_a)
     information = np.einsum('nki,nkj->ij', cross, cross) + 1e-12 * np.eye(3)
-    return RelativeRotation(
-        mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset
-    )
+    covariance = overlap * np.mean(residual**2) * np.linalg.inv(information)
+    return RelativeRotation(mat_ab, covariance, offset)
 
 
-def _directions_at_rest(a, b, offset):
+def _directions_at_rest(
+    a: PairedImu, b: PairedImu, offset: float
+) -> tuple[np.ndarray, np.ndarray] | None:
     """
-    Return mean forces of both over the times when both rest.
+    Return the mean forces of A and B in the poses of A, m/s^2, each of shape (k, 3).
 
-    Or None when there are too few directions.
+    None with fewer than four poses, or where an IMU has no calibration from poses.
     """
     if a.calibration is None or b.calibration is None:
         return None
-    pairs = []
-    for first, last in zip(a.calibration.poses.start, a.calibration.poses.stop):
-        begin = a.time[first]
-        end = a.time[last - 1]
+    forces_a = []
+    forces_b = []
+    for start, stop in zip(a.calibration.poses.start, a.calibration.poses.stop):
+        begin = a.time[start]
+        end = a.time[stop - 1]
         in_b = slice(*np.searchsorted(b.time, (begin + offset, end + offset)))
         if in_b.stop - in_b.start >= 2:
-            pairs.append((a.force[first:last].mean(0), b.force[in_b].mean(0)))
-    return tuple(np.array(pairs).swapaxes(0, 1)) if len(pairs) >= 4 else None
+            forces_a.append(a.force[start:stop].mean(0))
+            forces_b.append(b.force[in_b].mean(0))
+    if len(forces_a) < 4:
+        return None
+    return np.array(forces_a), np.array(forces_b)
