@@ -1,6 +1,6 @@
 """From a recording and a calibration to corrected samples, in memory or in a new bag."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.allan.figures import NoiseFigures
+from imu_calibration.compensation.compensate import Corrected, Transfer
 from imu_calibration.compensation.stream import (
     CompensationStream,
     late_ns,
@@ -19,12 +20,12 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import counter
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.scales import DOUBTFUL, IMPOSSIBLE, scale_range
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.document.calibration import ABSENT, Calibration
-from imu_calibration.document.trust import caveats, usable, with_measured_noise
+from imu_calibration.document.trust import Usable, caveats, usable, with_measured_noise
 from imu_calibration.effects.base import Role
 from imu_calibration.preprocessing.checks import (
     frozen_lines,
@@ -45,6 +46,7 @@ from imu_calibration.use_cases.recordings import (
     read_split,
     temperatures,
 )
+from msg_adapters.bag import Recording
 from msg_adapters.csv_log import (
     corrected_log,
     is_log_folder,
@@ -181,13 +183,13 @@ def compensate_recording(
         required temperatures, or the output exists.
 
     """
-    calibration = files.given_calibration(calibration)
-    used = usable(calibration, anyway=anyway)
+    used = usable(files.given_calibration(calibration), anyway=anyway)
     calibration = used.calibration
     figures = noise_of(noise)
-    calibration = calibration if figures is None else with_measured_noise(calibration, figures)
+    if figures is not None:
+        calibration = with_measured_noise(calibration, figures)
     transfer = requested_transfer(target_frame, target_xyz, target_rpy)
-    late = late_ns(calibration, correct_stamps)
+    shift_ns = late_ns(calibration, correct_stamps)
     units = {
         'nominal': nominal,
         'accelerometer_unit': accelerometer_unit,
@@ -196,10 +198,11 @@ def compensate_recording(
     }
     readings = readings_for(calibration, units)
     mask = ExclusionMask(parse_exclusions(exclude) if exclude else ())
+    correction = _Correction(calibration, used, transfer, shift_ns, readings, mask)
+
+    # Samples in memory, and text logs.
     if isinstance(recording, (ImuSamples, SampleBlock)):
-        return _in_memory(
-            recording, calibration, transfer, late=late, used=used, readings=readings, mask=mask
-        )
+        return _in_memory(recording, correction)
     if output is not None and Path(output).exists():
         raise InputError(
             f'the output {output} must not exist yet; choose another name or remove it',
@@ -208,27 +211,19 @@ def compensate_recording(
     log = log_options(readings, units | {'columns': columns, 'where': where})
     topics = Topics(imu_topic, None, temperature_topic, frame_id, gyroscope_topic, log)
     if output is not None and is_text_log(output):
-        return _into_text_log(
-            recording,
-            output,
-            calibration,
-            transfer=transfer,
-            late=late,
-            used=used,
-            readings=readings,
-            topics=topics,
-            mask=mask,
-        )
+        return _into_text_log(recording, output, correction, topics)
     _refuse_corrected_log(recording)
-    other, frame = None, target_frame
+
+    # A bag with the sensors on two topics.
+    other = None
+    frame = target_frame
     checks = RawChecks(readings, calibration)
     if gyroscope_topic is not None:
         split = read_split(recording, topics)
         joined = split.joined.imu
         if output is None:
-            block = SampleBlock(joined, None, temperatures(recording, topics))
             return _in_memory(
-                block, calibration, transfer, late=late, used=used, readings=readings, mask=mask
+                SampleBlock(joined, None, temperatures(recording, topics)), correction
             )
         # The messages of the slower sensor are corrected, in the frame of the accelerometer.
         checks.require_scale(joined.select(slice(UNIT_READINGS)))
@@ -237,77 +232,165 @@ def compensate_recording(
         frame = target_frame or joined.frame_id
         if split.topic == gyroscope_topic:
             topics = topics._replace(imu=gyroscope_topic, frame=None)
+    # A bag, block by block: into memory, or into another bag.
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
         refuse_corrected(bag.imu_topic)
         if other is None:
             checks.require_scale(_first_readings(recording, topics))
-        stream = CompensationStream(
-            calibration, temperature=temperatures(recording, topics), transfer=transfer
-        )
-        search = FrozenSearch()
-
-        def correct(imu):
-            advance(len(imu))
-            checks.push(imu)
-            search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
-            return stream.correct(readings.apply(imu))
-
-        def keep(stamp_ns):
-            kept = mask.kept(stamp_ns)
-            return kept if other is None else kept & other.known(stamp_ns)
-
-        def propagate(force_cov, rate_cov):
-            # Measured covariances are in the units of the readings.
-            if force_cov is not None:
-                force_cov = readings.accelerometer.convert_covariance(force_cov)
-            if rate_cov is not None:
-                rate_cov = readings.gyroscope.convert_covariance(rate_cov)
-            return stream.propagate(force_cov, rate_cov)
-
+        run = _CorrectionRun(correction, checks, temperatures(recording, topics), advance)
         if output is None:
-            parts = []
-            for block in bag.blocks():
-                if block.imu is not None:
-                    imu = block.imu.select(mask.kept(block.imu.stamp_ns))
-                    parts.append(_corrected(imu, correct(imu), transfer, late))
-            mask.require_used()
-            checks.require()
-            return _outcome(
-                ImuSamples.concatenate(parts) if parts else None,
-                stream,
-                bag.lost,
-                used=used,
-                search=search,
-                checks=checks,
-            )
+            return _samples_of_bag(bag, run)
+
         from msg_adapters.copying import copy_with_corrected
 
-        def check():
-            mask.require_used()
-            checks.require()
+        def keep(stamp_ns: np.ndarray) -> np.ndarray:
+            """Return which messages are corrected."""
+            kept = mask.kept(stamp_ns)
+            return kept if other is None else kept & other.known(stamp_ns)
 
         lost = copy_with_corrected(
             recording,
             output,
             bag.imu_topic,
             corrected_topic=corrected_topic,
-            correct=correct,
-            propagate=propagate,
+            correct=run.correct,
+            propagate=run.propagate,
             frame_id=frame or None,
             mat_ts=None if transfer is None else transfer.mat_ts,
-            late_ns=late,
+            late_ns=shift_ns,
             source_frame_id=topics.frame,
             log=log,
-            check=check,
+            check=run.require_valid,
             keep=keep if exclude or other is not None else None,
             other=other,
         )
-        return _outcome(None, stream, lost, used=used, search=search, checks=checks)
+        return run.outcome(None, lost)
 
 
-def _into_text_log(recording, output, calibration, *, transfer, late, used, readings, topics, mask):
+@dataclass(frozen=True, eq=False)
+class _Correction:
+    """A calibration, and the options of its application to one recording."""
+
+    calibration: Calibration
+    """The calibration as applied: without unusable sensors, with the measured noise."""
+    used: Usable
+    """Sensors that are not corrected, and cautions on the corrected ones."""
+    transfer: Transfer | None
+    """Move to another frame of the rigid body; None: none."""
+    shift_ns: int
+    """Subtracted from the stamps, ns."""
+    readings: RawReadings
+    """Units and axes of the readings."""
+    mask: ExclusionMask
+    """Times without corrected readings."""
+
+    def samples(self, imu: ImuSamples, corrected: Corrected) -> ImuSamples:
+        """Return corrected readings as samples; `imu`: the raw ones."""
+        frame_id = imu.frame_id if self.transfer is None else self.transfer.frame_id
+        return ImuSamples(imu.stamp_ns - self.shift_ns, corrected.force, corrected.rate, frame_id)
+
+
+class _CorrectionRun:
+    """Correction of the samples of one recording in order, with the checks of its raw readings."""
+
+    def __init__(
+        self,
+        correction: _Correction,
+        checks: 'RawChecks',
+        temperature: TemperatureSamples | None,
+        advance: Callable[[int], object] = lambda count: None,
+    ):
+        self.correction = correction
+        self.checks = checks
+        self.stream = CompensationStream(
+            correction.calibration, temperature=temperature, transfer=correction.transfer
+        )
+        # Search for parts in which a sensor repeats one reading.
+        self._frozen = FrozenSearch()
+        # Called with the number of samples of each block, to show the progress.
+        self._advance = advance
+
+    def check(self, imu: ImuSamples) -> None:
+        """Add raw samples to the checks."""
+        self._advance(len(imu))
+        self.checks.push(imu)
+        self._frozen.push(imu.stamp_ns, imu.force_s, imu.rate_s)
+
+    def correct(self, imu: ImuSamples) -> Corrected:
+        """Check and correct the next raw samples."""
+        self.check(imu)
+        return self.stream.correct(self.correction.readings.apply(imu))
+
+    def propagate(
+        self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the covariances of corrected readings, see `CompensationStream.propagate`."""
+        # Measured covariances are in the units of the readings.
+        readings = self.correction.readings
+        if force_cov is not None:
+            force_cov = readings.accelerometer.convert_covariance(force_cov)
+        if rate_cov is not None:
+            rate_cov = readings.gyroscope.convert_covariance(rate_cov)
+        return self.stream.propagate(force_cov, rate_cov)
+
+    def require_valid(self) -> None:
+        """Raise for an excluded time without samples, or raw readings that no correction suits."""
+        self.correction.mask.require_used()
+        self.checks.require()
+
+    def outcome(self, imu: ImuSamples | None, lost: dict[str, int]) -> Compensated:
+        """
+        Return the result after the last samples.
+
+        `imu`: corrected samples, None if they were written; `lost`: reason -> unreadable messages.
+        """
+        stream = self.stream
+        used = self.correction.used
+        lines = [*used.lines, *caveats(stream.calibration)]
+        refused = dict(used.refused)
+        for sensor in stream.calibration.absent:
+            if stream.measured[sensor]:  # readings without a calibration pass unchanged
+                refused[sensor] = ABSENT
+                lines.append(f'the {sensor} is not corrected: {ABSENT}')
+        frozen = self._frozen.parts()
+        lines += frozen_lines(frozen, 'the corrected topic has no measurements there')
+        n_wrapped = self.checks.n_wrapped
+        if n_wrapped:
+            lines.append(
+                f'{n_wrapped} samples are in motions whose readings wrap around at the end of'
+                ' the range of the converter: their corrected readings are wrong; move less fast or'
+                ' choose a wider range'
+            )
+        # Both sensors are frozen in one part where the IMU is: it counts once.
+        samples_of_part = {(part.start, part.stop): part.samples for part in frozen}
+        return Compensated(
+            imu,
+            stream.count,
+            warnings=lines + stream.warnings(),
+            lost=lost,
+            refused=refused,
+            cautions=(*used.cautions, *self.checks.cautions),
+            frozen=sum(samples_of_part.values()),
+            wrapped=n_wrapped,
+        )
+
+
+def _samples_of_bag(bag: Recording, run: _CorrectionRun) -> Compensated:
+    """Correct the samples of a bag in memory."""
+    parts = []
+    for block in bag.blocks():
+        if block.imu is not None:
+            imu = block.imu.select(run.correction.mask.kept(block.imu.stamp_ns))
+            parts.append(run.correction.samples(imu, run.correct(imu)))
+    run.require_valid()
+    return run.outcome(ImuSamples.concatenate(parts) if parts else None, bag.lost)
+
+
+def _into_text_log(
+    recording: str | PathLike, output: str | PathLike, correction: _Correction, topics: Topics
+) -> Compensated:
     """Correct a text log into another one with the same columns."""
     from msg_adapters.csv_copy import write_corrected_log
 
@@ -317,7 +400,7 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
             f' {output}; name a folder for a bag',
             code='output_kind',
         )
-    if late:
+    if correction.shift_ns:
         raise InputError(
             'stamps are copied as text into a text log and cannot be moved; name a folder for a'
             ' bag, or leave the stamps as they are',
@@ -325,16 +408,13 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
         )
     _refuse_corrected_log(recording)
     log = read_directly(existing(recording), topics.log)
-    block = SampleBlock(log.imu, None, log.temperature)
-    found = _in_memory(
-        block, calibration, transfer, late=0, used=used, readings=readings, mask=mask
-    )
+    result = _in_memory(SampleBlock(log.imu, None, log.temperature), correction)
     with files.output_folder(str(Path(output).parent)):
-        write_corrected_log(output, log, found.imu)
-    return replace(found, imu=None)
+        write_corrected_log(output, log, result.imu)
+    return replace(result, imu=None)
 
 
-def _refuse_corrected_log(recording):
+def _refuse_corrected_log(recording: str | PathLike) -> None:
     """Refuse text logs whose header states that their readings are corrected."""
     log = corrected_log(recording)
     if log is not None:
@@ -345,9 +425,14 @@ def _refuse_corrected_log(recording):
         )
 
 
-def _first_readings(recording, topics):
-    """Return the samples at the start of a bag, in a pass of its own: nothing is written before."""
-    parts, count = [], 0
+def _first_readings(recording: str | PathLike, topics: Topics) -> ImuSamples | None:
+    """
+    Return about `UNIT_READINGS` samples at the start of a bag; None without any.
+
+    The bag is read a second time, so that nothing is written before they are checked.
+    """
+    parts = []
+    count = 0
     with open_bag(recording, topics, want_joints=False) as bag:
         for block in bag.blocks():
             if block.imu is None:
@@ -363,15 +448,15 @@ class RawChecks:
     """
     Checks of raw readings.
 
-    Unit and scale of the force before the correction; of all readings stamps, one sensor, and the
-    unit of the rates.
+    `require_scale` checks unit and scale of the force before the correction; `push` and `require`
+    check the stamps, the number of sensors and the unit of the rates of all readings.
 
     Parameters
     ----------
     readings : RawReadings
-        Their stated units.
+        Stated units of the readings.
     calibration : Calibration
-        That corrects them.
+        The calibration that corrects them.
 
     """
 
@@ -380,7 +465,9 @@ class RawChecks:
         self.cautions: tuple[str, ...] = ()
         """A line for each sensor whose corrected readings may have another scale than the truth."""
         self._readings = readings
+        # Counts repeated stamps and wrapped readings, and recognises two sensors in one stream.
         self._check = StreamCheck(one_sensor=True)
+        # Compares the rates with the turns of gravity.
         self._gatherer = EvidenceGatherer(STANDARD_GRAVITY)
         self._n_samples = 0
 
@@ -415,7 +502,7 @@ class RawChecks:
         """
         Raise for equal stamps, two sensors, or rates in another unit or at another scale.
 
-        After the last samples.
+        It is called after the last samples.
         """
         self._check.finish()
         n_repeated = self._check.counts['repeated stamp']
@@ -428,6 +515,7 @@ class RawChecks:
         matrix = self._calibration.of('gyroscope', Role.LINEAR)
         if evidence.turning is None or matrix is None or 'gyroscope' in self._calibration.absent:
             return
+        # Corrected rate over the true one.
         ratio = 1.0 / (evidence.turning.factor * float(np.mean(np.diag(matrix))))
         text = corrected_rates_text(ratio)
         if scale_range(ratio) is IMPOSSIBLE:
@@ -441,58 +529,24 @@ class RawChecks:
         return self._check.counts['wrapped']
 
 
-def _in_memory(recording, calibration, transfer, *, late, used, readings, mask):
+def _in_memory(recording: ImuSamples | SampleBlock, correction: _Correction) -> Compensated:
+    """Correct samples in memory; in excluded times corrected readings are NaN."""
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
     # A recording in memory has samples of an IMU.
     assert block.imu is not None
-    kept = mask.kept(block.imu.stamp_ns)
-    mask.require_used()
+    kept = correction.mask.kept(block.imu.stamp_ns)
+    correction.mask.require_used()
     imu = block.imu.select(kept)
-    checks = RawChecks(readings, calibration)
+    checks = RawChecks(correction.readings, correction.calibration)
     checks.require_scale(imu)
-    stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
-    search = FrozenSearch()
-    checks.push(imu)
+    run = _CorrectionRun(correction, checks, block.temperature)
+    run.check(imu)
     checks.require()
-    search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
-    corrected = _corrected(imu, stream.correct(readings.apply(imu)), transfer, late)
+    corrected = correction.samples(imu, run.stream.correct(correction.readings.apply(imu)))
     if not kept.all():
-        # one sample for each reading, without values in the excluded times
         force, rate = np.full((2, len(kept), 3), np.nan)
-        force[kept], rate[kept] = corrected.force_s, corrected.rate_s
-        corrected = ImuSamples(block.imu.stamp_ns - late, force, rate, corrected.frame_id)
-    return _outcome(corrected, stream, {}, used=used, search=search, checks=checks)
-
-
-def _outcome(imu, stream, lost, *, used, search, checks):
-    against = [*used.lines, *caveats(stream.calibration)]
-    refused = dict(used.refused)
-    for sensor in stream.calibration.absent:
-        if stream.measured[sensor]:  # readings that nothing is known about pass unchanged
-            refused[sensor] = ABSENT
-            against.append(f'the {sensor} is not corrected: {ABSENT}')
-    frozen = search.parts()
-    against += frozen_lines(frozen, 'the corrected topic has no measurements there')
-    if checks.n_wrapped:
-        against.append(
-            f'{checks.n_wrapped} samples are in motions whose readings wrap around at the end of'
-            ' the range of the converter: their corrected readings are wrong; move less fast or'
-            ' choose a wider range'
-        )
-    # both sensors are frozen in one part where the IMU is
-    samples = {(part.start, part.stop): part.samples for part in frozen}
-    return Compensated(
-        imu,
-        stream.count,
-        against + stream.warnings(),
-        lost,
-        refused,
-        (*used.cautions, *checks.cautions),
-        sum(samples.values()),
-        checks.n_wrapped,
-    )
-
-
-def _corrected(imu, corrected, transfer, late):
-    frame_id = imu.frame_id if transfer is None else transfer.frame_id
-    return ImuSamples(imu.stamp_ns - late, corrected.force, corrected.rate, frame_id)
+        force[kept] = corrected.force_s
+        rate[kept] = corrected.rate_s
+        stamp_ns = block.imu.stamp_ns - correction.shift_ns
+        corrected = ImuSamples(stamp_ns, force, rate, corrected.frame_id)
+    return run.outcome(corrected, {})
