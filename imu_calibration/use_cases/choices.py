@@ -26,6 +26,7 @@ from imu_calibration.core.settings import override
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import checked_tolerances
+from imu_calibration.effects.base import Effect
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.motions import SENSOR_MOTIONS
 from imu_calibration.kinematics.rotations import local_gravity
@@ -42,7 +43,7 @@ from msg_adapters.csv_log import SENSOR_OF, LogOptions
 
 
 class Choices(TypedDict, total=False):
-    """All options have defaults."""
+    """Options of the user by name; each has a default."""
 
     imu_topic: str | None
     """sensor_msgs/Imu; default /imu/data_raw, otherwise the only one."""
@@ -69,7 +70,7 @@ class Choices(TypedDict, total=False):
     rotation shows it.
     """
     gyroscope_model: str | None
-    """The same for the gyroscope; default bias+matrix."""
+    """A named model or effect names joined by +, of the gyroscope; default bias+matrix."""
     reference_model: str | None
     """
     Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate unless
@@ -145,27 +146,30 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     if choices.get('candidates') is not None:
         catalogue = catalogue.with_candidates(choices['candidates'])
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
-    read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
+    if isinstance(tolerances, Mapping):
+        tolerances = checked_tolerances(tolerances, catalogue)
+    else:
+        tolerances = files.read_tolerances(tolerances, catalogue)
     gravity, gravity_sd = local_gravity(
-        *(choices.get(name) for name in ('gravity', 'latitude', 'height'))
+        choices.get('gravity'), choices.get('latitude'), choices.get('height')
     )
     return CalibrationOptions(
-        choices.get('accelerometer_model'),
-        choices.get('gyroscope_model'),
-        choices.get('reference_model'),
-        read(tolerances, catalogue),
-        window_settings(choices.get('setting') or ()),
-        readings_of(choices),
-        gravity,
-        catalogue,
-        noise_of(choices.get('noise')),
+        accelerometer_model=choices.get('accelerometer_model'),
+        gyroscope_model=choices.get('gyroscope_model'),
+        reference_model=choices.get('reference_model'),
+        tolerances=tolerances,
+        windows=window_settings(choices.get('setting') or ()),
+        nominal=readings_of(choices),
+        gravity=gravity,
+        catalogue=catalogue,
+        noise=noise_of(choices.get('noise')),
         as_asked=bool(choices.get('model_as_asked')),
         gravity_sd=gravity_sd,
     )
 
 
 def catalogue_of(chosen: Catalogue | str | PathLike | Mapping | None) -> Catalogue:
-    """Return the effects that there are, read where they are in a file."""
+    """Return the chosen catalogue of effects: given, in a file, or additions to the package's."""
     if isinstance(chosen, Catalogue):
         return chosen
     if isinstance(chosen, (str, PathLike)):
@@ -191,17 +195,17 @@ def window_settings(chosen: Sequence[str] | Mapping[str, float]) -> WindowSettin
 
 
 def noise_of(chosen: str | PathLike | NoiseFigures | None) -> NoiseFigures | None:
-    """Return the noise, read where it is a file."""
-    return (
-        chosen if chosen is None or isinstance(chosen, NoiseFigures) else files.read_noise(chosen)
-    )
+    """Return the noise figures, read where a file is chosen; None without a choice."""
+    if chosen is None or isinstance(chosen, NoiseFigures):
+        return chosen
+    return files.read_noise(chosen)
 
 
 def readings_of(choices: Mapping[str, Any]) -> RawReadings | None:
     """
-    Return the description of the readings that was chosen.
+    Return the description of the readings that was chosen; None without a choice.
 
-    From the file or scaling `nominal` and from the stated units; None without any.
+    It is that of the file or description `nominal`, with the units and axes that are stated.
 
     Raises
     ------
@@ -235,7 +239,8 @@ def readings_for(calibration: Calibration, choices: Mapping[str, Any]) -> RawRea
     """
     Return the description of readings to which a calibration is applied.
 
-    That of the calibration; a sensor, or axes, that the choices state replace its own.
+    It is that of the calibration, with the sensors and axes that the choices state. A file or
+    description `nominal` replaces it completely.
     """
     described = readings_of(choices)
     if described is None:
@@ -245,7 +250,7 @@ def readings_for(calibration: Calibration, choices: Mapping[str, Any]) -> RawRea
     return combined(calibration.readings, **_stated(choices))
 
 
-def _stated(choices):
+def _stated(choices: Mapping[str, Any]) -> dict[str, Any]:
     """Return the units and axes that options state, as arguments of `readings.combined`."""
     return {name: choices.get(name) for name in (*STATED_KEYS, AXES_KEY)}
 
@@ -257,14 +262,14 @@ def log_options(readings: RawReadings | None, choices: Mapping[str, Any]) -> Log
     Quantities with a stated unit are read without conversion: the description of the readings
     converts them.
     """
-    raw = []
+    raw_quantities = []
     for quantity, sensor in SENSOR_OF.items():
         stated = choices.get(UNIT_KEYS[sensor])
         if readings is not None and (stated or not getattr(readings, sensor).is_si):
-            raw.append(quantity)
+            raw_quantities.append(quantity)
     columns = choices.get('columns') or ()
     where = choices.get('where') or ()
-    return LogOptions(tuple(columns), tuple(where), tuple(raw))
+    return LogOptions(tuple(columns), tuple(where), tuple(raw_quantities))
 
 
 MAX_SHOWN_COLUMNS = 3
@@ -273,9 +278,10 @@ MAX_SHOWN_COLUMNS = 3
 
 def effect_rows(added: str | PathLike | None = None) -> list[dict[str, Any]]:
     """
-    Return one mapping per effect.
+    Return one mapping per effect of the catalogue, with the additional ones of a file.
 
-    Name, sensor, unit, tolerance, compensation, sentence, equation, required data and motion.
+    Its keys are name, sensor, unit, tolerance, compensation, sentence, equation, and the required
+    data and motion.
 
     Raises
     ------
@@ -286,7 +292,8 @@ def effect_rows(added: str | PathLike | None = None) -> list[dict[str, Any]]:
     return [_row(effect) for effect in catalogue_of(added).effects().values()]
 
 
-def _row(effect):
+def _row(effect: Effect) -> dict[str, Any]:
+    """Return an effect as plain data."""
     units = (effect.unit,) if isinstance(effect.unit, str) else tuple(dict.fromkeys(effect.unit))
     motions = [text for name, text in SENSOR_MOTIONS.items() if name in effect.motion]
     return {
@@ -301,11 +308,11 @@ def _row(effect):
     }
 
 
-def _equation(effect):
+def _equation(effect: Effect) -> str:
     """
-    Return the output of the effect as a sum of coefficients times columns.
+    Return the output of the effect as a sum of coefficients times columns, as text.
 
-    Empty where it changes the reference motion.
+    It is empty for an effect that changes the reference motion.
     """
     columns = []
     for group in effect.groups:
@@ -352,46 +359,48 @@ def provenance_with(
     """
     used = dict(choices) | options_of(stand)
     used['tolerances'] = used.get('tolerances') or config_file('tolerances.yaml')
-    if isinstance(setting := used.get('setting'), Mapping):
+    setting = used.get('setting')
+    if isinstance(setting, Mapping):
         used['setting'] = [f'{name}={value}' for name, value in setting.items()]
-    options = {
-        name: _named(used[name]) for name in sorted(used) if used[name] and name not in LABELS
-    }
-    return {
-        'verb': verb,
-        **provenance_of(recordings, options),
-        **{name: str(used[name]) for name in LABELS if used.get(name)},
-    }
+    options = {}
+    for name in sorted(used):
+        if used[name] and name not in LABELS:
+            options[name] = _documented(used[name])
+    provenance = {'verb': verb, **provenance_of(recordings, options)}
+    for name in LABELS:
+        if used.get(name):
+            provenance[name] = str(used[name])
+    return provenance
 
 
-def _named(option):
-    """Return name and hash of a file or of data in memory; other options unchanged."""
+def _documented(option: Any) -> Any:
+    """
+    Return an option as it is written into a document.
+
+    Of a file, and of data in memory, it is the name and the hash.
+    """
     if isinstance(option, (str, PathLike)):
-        return (
-            {'name': Path(option).name, 'sha256': files.hash_of(option)}
-            if Path(option).is_file()
-            else str(option)
-        )
+        if Path(option).is_file():
+            return {'name': Path(option).name, 'sha256': files.hash_of(option)}
+        return str(option)
     if isinstance(option, (bool, int, float)):
         return option
     if isinstance(option, Iterable) and not isinstance(option, Mapping):
         return list(option)
+    entry = {'name': 'in memory'}
     mapping = option.to_mapping() if isinstance(option, Table) else option
-    known = (
-        {'sha256': sha256(to_text(dict(mapping)).encode()).hexdigest()}
-        if isinstance(mapping, Mapping)
-        else {}
-    )
-    return {'name': 'in memory', **known}
+    if isinstance(mapping, Mapping):
+        entry['sha256'] = sha256(to_text(dict(mapping)).encode()).hexdigest()
+    return entry
 
 
-def made_from(found: Mapping[str, Any]) -> set[str]:
+def made_from(provenance: Mapping[str, Any]) -> set[str]:
     """Return the hashes of the recordings of a provenance, as many digits as all versions write."""
-    return {
-        str(bag.get('sha256'))[:SHORT_HASH_DIGITS]
-        for bag in found.get('bags') or ()
-        if isinstance(bag, Mapping)
-    }
+    hashes = set()
+    for bag in provenance.get('bags') or ():
+        if isinstance(bag, Mapping):
+            hashes.add(str(bag.get('sha256'))[:SHORT_HASH_DIGITS])
+    return hashes
 
 
 def require_same_inputs(
@@ -426,31 +435,32 @@ def require_same_inputs(
     if not path.exists():
         files.require_new(Path(folder) / files.REPORT, force=not report)
         return
-    found = provenance()
+    new = provenance()
     try:
-        before = files.read_mapping(path, 'document').get('provenance')
+        earlier = files.read_mapping(path, 'document').get('provenance')
     except ImuCalibrationError:
-        before = None
-    before = before if isinstance(before, Mapping) else {}
-    parts = {
-        'verb': before.get('verb', found.get('verb')) == found.get('verb'),
-        'recordings': made_from(before) == made_from(found),
-        'reference': _stands(before) == _stands(found),
-    }
-    if not all(parts.values()):
+        earlier = None
+    if not isinstance(earlier, Mapping):
+        earlier = {}
+    different = []
+    if earlier.get('verb', new.get('verb')) != new.get('verb'):
+        different.append('verb')
+    if made_from(earlier) != made_from(new):
+        different.append('recordings')
+    if _stand_options(earlier) != _stand_options(new):
+        different.append('reference')
+    if different:
         raise InputError(
             f'a result must not replace that of other inputs, {path} differs in'
-            f' {" and ".join(name for name, same in parts.items() if not same)}; choose another'
-            ' folder, or overwrite it',
+            f' {" and ".join(different)}; choose another folder, or overwrite it',
             key='force',
             code='other_result',
         )
 
 
-def _stands(found):
-    options = found.get('options')
-    return (
-        {name: options[name] for name in STANDS if name in options}
-        if isinstance(options, Mapping)
-        else {}
-    )
+def _stand_options(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a provenance that name the files of the reference."""
+    options = provenance.get('options')
+    if not isinstance(options, Mapping):
+        return {}
+    return {name: options[name] for name in STANDS if name in options}

@@ -51,14 +51,14 @@ class Topics(NamedTuple):
     temperature: str | None = None
     """sensor_msgs/Temperature, default /imu/temperature."""
     frame: str | None = None
-    """frame_id of the Imu messages; None: that of all."""
+    """frame_id of the Imu messages to read; None: all messages have the same."""
     gyroscope: str | None = None
     """sensor_msgs/Imu topic of the rates, where they have one of their own; None: as `imu`."""
     log: LogOptions = LogOptions()
     """Columns, rows and units of a text log."""
 
     def chosen(self) -> dict[str, Any]:
-        """Return them as arguments of `msg_adapters.bag.open_recording`."""
+        """Return the names as arguments of `msg_adapters.bag.open_recording`."""
         return {
             'imu_topic': self.imu,
             'joint_topic': self.joints,
@@ -87,7 +87,7 @@ def open_bag(
     """
     Open a recording with the topics that were chosen.
 
-    The rest as for `msg_adapters.bag.open_recording`.
+    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`.
     """
     return open_recording(
         existing(path),
@@ -102,7 +102,7 @@ class RecordingFile:
     """A recording in a file or folder, which any process reads from its start."""
 
     path: str
-    """Its path."""
+    """Path of the recording."""
     topics: Topics
     """Topics of the recording."""
     joint_names: Iterable[str] | None
@@ -135,14 +135,12 @@ class RecordingFile:
         """Yield the blocks and report the progress."""
         gyroscope = self.topics.gyroscope
         if gyroscope is not None:
-            of_force = replace(self, topics=self.topics._replace(gyroscope=None), quiet=True)
-            yield _with_gyroscope(list(of_force), self.path, gyroscope)
+            first_topic = replace(self, topics=self.topics._replace(gyroscope=None), quiet=True)
+            yield _with_gyroscope(list(first_topic), self.path, gyroscope)
             return
         recording = self.open()
-        advance = counter(
-            f'reading {files.name_of_path(self.path)}',
-            0 if self.quiet else recording.message_counts.get(recording.imu_topic, 0),
-        )
+        n_messages = 0 if self.quiet else recording.message_counts.get(recording.imu_topic, 0)
+        advance = counter(f'reading {files.name_of_path(self.path)}', n_messages)
         with recording:
             read = recording.blocks(self.joint_names) if self.want_joints else recording.blocks()
             with closing(read_ahead(read)) as blocks:
@@ -154,37 +152,40 @@ class RecordingFile:
                 yield SampleBlock(dropped=recording.lost)
 
 
-def _with_gyroscope(blocks, path, topic):
-    """Return one block: those of a recording, with the rates of another Imu topic."""
-    # All of the first topic.
-    parts: dict[str, list] = {'imu': [], 'joints': [], 'temperature': []}
+def _with_gyroscope(blocks: Iterable[SampleBlock], path: str, topic: str) -> SampleBlock:
+    """Return the blocks of a recording as one, with the rates of another Imu topic."""
+    # All samples of the first topic, with joints and temperatures.
+    imu_parts = []
+    joint_parts = []
+    temperature_parts = []
     dropped: Counter[str] = Counter()
     notes: Counter[str] = Counter()
     for block in blocks:
-        for name, samples in parts.items():
-            if getattr(block, name) is not None:
-                samples.append(getattr(block, name))
+        if block.imu is not None:
+            imu_parts.append(block.imu)
+        if block.joints is not None:
+            joint_parts.append(block.joints)
+        if block.temperature is not None:
+            temperature_parts.append(block.temperature)
         dropped.update(block.dropped or {})
         notes.update(block.notes or {})
 
-    # The rates of the other one, at the stamps of the first.
-    other = _imu_messages(path, Topics(imu=topic))
-    gyroscope = other.imu
-    dropped.update(other.lost)
-    if not parts['imu']:
+    # The rates of the other topic, at the stamps of the first one.
+    gyroscope = _imu_messages(path, Topics(imu=topic))
+    dropped.update(gyroscope.lost)
+    if not imu_parts:
         raise _no_samples('the topic of the accelerometer')
-    imu = ImuSamples.concatenate(parts['imu'])
+    imu = ImuSamples.concatenate(imu_parts)
     joined = join_sensors(
         finite_stream(imu.stamp_ns, imu.force_s),
-        finite_stream(gyroscope.stamp_ns, gyroscope.rate_s),
+        finite_stream(gyroscope.imu.stamp_ns, gyroscope.imu.rate_s),
         imu.frame_id,
     )
     remark(joined.text)
-    joints, temperature = None, None
-    if parts['joints']:
-        joints = JointSamples.concatenate(parts['joints'])
-    if parts['temperature']:
-        temperature = TemperatureSamples.concatenate(parts['temperature'])
+    joints = JointSamples.concatenate(joint_parts) if joint_parts else None
+    temperature = None
+    if temperature_parts:
+        temperature = TemperatureSamples.concatenate(temperature_parts)
     return SampleBlock(joined.imu, joints, temperature, dict(dropped), dict(notes))
 
 
@@ -193,9 +194,9 @@ class _ImuMessages:
     """All messages of an Imu topic."""
 
     topic: str
-    """Its name."""
+    """Name of the topic."""
     imu: ImuSamples
-    """Their samples."""
+    """Samples of the messages."""
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
 
@@ -212,7 +213,8 @@ def _imu_messages(path: str | PathLike, topics: Topics) -> _ImuMessages:
     return _ImuMessages(recording.imu_topic, ImuSamples.concatenate(parts), recording.lost)
 
 
-def _no_samples(topic):
+def _no_samples(topic: str) -> InputError:
+    """Return the error of an Imu topic without messages."""
     return InputError(
         f'both topics must hold Imu messages, {topic} holds none; check the topics',
         key='imu_topic',
@@ -243,16 +245,16 @@ def read_split(path: str | PathLike, topics: Topics) -> SplitRecording:
 
     """
     # The delay needs all readings of both sensors.
-    of_force = _imu_messages(path, topics._replace(gyroscope=None))
-    of_rate = _imu_messages(path, Topics(imu=topics.gyroscope))
-    frame = of_force.imu.frame_id
-    force = finite_stream(of_force.imu.stamp_ns, of_force.imu.force_s)
-    rate = finite_stream(of_rate.imu.stamp_ns, of_rate.imu.rate_s)
+    accelerometer = _imu_messages(path, topics._replace(gyroscope=None))
+    gyroscope = _imu_messages(path, Topics(imu=topics.gyroscope))
+    frame = accelerometer.imu.frame_id
+    force = finite_stream(accelerometer.imu.stamp_ns, accelerometer.imu.force_s)
+    rate = finite_stream(gyroscope.imu.stamp_ns, gyroscope.imu.rate_s)
     joined = join_sensors(force, rate, frame)
     remark(joined.text)
     if joined.slower == 'accelerometer':
-        return SplitRecording(joined, of_force.topic, OtherSensor('rate', rate, frame))
-    return SplitRecording(joined, of_rate.topic, OtherSensor('force', force, frame))
+        return SplitRecording(joined, accelerometer.topic, OtherSensor('rate', rate, frame))
+    return SplitRecording(joined, gyroscope.topic, OtherSensor('force', force, frame))
 
 
 def source_of(
@@ -265,14 +267,13 @@ def source_of(
     quiet: bool = False,
 ) -> BlockSource:
     """
-    Return a recording to read, also repeatedly.
+    Return a recording as blocks that can be read repeatedly; samples in memory are one block.
 
-    Samples in memory are a recording of one block.
-
-    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`; joints are read
-    if `joint_names` is given.
+    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`; by default joints
+    are read if `joint_names` is given.
     """
-    want_joints = joint_names is not None if want_joints is None else want_joints
+    if want_joints is None:
+        want_joints = joint_names is not None
     if isinstance(recording, SampleBlock):
         if not want_joints:
             recording = SampleBlock(recording.imu, None, recording.temperature)
@@ -304,24 +305,21 @@ def sources_without(
     if not exclude:
         return list(sources)
     names = [name_of(recording) for recording in recordings]
-    found = []
-    for source, exclusions in zip(
-        sources, exclusions_by_recording(parse_exclusions(exclude), names), strict=True
-    ):
-        found.append(WithoutExcluded(source, exclusions) if exclusions else source)
-    return found
+    exclusions_of = exclusions_by_recording(parse_exclusions(exclude), names)
+    reduced = []
+    for source, exclusions in zip(sources, exclusions_of, strict=True):
+        reduced.append(WithoutExcluded(source, exclusions) if exclusions else source)
+    return reduced
 
 
 def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:
     """
     Return names and hashes of recordings and the options for a document: the same in every run.
     """
-    return {
-        'bags': [
-            {'name': name_of(recording), 'sha256': _hash_of(recording)} for recording in recordings
-        ],
-        'options': options,
-    }
+    bags = []
+    for recording in recordings:
+        bags.append({'name': name_of(recording), 'sha256': _hash_of(recording)})
+    return {'bags': bags, 'options': options}
 
 
 def name_of(recording: str | PathLike | SampleBlock) -> str:
@@ -331,7 +329,8 @@ def name_of(recording: str | PathLike | SampleBlock) -> str:
     return files.name_of_path(recording)
 
 
-def _hash_of(recording):
+def _hash_of(recording: str | PathLike | SampleBlock) -> str:
+    """Return the SHA-256 of a file or folder, or of the samples of the IMU in memory."""
     if not isinstance(recording, SampleBlock):
         return files.hash_of(existing(recording))
     imu = recording.imu
@@ -345,25 +344,25 @@ def temperatures(path: str | PathLike, topics: Topics) -> TemperatureSamples | N
     parts = []
     with open_bag(path, topics, want_joints=False) as recording:
         if recording.temperature_topic:
-            parts = []
             for block in recording.blocks():
                 if block.temperature is not None and len(block.temperature):
                     parts.append(block.temperature)
     return TemperatureSamples.concatenate(parts) if parts else None
 
 
-def jobs_for(asked: int | None, n_items: int) -> int:
+def jobs_for(requested: int | None, n_items: int) -> int:
     """
-    Return the number of processes: as requested, by default one per processor.
+    Return the number of processes for some items, at most one for each.
 
-    At most the number of items.
+    It is the requested number, by default one per processor.
     """
-    if asked is not None and asked < 1:
+    if requested is not None and requested < 1:
         raise InputError(
-            f'at least one process must work, got {asked}; omit the number to use every processor',
+            f'at least one process must work, got {requested}; omit the number to use every'
+            ' processor',
             key='jobs',
         )
-    return max(1, min(asked or os.cpu_count() or 1, n_items))
+    return max(1, min(requested or os.cpu_count() or 1, n_items))
 
 
 def on_cluster(
@@ -476,48 +475,50 @@ def table_of(
         When a file cannot be used, or required data are not in the recordings.
 
     """
+    # A table, or its description.
     if isinstance(stand, Table):
-        description = {each.name: getattr(stand, each.name) for each in fields(stand)}
+        description = {field.name: getattr(stand, field.name) for field in fields(stand)}
         return Table.at(gravity, gravity_sd, description)
     if not isinstance(stand, Arm):
         if Path(stand).suffix not in DESCRIPTIONS:
             return files.read_table(stand, gravity=gravity, gravity_sd=gravity_sd)
         stand = Arm(stand)
-    site = (
-        dict(stand.site or {})
-        if isinstance(stand.site, Mapping | None)
-        else files.read_mapping(stand.site, 'table description')
-    )
-    bag = next(
-        (
-            (str(existing(item)), topics.imu)
-            for item in recordings
-            if not isinstance(item, SampleBlock)
-        ),
-        None,
-    )
+
+    # A robot: data that the user does not give are those of the first recording in a file.
+    if isinstance(stand.site, Mapping | None):
+        site = dict(stand.site or {})
+    else:
+        site = files.read_mapping(stand.site, 'table description')
+    bag = None  # path and Imu topic
+    for recording in recordings:
+        if not isinstance(recording, SampleBlock):
+            bag = (str(existing(recording)), topics.imu)
+            break
     text = _description(stand, bag)
     if stand.up is not None:
         site['up'] = list(stand.up)
     elif bag is not None and site.get('up') is None:
         site['up'] = list(up_of(root_of(text), static_transforms(*bag)))
-    return table_from_urdf(
-        text,
-        stand.imu_link or topics.frame or _frame(recordings, bag),
-        site,
-        gravity=gravity,
-        gravity_sd=gravity_sd,
-    )
+    imu_link = stand.imu_link or topics.frame or _frame(recordings, bag)
+    return table_from_urdf(text, imu_link, site, gravity=gravity, gravity_sd=gravity_sd)
 
 
 def refuse_stand(stand: Stand | None, recording: str) -> None:
-    """Refuse a table or an arm, which needs a recording; `recording`: which, and why it misses."""
+    """
+    Refuse a table or an arm where there is no recording.
+
+    `recording`: the one that it needs, and why there is none, for the message.
+    """
     if stand is not None:
         raise InputError(f'a table or arm needs {recording}')
 
 
-def _description(arm, bag):
-    """Return the text of the robot description: of the file, otherwise of the recording's topic."""
+def _description(arm: Arm, bag: tuple[str, str | None] | None) -> str:
+    """
+    Return the text of the robot description: of the file, otherwise of the recording's topic.
+
+    `bag`: (path, Imu topic) of the recording.
+    """
     if arm.urdf is not None:
         return files.read_robot_description(arm.urdf, arm.allow_xacro)
     if bag is None:
@@ -529,14 +530,17 @@ def _description(arm, bag):
     return description_in(*bag)
 
 
-def _frame(recordings, bag):
+def _frame(
+    recordings: Sequence[str | PathLike | SampleBlock], bag: tuple[str, str | None] | None
+) -> str:
+    """
+    Return the frame of the IMU: that of a bag (path, Imu topic), or of samples in memory.
+
+    Without either it is `LIKELY_LINK`.
+    """
     if bag is not None:
         return frame_of(*bag)
-    return next(
-        (
-            item.imu.frame_id
-            for item in recordings
-            if isinstance(item, SampleBlock) and item.imu is not None
-        ),
-        LIKELY_LINK,
-    )
+    for recording in recordings:
+        if isinstance(recording, SampleBlock) and recording.imu is not None:
+            return recording.imu.frame_id
+    return LIKELY_LINK
