@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core import documents
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.exit_codes import exit_code_of
@@ -18,12 +19,12 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, listed
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
 from imu_calibration.estimation.solution import GRAVITY, REMEDIES, tolerances_of
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.motion_limits import (
     NOT_CHECKED,
+    MotionLimits,
     limit_words,
     limits_of,
     missing_ranges,
@@ -65,7 +66,7 @@ class Planned:
     plan: Plan
     """Motions, predicted standard deviations, time and its lower bound."""
     provenance: dict[str, Any]
-    """Options that it was made with."""
+    """Options of the plan, for its file."""
     unbounded: Sequence[str] = ()
     """Joints without a range."""
     notes: Sequence[str] = ()
@@ -143,18 +144,18 @@ class Planned:
             )
         files.write_text(place / 'plan.yaml', text)
 
-    def _messages(self):
+    def _messages(self) -> list[tuple[int, Any]]:
+        """Return (stamp in ns, JointTrajectory) of each motion of the joints."""
         from imu_calibration.planning.motion_library import trajectory
 
         names = self.plan.moved_joints
         begins = np.concatenate([[0.0], self.plan.ends[:-1]])
-        found = []
+        messages = []
         for begin, segments in zip(begins, self.plan.segments, strict=True):
             if segments:
-                found.append(
-                    (PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
-                )
-        return found
+                stamp_ns = PLAN_START_NS + round(float(begin) * 1e9)
+                messages.append((stamp_ns, trajectory(names, segments)))
+        return messages
 
     def __str__(self):
         return '\n'.join([*plan_summary(self.plan), *self.notes])
@@ -233,30 +234,29 @@ def plan(
     if around or reach is not None:
         limits, start = _neighbourhood(limits, table.joint_names, around or {}, reach)
 
-    # Prior knowledge, and the effects to separate if a diagnosis named several.
-    known = _known(calibration, table, options)
-    causes = tuple(separate)
+    # Prior data, and the effects to separate: requested, or collinear ones of a diagnosis.
+    prior = _prior_calibration(calibration, table, options)
+    effects = tuple(separate)
     sizes = {}
     if diagnosis and not separate:
-        causes, sizes = (
-            class_in(diagnosis)
-            if isinstance(diagnosis, Mapping)
-            else files.read_mapping(diagnosis, 'diagnosis', class_in)
-        )
+        if isinstance(diagnosis, Mapping):
+            effects, sizes = class_in(diagnosis)
+        else:
+            effects, sizes = files.read_mapping(diagnosis, 'diagnosis', class_in)
 
     # Separate effects, or determine every parameter.
-    if causes:
-        if known is None:
+    if effects:
+        if prior is None:
             raise InputError(
                 'separation of effects needs the calibration of the diagnosis with the finding,'
                 ' none was given; give it',
                 key='calibration',
             )
-        owners = [(options.catalogue.owner_of(name, table.joint_names), name) for name in causes]
+        keys = [(options.catalogue.owner_of(name, table.joint_names), name) for name in effects]
         planner = make_separator(
             table,
-            known,
-            owners,
+            prior,
+            keys,
             noise=noise,
             rate=imu_rate,
             options=options,
@@ -265,12 +265,12 @@ def plan(
         )
     else:
         planner = make_planner(
-            table, noise=noise, rate=imu_rate, options=options, limits=limits, calibration=known
+            table, noise=noise, rate=imu_rate, options=options, limits=limits, calibration=prior
         )
     provenance = {
         'noise': grade if options.noise is None else 'as identified',
         'imu_rate': imu_rate,
-        'known': 'a calibration' if known else 'nothing',
+        'known': 'a calibration' if prior else 'nothing',
     }
     if isinstance(calibration, (str, PathLike)):
         provenance['known'] = Path(calibration).name
@@ -278,13 +278,13 @@ def plan(
     warnings = range_warnings(table)
     if warnings:
         provenance['warnings'] = '; '.join(warnings)
-    if causes:
-        provenance['tells_apart'] = ', '.join(causes)
+    if effects:
+        provenance['tells_apart'] = ', '.join(effects)
     return Planned(
-        planner.plan(start, with_bound=with_bound, longest=longest if causes else np.inf),
+        planner.plan(start, with_bound=with_bound, longest=longest if effects else np.inf),
         provenance,
-        missing_ranges(table),
-        notes_on(table),
+        unbounded=missing_ranges(table),
+        notes=notes_on(table),
     )
 
 
@@ -302,8 +302,14 @@ def notes_on(table: Table) -> list[str]:
     return lines
 
 
-def _neighbourhood(limits, names, around, reach):
-    """Return the limits restricted to `reach` about a pose, and the pose."""
+def _neighbourhood(
+    limits: MotionLimits, names: Sequence[str], around: Mapping[str, float], reach: float | None
+) -> tuple[MotionLimits, np.ndarray]:
+    """
+    Return (limits restricted to `reach` degrees about a pose, positions of the pose).
+
+    Positions are in rad, or m where a joint slides, shape (n_joints,).
+    """
     if reach is None or reach <= 0 or set(around) != set(names):
         raise InputError(
             'a neighbourhood must have a reach above 0 and a position of every joint'
@@ -314,8 +320,10 @@ def _neighbourhood(limits, names, around, reach):
     return limits.reached(position, reach), position
 
 
-def _known(calibration, table, options):
-    """Return the prior data as a Calibration, None without."""
+def _prior_calibration(
+    calibration: str | PathLike | Calibration | None, table: Table, options: CalibrationOptions
+) -> Calibration | None:
+    """Return the prior data: given, from a calibration file, or from a saved accumulator."""
     if not isinstance(calibration, (str, PathLike)):
         return calibration
     if Path(calibration).suffix != ACCUMULATOR:
@@ -341,24 +349,21 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
 
     """
     options = calibration_options(choices)
-    asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
-    accelerometer, gyroscope = (
-        parse_effects(sensor, asked[sensor] or '+'.join(BASE), catalogue=options.catalogue)
-        for sensor in SENSORS
+    catalogue = options.catalogue
+    base = '+'.join(BASE)
+    accelerometer = parse_effects(
+        'accelerometer', options.accelerometer_model or base, catalogue=catalogue
     )
-    model = HandModel(
-        SensorModel(
-            accelerometer, gyroscope, joint_names=JointNames.of(()), catalogue=options.catalogue
-        ),
-        options.gravity or STANDARD_GRAVITY,
+    gyroscope = parse_effects('gyroscope', options.gyroscope_model or base, catalogue=catalogue)
+    sensors = SensorModel(
+        accelerometer, gyroscope, joint_names=JointNames.of(()), catalogue=catalogue
     )
+    model = HandModel(sensors, options.gravity or STANDARD_GRAVITY)
     noise = expected_noise(options.noise, grade, imu_rate)
     report('planning')
-    found = plan_by_hand(
-        model, tolerances=tolerances_of(model.model, options.tolerances), noise=noise, rate=imu_rate
-    )
+    tolerances = tolerances_of(sensors, options.tolerances)
     return Planned(
-        found,
+        plan_by_hand(model, tolerances=tolerances, noise=noise, rate=imu_rate),
         {
             'noise': grade if options.noise is None else 'as identified',
             'imu_rate': imu_rate,
@@ -369,9 +374,9 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
 
 def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, float]]:
     """
-    Return the first class of inseparable effects in a diagnosis, and values (SI).
+    Return (first class of collinear effects in a diagnosis, parameter -> value in SI).
 
-    The named effect is the first one, and the values are of the alternatives.
+    The finding is the first effect of the class. The values are those of the other effects.
 
     Raises
     ------
@@ -393,30 +398,30 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
     )
 
 
-def plan_summary(made: Plan) -> list[str]:
+def plan_summary(plan: Plan) -> list[str]:
     """Return the predictions of a plan, a line each."""
-    if made.told_apart:
-        head = f'{len(made.motions)} motions in {made.seconds:.0f} s'
-        if not made.missing:
-            return [f'{head} separate {made.told_apart}']
+    if plan.told_apart:
+        first_line = f'{len(plan.motions)} motions in {plan.seconds:.0f} s'
+        if not plan.missing:
+            return [f'{first_line} separate {plan.told_apart}']
         return [
-            head,
+            first_line,
             (
                 'at their assumed sizes, no motion of these joints in that time separates:'
-                f' {", ".join(made.missing)}'
+                f' {", ".join(plan.missing)}'
             ),
         ]
-    count = int(made.wanted.sum())
-    met = int(made.wanted.sum()) - len(made.missing)
+    n_wanted = int(plan.wanted.sum())
+    n_determined = n_wanted - len(plan.missing)
     lines = [
-        f'{len(made.motions)} {made.noun} in {made.seconds:.0f} s; {met} of {count} parameters are'
-        ' within their tolerance'
+        f'{len(plan.motions)} {plan.noun} in {plan.seconds:.0f} s; {n_determined} of {n_wanted}'
+        ' parameters are within their tolerance'
     ]
-    if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
+    if plan.missing:
+        lines.append(f'outside their tolerance {plan.scope}: {", ".join(plan.missing)}')
+    elif np.isfinite(plan.lower_bound_seconds) and plan.lower_bound_seconds > 0:
         lines.append(
             'every plan of these motions with the same probability (95 %) needs at least'
-            f' {made.lower_bound_seconds:.0f} s'
+            f' {plan.lower_bound_seconds:.0f} s'
         )
-    if made.missing:
-        lines.append(f'outside their tolerance {made.scope}: {", ".join(made.missing)}')
     return lines

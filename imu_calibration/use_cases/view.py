@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from os import PathLike
@@ -45,9 +45,9 @@ BAND = 1.959964
 
 def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, Any]:
     """
-    Return every parameter with tolerance and status.
+    Return every parameter with tolerance and status as plain data.
 
-    Without bands where the uncertainty of the values is unknown.
+    The standard deviation and the band of 95 % are omitted where they are unknown.
     """
     units = []
     for effect in calibration.model.effects:
@@ -77,9 +77,9 @@ def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, An
 
 def residual(result: CalibrationResult) -> dict[str, Any]:
     """
-    Return the errors of window means before and after, in the order of time.
+    Return the errors of window means before and after, in order of time, as plain data.
 
-    The expected residual from noise is returned too.
+    The sd of each mean from noise is returned too (`floor`).
     """
     errors = result.window_errors()
     windows = []
@@ -101,24 +101,24 @@ LONGEST_SEGMENT = 1024
 Most samples of a segment: a finer resolution than that of a recording of a minute is not useful.
 """
 SHORTEST_SEGMENT = 64
-"""Windows with fewer samples are left out."""
+"""Windows with fewer samples are omitted."""
 
 
 def residual_spectrum(
     result: CalibrationResult, windows: Sequence[Window]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """
-    Return (frequency, sensor -> density) of the residuals of the windows with motion among some.
+    Return (frequency, sensor -> density) of the residuals of the windows with motion.
 
-    Welch's method [1]: the power of segments of one length, each about its own mean, averaged over
-    all windows.
+    By Welch's method [1], the power of segments of one length, each about its mean, is averaged
+    over all windows.
 
     Parameters
     ----------
     result : CalibrationResult
-        The calibration that predicts them.
+        The calibration that predicts the readings.
     windows : sequence of Window
-        With their samples.
+        Windows with their samples; those at rest are omitted.
 
     Returns
     -------
@@ -146,20 +146,26 @@ def residual_spectrum(
     residuals = [result.residuals_of(window) for window in windows]
     density = {}
     for sensor in SENSORS:
-        spectra = [welch(own[sensor], rate, nperseg=segment, axis=0)[1] for own in residuals]
+        spectra = []
+        for of_window in residuals:
+            _, power = welch(of_window[sensor], rate, nperseg=segment, axis=0)
+            spectra.append(power)
         density[sensor] = np.sqrt(np.average(spectra, axis=0, weights=weights))[1:]
     return np.fft.rfftfreq(segment, 1 / rate)[1:], density
 
 
-def _by_sensor(vectors, k):
-    return {sensor: _axes(vectors[sensor][k]) for sensor in SENSORS}
+def _by_sensor(vectors: Mapping[str, np.ndarray], k: int) -> dict[str, dict[str, float]]:
+    """Return row k of the vectors (n, 3) of each sensor: sensor -> axis -> component."""
+    return {sensor: _by_finite_axis(vectors[sensor][k]) for sensor in SENSORS}
 
 
-def _axes(vector):
-    """Return the components by axis; unknown ones are omitted, because JSON has no NaN."""
-    return {
-        axis: float(part) for axis, part in zip('xyz', vector, strict=True) if np.isfinite(part)
-    }
+def _by_finite_axis(vector: np.ndarray) -> dict[str, float]:
+    """Return axis -> component; unknown ones are omitted, because JSON has no NaN."""
+    components = {}
+    for axis, component in zip('xyz', vector, strict=True):
+        if np.isfinite(component):
+            components[axis] = float(component)
+    return components
 
 
 MIN_FILE_SECONDS = 1.0
@@ -206,11 +212,12 @@ def mcap_bytes(topics: Iterable[tuple[str, Sequence[tuple[float, Any]]]]) -> byt
 
     """
     sdk = foxglove()
-    whole = BytesIO()
+    target = BytesIO()
     context = sdk.Context()
-    with sdk.open_mcap(whole, context=context):
+    with sdk.open_mcap(target, context=context):
         for topic, messages in topics:
-            if isinstance(first := messages[0][1], dict):
+            _, first = messages[0]
+            if isinstance(first, dict):
                 channel = sdk.Channel(
                     topic,
                     schema={'title': topic.strip('/').replace('/', '.'), **_schema(first)},
@@ -221,7 +228,7 @@ def mcap_bytes(topics: Iterable[tuple[str, Sequence[tuple[float, Any]]]]) -> byt
                 channel = sdk.channels.SceneUpdateChannel(topic, context=context)
             for time, content in messages:
                 channel.log(content, log_time=round(1e9 * time))
-    return whole.getvalue()
+    return target.getvalue()
 
 
 def _schema(content: Any) -> dict[str, Any]:
@@ -238,28 +245,33 @@ def _schema(content: Any) -> dict[str, Any]:
 
 def scene_of(coverage: Coverage, frame_id: str) -> Any:
     """
-    Return the sphere as a SceneUpdate.
+    Return the sphere of a coverage as a SceneUpdate.
 
-    The cells, earlier up directions, the next motion, the arms, the line of text.
+    It has the cells, earlier up directions, the next motion, the arms, and the line of text.
     """
-    found = foxglove().messages
+    messages = foxglove().messages
 
     def color(rgb):
-        return found.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=0.9)
+        """Return a Color."""
+        return messages.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=0.9)
 
-    def pose(place, turn=(0.0, 0.0, 0.0, 1.0)):
-        return found.Pose(
-            position=found.Vector3(**_named(place)), orientation=found.Quaternion(**_named(turn))
+    def pose(place, quaternion=(0.0, 0.0, 0.0, 1.0)):
+        """Return a Pose."""
+        return messages.Pose(
+            position=messages.Vector3(**_named(place)),
+            orientation=messages.Quaternion(**_named(quaternion)),
         )
 
-    def ball(place, rgb, size):
-        return found.SpherePrimitive(
-            pose=pose(place), size=found.Vector3(x=size, y=size, z=size), color=color(rgb)
-        )
+    def ball(place, rgb, diameter):
+        """Return a sphere."""
+        size = messages.Vector3(x=diameter, y=diameter, z=diameter)
+        return messages.SpherePrimitive(pose=pose(place), size=size, color=color(rgb))
 
-    def arrow(start, along, rgb):
+    def arrow(start, end, rgb):
+        """Return an arrow."""
+        along = end - start
         length = float(np.linalg.norm(along))
-        return found.ArrowPrimitive(
+        return messages.ArrowPrimitive(
             pose=pose(start, _from_x(along / length)),
             shaft_length=0.8 * length,
             shaft_diameter=0.025,
@@ -269,36 +281,39 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
         )
 
     balls = [ball(*cell) for cell in sphere_cells(coverage)]
-    seen, colour_of_seen, diameter = seen_of(coverage)
-    balls += [ball(place, colour_of_seen, diameter) for place in seen]
-    above, colour_of_line, line = label_of(coverage)
-    arrows = [arrow(start, end - start, rgb) for _, start, end, rgb in arrows_of(coverage)]
-    text = found.TextPrimitive(
-        pose=pose(above), billboard=True, font_size=0.09, color=color(colour_of_line), text=line
+    seen_places, seen_colour, diameter = seen_of(coverage)
+    balls += [ball(place, seen_colour, diameter) for place in seen_places]
+    arrows = [arrow(start, end, rgb) for _, start, end, rgb in arrows_of(coverage)]
+    label_place, label_colour, line = label_of(coverage)
+    text = messages.TextPrimitive(
+        pose=pose(label_place), billboard=True, font_size=0.09, color=color(label_colour), text=line
     )
-    entity = found.SceneEntity(
-        timestamp=found.Timestamp(0),
+    entity = messages.SceneEntity(
+        timestamp=messages.Timestamp(0),
         frame_id=frame_id,
         id='coverage',
         spheres=balls,
         arrows=arrows,
         texts=[text],
     )
-    return found.SceneUpdate(entities=[entity])
+    return messages.SceneUpdate(entities=[entity])
 
 
-def _named(numbers):
+def _named(numbers: Iterable[float]) -> dict[str, float]:
+    """Return x, y, z and, of a quaternion, w -> number."""
     return dict(zip('xyzw', map(float, numbers)))
 
 
-def _from_x(along):
+def _from_x(along: np.ndarray) -> np.ndarray:
     """
     Return the quaternion (x, y, z, w) of the shortest turn from x to a unit vector.
 
-    Half a turn about z where that is -x.
+    For -x it is half a turn about z.
     """
-    turn = np.array([0.0, -along[2], along[1], 1 + along[0]])
-    return turn / np.linalg.norm(turn) if turn[3] > 1e-9 else np.array([0.0, 0.0, 1.0, 0.0])
+    quaternion = np.array([0.0, -along[2], along[1], 1 + along[0]])
+    if quaternion[3] > 1e-9:
+        return quaternion / np.linalg.norm(quaternion)
+    return np.array([0.0, 0.0, 1.0, 0.0])
 
 
 def overlay_topics(
@@ -325,7 +340,7 @@ def overlay_topics(
         for k, time in enumerate(traces.time.tolist()):
             messages.append((time, _residual(traces, sensor, joint_names, k)))
         yield f'/residual/{sensor}', messages
-        # Spectrum and histograms belong to the whole time.
+        # Spectrum and histograms belong to the complete time: at its start and at its end.
         if sensor in traces.distances:
             frequency, (before, after), noise = traces.distances[sensor].density()
             content = {
@@ -347,7 +362,8 @@ def overlay_topics(
             yield f'/residual_histogram/{sensor}/{axis}', [(0.0, content), (end, content)]
 
 
-def _residual(traces, sensor, joint_names, k):
+def _residual(traces: Traces, sensor: str, joint_names: Sequence[str], k: int) -> dict[str, Any]:
+    """Return the residual of block k before and after, with its variables, as plain data."""
     content = {
         'time': float(traces.time[k]),
         'force': _named(traces.force_s[k]),
@@ -361,7 +377,8 @@ def _residual(traces, sensor, joint_names, k):
     return content
 
 
-def _by_axis(values):
+def _by_axis(values: np.ndarray) -> dict[str, list[float]]:
+    """Return axis -> column of values, shape (n, 3)."""
     return dict(zip(AXES, values.T.tolist()))
 
 
@@ -374,9 +391,9 @@ class View:
     contents: dict[str, dict[str, Any]]
     """Topic -> content, SI units."""
     coverage: Coverage | None
-    """The sphere; None where only a file is known."""
+    """Directions covered by the calibration; None where there is only a file."""
     seconds: float = 0.0
-    """Until the middle of the last window."""
+    """Time from the first sample to the middle of the last window, s."""
 
     @property
     def reasons(self) -> list[str]:
@@ -385,7 +402,7 @@ class View:
 
     @property
     def exit_code(self) -> int:
-        """That of the calibration."""
+        """Exit code of the calibration."""
         return exit_code(self.calibration)
 
     @property
@@ -418,12 +435,13 @@ class View:
 
         """
         files.require_new(path, force=force)
-        shown: dict[str, Any] = dict(self.contents)
+        contents: dict[str, Any] = dict(self.contents)
         if self.coverage is not None:
-            shown[SPHERE_TOPIC] = scene_of(self.coverage, self.calibration.frame_id or 'imu_link')
+            frame_id = self.calibration.frame_id or 'imu_link'
+            contents[SPHERE_TOPIC] = scene_of(self.coverage, frame_id)
         end = max(self.seconds, MIN_FILE_SECONDS)
         topics = []
-        for topic, content in shown.items():  # visible at any playback time
+        for topic, content in contents.items():  # visible at any playback time
             topics.append((topic, [(0.0, content), (end, content)]))
         files.write_whole(path, mcap_bytes(topics))
 
@@ -432,9 +450,7 @@ def view(
     source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]
 ) -> View:
     """
-    Return the view of a recording, which is calibrated, or of a calibration file.
-
-    Only its parameters.
+    Return the view of a recording, which is calibrated, or of the parameters of a calibration file.
 
     Parameters
     ----------
@@ -452,35 +468,34 @@ def view(
 
     """
     path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
-    if path is None:
-        made = calibrate_recordings(source, table, **choices)
-        result = made.result
-        contents = {
-            PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances),
-            RESIDUAL_TOPIC: residual(result),
-        }
-        frequency, density = residual_spectrum(result, result.gathered.kept)
-        if len(frequency):
-            lines = []
-            for k, line_frequency in enumerate(frequency):
-                lines.append({'frequency': float(line_frequency), **_by_sensor(density, k)})
-            contents[SPECTRUM_TOPIC] = {'lines': lines}
-        return View(
-            result.calibration,
-            contents,
-            made.reference.coverage(result),
-            contents[RESIDUAL_TOPIC]['windows'][-1]['time'],
-        )
-    refuse_stand(table, 'a recording, a calibration file was given; omit one')
-    calibration = files.read_calibration(path)
+    if path is not None:
+        refuse_stand(table, 'a recording, a calibration file was given; omit one')
+        calibration = files.read_calibration(path)
+        rows = parameters(calibration, tolerances_of(calibration.model))
+        return View(calibration, {PARAMETERS_TOPIC: rows}, coverage=None)
+
+    calibrated = calibrate_recordings(source, table, **choices)
+    result = calibrated.result
+    contents = {
+        PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances),
+        RESIDUAL_TOPIC: residual(result),
+    }
+    frequency, density = residual_spectrum(result, result.gathered.kept)
+    if len(frequency):
+        lines = []
+        for k, line_frequency in enumerate(frequency):
+            lines.append({'frequency': float(line_frequency), **_by_sensor(density, k)})
+        contents[SPECTRUM_TOPIC] = {'lines': lines}
     return View(
-        calibration,
-        {PARAMETERS_TOPIC: parameters(calibration, tolerances_of(calibration.model))},
-        None,
+        result.calibration,
+        contents,
+        calibrated.reference.coverage(result),
+        seconds=contents[RESIDUAL_TOPIC]['windows'][-1]['time'],
     )
 
 
-def _document_of(path):
-    """Return the calibration file that a path means, None where it means a recording."""
-    path = path / 'calibration.yaml' if (path / 'calibration.yaml').is_file() else path
+def _document_of(path: Path) -> Path | None:
+    """Return the calibration file at a path or in a folder; None for a recording."""
+    if (path / 'calibration.yaml').is_file():
+        return path / 'calibration.yaml'
     return path if path.suffix in ('.yaml', '.yml') else None
