@@ -27,7 +27,7 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.change import checked_limit
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import JudgedResult
-from imu_calibration.document.proof_entry import EarlierErrors
+from imu_calibration.document.proof_entry import EarlierErrors, Proof
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import (
@@ -54,7 +54,8 @@ class Calibrated(JudgedResult):
     """
     Result of a calibration.
 
-    Prints the parameters and the verdict, draws residuals, saves calibration.yaml and report.html.
+    It prints the parameters and the verdict, draws residuals, and saves calibration.yaml and
+    report.html.
     """
 
     result: CalibrationResult
@@ -74,9 +75,7 @@ class Calibrated(JudgedResult):
 
     def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """
-        Return the errors of one sensor in every window, before and after.
-
-        As a figure for a notebook.
+        Return the errors of one sensor in every window, before and after, as a figure.
         """
         from imu_calibration.report.calibration_sections import draw_windows
 
@@ -98,11 +97,11 @@ class Calibrated(JudgedResult):
         """
         if not force:
             require_same_inputs(folder, lambda: self.calibration.provenance, report=report)
-        files.write_texts(
-            folder,
-            ({files.REPORT: self.report} if report else {})
-            | {'calibration.yaml': calibration_to_text(self.calibration)},
-        )
+        texts = {}
+        if report:
+            texts[files.REPORT] = self.report
+        texts['calibration.yaml'] = calibration_to_text(self.calibration)
+        files.write_texts(folder, texts)
 
     def __repr__(self):
         return repr(self.calibration)
@@ -148,56 +147,50 @@ def calibrate_recordings(
         When a recording cannot be used, or no parameter can be determined from it.
 
     """
-    given = {**choices, 'earlier': earlier}
+    documented_choices = {**choices, 'earlier': earlier}
     earlier = None if earlier is None else files.given_calibration(earlier)
-    recordings = (
-        [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
-    )
+    if isinstance(recordings, (str, PathLike, SampleBlock)):
+        recordings = [recordings]
+    else:
+        recordings = list(recordings)
     options, reference, sources = inputs_of(recordings, table, choices)
     if earlier is not None:
         reference.table_for('an earlier calibration must be compared on a table', 'table_missing')
     jobs = jobs_for(jobs, len(recordings))
     with ThreadPoolExecutor(1) as hashing:  # reads the files during the calibration, not before it
-        provenance = hashing.submit(provenance_with, 'calibrate', recordings, given, stand=table)
-        result = _side_by_side(sources, reference, options, recordings, jobs)
-        if earlier is not None and result.calibration.proof:
-            result = _beside(result, reference.errors(sources, earlier, options).proof)
-        calibration = result.calibration
-        return Calibrated(
-            replace(
-                result,
-                calibration=replace(
-                    calibration, provenance=calibration.provenance | provenance.result()
-                ),
-            ),
-            reference,
+        provenance = hashing.submit(
+            provenance_with, 'calibrate', recordings, documented_choices, stand=table
         )
+        gathered = reference.gather(sources, options, names=_distinct_names(recordings), jobs=jobs)
+        result = calibrate_by_evidence(gathered, options)
+        if earlier is not None and result.calibration.proof:
+            earlier_proof = reference.errors(sources, earlier, options).proof
+            result = _with_earlier_errors(result, earlier_proof)
+        calibration = result.calibration
+        calibration = replace(calibration, provenance=calibration.provenance | provenance.result())
+        return Calibrated(replace(result, calibration=calibration), reference)
 
 
-def _beside(result, proof):
-    """
-    Return the result with the error after an earlier calibration, from `proof`, in its own proof.
-    """
-    known = dict(result.calibration.proof)
-    for sensor in known.keys() & proof.keys():
-        earlier = EarlierErrors(proof[sensor].after, proof[sensor].ci95)
-        known[sensor] = replace(known[sensor], earlier=earlier)
-    return replace(
-        result, calibration=judged(replace(result.calibration, proof=known), result.tolerances)
-    )
+def _with_earlier_errors(result: CalibrationResult, earlier_proof: Proof) -> CalibrationResult:
+    """Return the result, in its proof the errors with an earlier calibration (`earlier_proof`)."""
+    proof = dict(result.calibration.proof)
+    for sensor in proof.keys() & earlier_proof.keys():
+        earlier = EarlierErrors(earlier_proof[sensor].after, earlier_proof[sensor].ci95)
+        proof[sensor] = replace(proof[sensor], earlier=earlier)
+    calibration = judged(replace(result.calibration, proof=proof), result.tolerances)
+    return replace(result, calibration=calibration)
 
 
-def _side_by_side(sources, reference, options, recordings, jobs):
-    """Calibrate, recordings in several processes if `jobs` is above 1."""
-    short = [name_of(recording) for recording in recordings]
-    names = []
-    for number, (name, recording) in enumerate(zip(short, recordings, strict=True), 1):
-        if short.count(name) > 1:
+def _distinct_names(recordings: Sequence[str | PathLike | SampleBlock]) -> list[str]:
+    """Return the names of recordings, of equal ones the path or the number."""
+    names = [name_of(recording) for recording in recordings]
+    distinct = []
+    for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1):
+        if names.count(name) > 1:
             is_block = isinstance(recording, SampleBlock)
             name = f'recording {number}' if is_block else str(Path(recording))
-        names.append(name)
-    gathered = reference.gather(sources, options, names=names, jobs=jobs)
-    return calibrate_by_evidence(gathered, options)
+        distinct.append(name)
+    return distinct
 
 
 def check_recording(
@@ -211,8 +204,8 @@ def check_recording(
     """
     Test whether a calibration helps on a recording, and whether its error has changed.
 
-    The error before and after, by sensor and kind of motion, and the error now against the held-out
-    error in the file.
+    Compared are the errors of raw and corrected readings, by sensor and kind of motion, and the
+    error now with the held-out error in the file.
 
     Parameters
     ----------
@@ -236,10 +229,10 @@ def check_recording(
     limit = checked_limit(change)
     calibration = files.given_calibration(calibration)
     # The readings are those of the calibration, unless the choices state others.
-    described = {**choices, 'nominal': readings_for(calibration, choices)}
+    with_readings = {**choices, 'nominal': readings_for(calibration, choices)}
     for name in STATED_KEYS:
-        described.pop(name, None)
-    options, reference, sources = inputs_of([recording], table, described)
+        with_readings.pop(name, None)
+    options, reference, sources = inputs_of([recording], table, with_readings)
     errors = reference.errors(sources, calibration, options, names=[name_of(recording)])
-    own = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
-    return check_errors(errors, calibration, change_limit=limit, own_recording=bool(own))
+    same_hashes = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
+    return check_errors(errors, calibration, change_limit=limit, own_recording=bool(same_hashes))

@@ -32,7 +32,7 @@ class Diagnosed(JudgedResult):
     """
     Result of a diagnosis.
 
-    Prints the findings, draws them, saves diagnosis.json, the extended calibration.yaml and
+    It prints the findings, draws them, and saves diagnosis.json, the extended calibration.yaml and
     report.html.
     """
 
@@ -47,9 +47,7 @@ class Diagnosed(JudgedResult):
     @property
     def proposed(self) -> Calibration | None:
         """
-        The calibration with the formulas proposed for unexplained residuals.
-
-        None where there are none.
+        The calibration with the formulas proposed for unexplained residuals; None without any.
         """
         return self.result.proposed
 
@@ -74,9 +72,9 @@ class Diagnosed(JudgedResult):
 
     def plot(self, number: int = 1) -> Drawn:
         """
-        Return the residual against the cause of a finding, before and after.
+        Return the residual against the cause of a finding, before and after, as a figure.
 
-        0, or without findings: residuals over time.
+        `number` counts the findings from 1; for 0, or without findings, residuals over time.
         """
         from imu_calibration.report.diagnosis_page import draw_finding, draw_over_time
 
@@ -96,24 +94,19 @@ class Diagnosed(JudgedResult):
         """
         Write diagnosis.json, report.html and the extended calibration.yaml into a folder.
 
-        With proposed formulas that compensation undoes also extended.yaml. The result of other
-        inputs there is replaced only with `force`.
+        With proposed formulas that compensation undoes extended.yaml is written too. The result of
+        other inputs there is replaced only with `force`.
         """
         if not force:
             require_same_inputs(folder, lambda: self.calibration.provenance)
-        files.write_texts(
-            folder,
-            {
-                'diagnosis.json': json.dumps(self.document, indent=1) + '\n',
-                files.REPORT: self.report,
-                'calibration.yaml': calibration_to_text(self.calibration),
-                **(
-                    {}
-                    if self.transferable is None
-                    else {'extended.yaml': calibration_to_text(self.transferable)}
-                ),
-            },
-        )
+        texts = {
+            'diagnosis.json': json.dumps(self.document, indent=1) + '\n',
+            files.REPORT: self.report,
+            'calibration.yaml': calibration_to_text(self.calibration),
+        }
+        if self.transferable is not None:
+            texts['extended.yaml'] = calibration_to_text(self.transferable)
+        files.write_texts(folder, texts)
 
     def save_overlay(self, path: str | PathLike, *, force: bool = False) -> None:
         """
@@ -126,9 +119,8 @@ class Diagnosed(JudgedResult):
 
         files.require_new(path, force=force)
         diagnosis = self.result.diagnosis
-        files.write_whole(
-            path, mcap_bytes(overlay_topics(diagnosis.traces, diagnosis.baseline.model.joint_names))
-        )
+        topics = overlay_topics(diagnosis.traces, diagnosis.baseline.model.joint_names)
+        files.write_whole(path, mcap_bytes(topics))
 
     def __str__(self):
         return '\n'.join(self.result.lines)

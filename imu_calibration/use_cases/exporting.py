@@ -74,23 +74,30 @@ def export_calibration(
 
     """
     target = find_target(to)
-    known = files.given_calibration(calibration)
+    calibration = files.given_calibration(calibration)
     if axes is not None:
-        known = replace(known, readings=combined(known.readings, axes=axes))
+        calibration = replace(calibration, readings=combined(calibration.readings, axes=axes))
     figures = None if noise is None else files.read_noise(noise)
     motion = None
     if bag is not None:
-        raw = log_options(known.readings, {}).raw
+        raw = log_options(calibration.readings, {}).raw
         topics = topics._replace(log=replace(topics.log, raw=raw))
-        motion = _motion(known, bag, stand, topics=topics, exclude=exclude)
-    found = export(known, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
+        motion = _motion(calibration, bag, stand, topics=topics, exclude=exclude)
+    exported = export(calibration, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
     if output is not None:
         files.require_new(output, force=force)
-        files.write_whole(output, found.content)
-    return found
+        files.write_whole(output, exported.content)
+    return exported
 
 
-def _motion(calibration, bag, stand, *, topics, exclude) -> TrialMotion:
+def _motion(
+    calibration: Calibration,
+    bag: str | PathLike,
+    stand: Stand | None,
+    *,
+    topics: Topics,
+    exclude: str | None,
+) -> TrialMotion:
     """Return the motion of a recording by its reference."""
     reference = reference_of(stand, [bag], topics)
     (source,) = sources_without([source_of(bag, topics, reference.joint_names)], [bag], exclude)
@@ -128,10 +135,9 @@ def import_calibration(
 
     """
     target = find_target(source, read=True)
-    found = import_file(
-        target, files.read_bytes(path, f'file of {target.name}'), Path(path), frame_id=frame_id
-    )
+    content = files.read_bytes(path, f'file of {target.name}')
+    calibration = import_file(target, content, Path(path), frame_id=frame_id)
     if output is not None:
         files.require_new(output, force=force)
-        files.write_text(output, calibration_to_text(found))
-    return found
+        files.write_text(output, calibration_to_text(calibration))
+    return calibration

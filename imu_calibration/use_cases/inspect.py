@@ -1,7 +1,5 @@
 """
 Inspect: content of the topics of a recording, their faults, and the parameters that they determine.
-
-Each is read once.
 """
 
 from __future__ import annotations
@@ -100,9 +98,9 @@ class RecordingSummary:
 
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     """
-    Return the topics with the requested Imu topic, or with each one of the recording.
+    Return the topics of each IMU to inspect: with the requested Imu topic, or with each one.
 
-    Each frame_id is returned too if a topic has several.
+    A topic with messages of several frame_ids is returned once for each of them.
 
     Raises
     ------
@@ -116,15 +114,15 @@ def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
         listed = list_topics(bag, topics.log)
         names = [topic.name for topic in listed if topic.type == IMU_TYPE]
     _limit_imus(bag, len(names))
-    found = []
+    imus = []
     for name in names:
-        one = topics._replace(imu=name)
-        found += [one] if topics.frame is not None else _by_frame(bag, one)
-        _limit_imus(bag, len(found))
-    return found or [topics]
+        of_topic = topics._replace(imu=name)
+        imus += [of_topic] if topics.frame is not None else _by_frame(bag, of_topic)
+        _limit_imus(bag, len(imus))
+    return imus or [topics]
 
 
-def _limit_imus(bag, n_imus):
+def _limit_imus(bag: str | PathLike, n_imus: int) -> None:
     """Refuse a recording of too many IMUs, before each of them is read."""
     if n_imus > MOST_IMUS:
         raise InputError(
@@ -135,10 +133,13 @@ def _limit_imus(bag, n_imus):
         )
 
 
-def _by_frame(bag, topics):
+def _by_frame(bag: str | PathLike, topics: Topics) -> list[Topics]:
+    """Return the topics with each frame_id of the Imu messages, unchanged if they have one."""
     with open_bag(bag, topics, want_joints=False, want_temperature=False) as recording:
         frames = recording.frames()
-    return [topics._replace(frame=frame) for frame in frames] if len(frames) > 1 else [topics]
+    if len(frames) <= 1:
+        return [topics]
+    return [topics._replace(frame=frame) for frame in frames]
 
 
 def inspect_imus(
@@ -178,63 +179,80 @@ def inspect_recording(
 
     `exclude`: times that are not used, as in `Choices`.
     """
-    looks = [_look(bag, each, reference, options=options, exclude=exclude) for each in topics]
-    notes = {}
-    for pair in split_topics(looks):
+    summaries = []
+    for of_imu in topics:
+        summaries.append(_summary(bag, of_imu, reference, options=options, exclude=exclude))
+
+    # A note on both topics of an IMU with one topic for each sensor.
+    notes = {}  # topic -> note
+    for pair in split_topics(summaries):
         note = CheckFinding(
             'split',
             NOTE,
             f'{pair.imu} has the accelerometer only and {pair.gyroscope} the gyroscope only: read'
             ' both together as one IMU',
         )
-        notes[pair.imu] = notes[pair.gyroscope] = note
-    noted = []
-    for look in looks:
-        topic = None if look.recording is None else look.recording.imu_topic
+        notes[pair.imu] = note
+        notes[pair.gyroscope] = note
+    with_notes = []
+    for summary in summaries:
+        topic = None if summary.recording is None else summary.recording.imu_topic
         if topic in notes:
-            look = replace(look, findings=(*look.findings, notes[topic]))
-        noted.append(look)
-    return noted
+            summary = replace(summary, findings=(*summary.findings, notes[topic]))
+        with_notes.append(summary)
+    return with_notes
 
 
-def split_topics(looks: Sequence[RecordingSummary]) -> list[Topics]:
+def split_topics(summaries: Sequence[RecordingSummary]) -> list[Topics]:
     """
     Return the pairs of Imu topics with one sensor each, as `Topics`.
 
-    Several pairs are told apart by their names: each topic of a pair has more words in common with
-    the other one than with the other topics of that sensor.
+    Several pairs are separated by their names: each topic of a pair has more words in common with
+    its mate than with the other topics of that sensor.
     """
-    alone: dict[str, list[str]] = {'accelerometer': [], 'gyroscope': []}
-    for look in looks:
-        lacking = {each.sensor for each in look.findings if each.check == 'frozen' and each.sensor}
-        if 'imu' in look.streams:
-            lacking.update(look.streams['imu'].absent)
-        present = [sensor for sensor in alone if sensor not in lacking]
-        if len(present) == 1 and look.recording is not None:
-            alone[present[0]].append(look.recording.imu_topic)
+    # Sensor -> topics in which only this sensor has readings that change.
+    topics_of: dict[str, list[str]] = {'accelerometer': [], 'gyroscope': []}
+    for summary in summaries:
+        lacking = set()
+        for finding in summary.findings:
+            if finding.check == 'frozen' and finding.sensor:
+                lacking.add(finding.sensor)
+        if 'imu' in summary.streams:
+            lacking.update(summary.streams['imu'].absent)
+        present = [sensor for sensor in topics_of if sensor not in lacking]
+        if len(present) == 1 and summary.recording is not None:
+            topics_of[present[0]].append(summary.recording.imu_topic)
     pairs = []
-    for accelerometer in sorted(set(alone['accelerometer'])):
-        gyroscope = _closest_name(accelerometer, alone['gyroscope'])
+    for accelerometer in sorted(set(topics_of['accelerometer'])):
+        gyroscope = _closest_name(accelerometer, topics_of['gyroscope'])
         if gyroscope is None:
             continue
-        if _closest_name(gyroscope, alone['accelerometer']) == accelerometer:
+        if _closest_name(gyroscope, topics_of['accelerometer']) == accelerometer:
             pairs.append(Topics(imu=accelerometer, gyroscope=gyroscope))
     return pairs
 
 
-def _closest_name(name, candidates):
-    """Return the topic that has most words in common with a name; None without a single one."""
+def _closest_name(name: str, candidates: Sequence[str]) -> str | None:
+    """Return the topic that has most words in common with a name; None if several have."""
     words = Counter(re.findall('[a-z]+|[0-9]+', name.lower()))
-    common = {}
+    n_common = {}
     for candidate in candidates:
-        other_words = Counter(re.findall('[a-z]+|[0-9]+', candidate.lower()))
-        common[candidate] = (words & other_words).total()
-    most = max(common.values(), default=0)
-    closest = [candidate for candidate, count in common.items() if count == most]
+        candidate_words = Counter(re.findall('[a-z]+|[0-9]+', candidate.lower()))
+        n_common[candidate] = (words & candidate_words).total()
+    most = max(n_common.values(), default=0)
+    closest = [candidate for candidate, count in n_common.items() if count == most]
     return closest[0] if len(closest) == 1 else None
 
 
-def _look(bag, topics, reference, *, options, exclude):
+def _summary(
+    bag: str | PathLike | SampleBlock,
+    topics: Topics,
+    reference: MotionReference,
+    *,
+    options: CalibrationOptions,
+    exclude: str | None,
+) -> RecordingSummary:
+    """Inspect one IMU of a recording."""
     recording = None
     if not isinstance(bag, SampleBlock):
         recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
@@ -243,15 +261,20 @@ def _look(bag, topics, reference, *, options, exclude):
     lenient = source_of(bag, topics, want_joints='optional', want_temperature='optional')
     (source,) = sources_without([source], [bag], exclude)
     (lenient,) = sources_without([lenient], [bag], exclude)
-    found = reference.inspect(source, lenient, options)
-    preflight = found.preflight
-    findings = (*found.findings, *_axes_question(bag, options))
+    inspection = reference.inspect(source, lenient, options)
     return RecordingSummary(
-        recording, preflight.streams, findings, preflight.lost, found.calibrated, reference
+        recording,
+        inspection.preflight.streams,
+        findings=(*inspection.findings, *_axes_question(bag, options)),
+        lost=inspection.preflight.lost,
+        calibrated=inspection.calibrated,
+        reference=reference,
     )
 
 
-def _axes_question(bag, options):
+def _axes_question(
+    bag: str | PathLike | SampleBlock, options: CalibrationOptions
+) -> list[CheckFinding]:
     """Return a note where the log of an autopilot is read without a statement of its axes."""
     if options.nominal is not None and options.nominal.axes:
         return []

@@ -29,7 +29,7 @@ class IdentifiedNoise:
     """
     Noise figures from a recording.
 
-    Prints them, draws the Allan curves, saves noise.yaml and report.html.
+    It prints them, draws the Allan curves, and saves noise.yaml and report.html.
     """
 
     result: NoiseIdentification
@@ -78,11 +78,11 @@ class IdentifiedNoise:
             require_same_inputs(
                 folder, lambda: self.figures.provenance, 'noise.yaml', report=report
             )
-        files.write_texts(
-            folder,
-            ({files.REPORT: self.report} if report else {})
-            | {'noise.yaml': noise_to_text(self.figures, self.horizon)},
-        )
+        texts = {}
+        if report:
+            texts[files.REPORT] = self.report
+        texts['noise.yaml'] = noise_to_text(self.figures, self.horizon)
+        files.write_texts(folder, texts)
 
     def __str__(self):
         return '\n'.join(lines(self.figures))
@@ -147,6 +147,8 @@ def identify_recording(
     topics = Topics(imu_topic, None, temperature_topic, frame_id, gyroscope_topic, log)
     (source,) = sources_without([source_of(recording, topics)], [recording], exclude)
     result = identify_noise(source, readings)
+
+    # Options for the document, with those of the log one by one.
     chosen = topics.chosen() | {'gyroscope_topic': gyroscope_topic, 'exclude': exclude}
     chosen |= asdict(chosen.pop('log'))
     options = {name: value for name, value in chosen.items() if value}

@@ -44,15 +44,16 @@ USE_CASES: dict[str, Callable[..., Any]] = {'compensate': _compensate, 'noise': 
 def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the function with errors that name its arguments."""
     names = set(signature(function).parameters)
-    if 'options' in names:  # which are those of the use case
+    # Further named arguments are those of the use case, or choices.
+    if 'options' in names:
         names |= set(signature(USE_CASES[function.__name__]).parameters)
-    hints = {
-        name: f'argument {name}'
-        for name in (names | set(Choices.__annotations__) if 'choices' in names else names)
-    }
+    if 'choices' in names:
+        names |= set(Choices.__annotations__)
+    hints = {name: f'argument {name}' for name in names}
 
     @wraps(function)
     def with_hints(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        """Call the function; an error names the arguments."""
         try:
             return function(*arguments, **named)
         except ImuCalibrationError as error:
@@ -68,13 +69,13 @@ class Arrays:
     time: ArrayLike | None
     """Seconds, or integer nanoseconds, shape (n,)."""
     force: ArrayLike | None
-    """m/s^2, shape (n, 3)."""
+    """Specific force, m/s^2, shape (n, 3)."""
     rate: ArrayLike | None
-    """rad/s, shape (n, 3)."""
+    """Angular rate, rad/s, shape (n, 3)."""
     joints: dict[str, ArrayLike] | None
-    """Joint name -> rad, shape (n,)."""
+    """Joint name -> position, rad, shape (n,)."""
     temperature_c: ArrayLike | None
-    """Degrees Celsius, shape (n,)."""
+    """Temperature, degrees Celsius, shape (n,)."""
 
     def or_given(self, verb: str, recording: Any) -> Any:
         """Return the recording, or these arrays as one; exactly one of both must be there."""

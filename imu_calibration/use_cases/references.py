@@ -37,19 +37,21 @@ def reference_of(
     # Here, because by hand its import is not needed.
     from imu_calibration.references.turntable.table_reference import TableReference
 
-    gravity, spread = options.gravity, options.gravity_sd
-    return TableReference(table_of(stand, recordings, topics, gravity=gravity, gravity_sd=spread))
+    table = table_of(
+        stand, recordings, topics, gravity=options.gravity, gravity_sd=options.gravity_sd
+    )
+    return TableReference(table)
 
 
 class Inputs(NamedTuple):
-    """What a use case on recordings works with."""
+    """Inputs of a use case on recordings."""
 
     options: CalibrationOptions
-    """Of estimation and validation."""
+    """Options of estimation and validation."""
     reference: MotionReference
     """A table or an arm, or gravity."""
     sources: list[BlockSource]
-    """One for each recording."""
+    """Samples of each recording."""
 
 
 def inputs_of(
@@ -75,10 +77,10 @@ def inputs_of(
         When a choice does not exist, or a file cannot be used.
 
     """
-    strange = sorted(set(choices) - set(Choices.__annotations__))
-    if strange:
+    unknown = sorted(set(choices) - set(Choices.__annotations__))
+    if unknown:
         raise InputError(
-            f'{", ".join(strange)} cannot be chosen; the choices are'
+            f'{", ".join(unknown)} cannot be chosen; the choices are'
             f' {", ".join(Choices.__annotations__)}',
             code='choice_unknown',
         )

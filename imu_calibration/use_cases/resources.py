@@ -1,11 +1,12 @@
 """
 Files that are installed with the package, searched relative to the running code.
 
-Checkout, colcon workspace or pip.
+The code runs from a checkout, a colcon workspace or an installation by pip.
 """
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from imu_calibration.core.errors import InputError
@@ -59,7 +60,8 @@ def config_file(name: str) -> Path:
     return path
 
 
-def _candidates():
+def _candidates() -> Iterator[Path]:
+    """Yield the folders that may hold the files, in order of priority."""
     module = Path(__file__).resolve()
     yield module.parents[2]
     for prefix in module.parents[3:]:

@@ -60,7 +60,7 @@ class Simulated:
     duration: float
     """Length, s."""
     lost: int = 0
-    """Samples of a replayed recording without known motion, which are left out."""
+    """Samples of a replayed recording without known motion, which are omitted."""
 
     def save(
         self, path: str | PathLike, *, storage: str = 'sqlite3', compression: str = 'none'
@@ -74,14 +74,14 @@ class Simulated:
 
         report(f'writing {Path(path).name}')
         samples = self.samples
-        packed = {} if compression == 'none' else {'compression': compression}
+        compression_option = {} if compression == 'none' else {'compression': compression}
         write_session(
             path,
             cast(ImuSamples, samples.imu),
             samples.joints,
             temperature=samples.temperature,
             storage=storage,
-            **packed,
+            **compression_option,
         )
         files.write_text(Path(path) / 'truth.yaml', calibration_to_text(self.truth))
         files.write_text(Path(path) / 'table.yaml', documents.to_text(self.table.to_mapping()))
@@ -149,28 +149,36 @@ def simulate(
 
     """
     report('simulating')
-    given = table_of(table or config_file('table_simulated.yaml'))
-    motion = make_profile(profile, seed, given, duration=duration)
-    mover = motion.table_moved(given)
+
+    # The motion, and the table with the joints that it moves.
+    described_table = table_of(table or config_file('table_simulated.yaml'))
+    motion = make_profile(profile, seed, described_table, duration=duration)
+    moved_table = motion.table_moved(described_table)
+
+    # The true IMU, with the added effects.
+    if imu_seed is None:
+        imu_seed = seed
     given_imu = None if calibration is None else files.given_calibration(calibration)
     model, values = true_imu(
-        mover,
+        moved_table,
         (given_imu.model, given_imu.values) if given_imu else None,
         grade,
-        seed=seed if imu_seed is None else imu_seed,
+        seed=imu_seed,
         catalogue=catalogue_of(catalogue),
     )
-    of_imu = seed if imu_seed is None else imu_seed
     for name in effects:
-        sensor, hidden = hidden_effect(
-            model, name, of_imu, share=size, moment=0.6 * motion.duration
+        sensor, hidden_size = hidden_effect(
+            model, name, imu_seed, share=size, moment=0.6 * motion.duration
         )
         model, values = replace(model, point={}).with_sized_effect(
-            values, sensor, name, size=hidden
+            values, sensor, name, size=hidden_size
         )
-    warm = temperature or any(
-        'temperature' in effect.needs for effect in model.effects if effect.name in effects
-    )
+
+    # The samples, with temperatures for thermal effects.
+    warms_up = temperature
+    for effect in model.effects:
+        if effect.name in effects and 'temperature' in effect.needs:
+            warms_up = True
     noise = replace(
         GRADES[grade].noise,
         encoder_resolution=math.radians(encoder_resolution_deg),
@@ -178,15 +186,19 @@ def simulate(
     )
     frame_id = options_of(table).get('imu_link') or LIKELY_LINK
     options = SimulationOptions(
-        imu_rate, joint_rate, noise, frame_id=frame_id, temperature_start_c=25.0 if warm else None
+        imu_rate,
+        joint_rate,
+        noise,
+        frame_id=frame_id,
+        temperature_start_c=25.0 if warms_up else None,
     )
     samples = SampleBlock(
-        *run_session(model, values, mover, profile=motion, options=options, seed=seed)
+        *run_session(model, values, moved_table, profile=motion, options=options, seed=seed)
     )
     truth = true_calibration(
         model, values, options.frame_id, simulated={'seed': seed, 'profile': profile}
     )
-    return Simulated(samples, mover, truth, motion.duration)
+    return Simulated(samples, moved_table, truth, motion.duration)
 
 
 def replay(
@@ -200,7 +212,8 @@ def replay(
     """
     Simulate a calibrated IMU on the motion of a recording.
 
-    Its joints, stamps, rates, temperature and identified noise.
+    The simulation has the joints, stamps, rates and temperature of the recording, and the
+    identified noise of the calibration.
 
     Parameters
     ----------
@@ -223,24 +236,26 @@ def replay(
 
     """
     _, reference, (source,) = inputs_of([recording], table, choices)
-    given = reference.table_for('a replay needs the motion of a table or an arm', 'replay_by_hand')
-    known = files.given_calibration(calibration)
-    require_joints(known.model, given)
+    given_table = reference.table_for(
+        'a replay needs the motion of a table or an arm', 'replay_by_hand'
+    )
+    calibration = files.given_calibration(calibration)
+    require_joints(calibration.model, given_table)
+    statistics = calibration.statistics
     noise = None
-    if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
+    if all('noise_sd' in statistics.get(sensor, {}) for sensor in SENSORS):
         noise = {}
         for sensor in SENSORS:
-            noise[sensor] = ReplayNoise(
-                *known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME
-            )
+            wander_time = statistics[sensor].get('wander_time_s') or BIAS_TIME
+            noise[sensor] = ReplayNoise(*calibration.noise(sensor), wander_time)
     report('simulating')
     samples, lost = run_replay(
-        source, given, known.model, values=known.values, noise=noise, seed=seed
+        source, given_table, calibration.model, values=calibration.values, noise=noise, seed=seed
     )
     truth = replace(
-        known,
+        calibration,
         provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}},
-        readings=RawReadings(axes=known.readings.axes),
+        readings=RawReadings(axes=calibration.readings.axes),
     )
-    stamps = cast(ImuSamples, samples.imu).stamp_ns
-    return Simulated(samples, given, truth, 1e-9 * float(stamps[-1] - stamps[0]), lost)
+    stamp_ns = cast(ImuSamples, samples.imu).stamp_ns
+    return Simulated(samples, given_table, truth, 1e-9 * float(stamp_ns[-1] - stamp_ns[0]), lost)
