@@ -26,8 +26,8 @@ class ReplayNoise(NamedTuple):
 
     white_sd: np.ndarray
     """Standard deviation of a sample, m/s^2 or rad/s, shape (3,)."""
-    bias_sd: np.ndarray
-    """Standard deviation of the bias process, shape (3,)."""
+    bias_sd: np.ndarray | float
+    """Standard deviation of the bias process, shape (3,), or equal on all axes."""
     bias_time: float = BIAS_TIME
     """Correlation time of the bias process, s."""
 

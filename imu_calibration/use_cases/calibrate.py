@@ -187,8 +187,10 @@ def _distinct_names(recordings: Sequence[str | PathLike | SampleBlock]) -> list[
     distinct = []
     for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1):
         if names.count(name) > 1:
-            is_block = isinstance(recording, SampleBlock)
-            name = f'recording {number}' if is_block else str(Path(recording))
+            if isinstance(recording, SampleBlock):
+                name = f'recording {number}'
+            else:
+                name = str(Path(recording))
         distinct.append(name)
     return distinct
 

@@ -348,9 +348,10 @@ class _CorrectionRun:
         """
         stream = self.stream
         used = self.correction.used
-        lines = [*used.lines, *caveats(stream.calibration)]
+        calibration = self.correction.calibration
+        lines = [*used.lines, *caveats(calibration)]
         refused = dict(used.refused)
-        for sensor in stream.calibration.absent:
+        for sensor in calibration.absent:
             if stream.measured[sensor]:  # readings without a calibration pass unchanged
                 refused[sensor] = ABSENT
                 lines.append(f'the {sensor} is not corrected: {ABSENT}')
@@ -409,6 +410,7 @@ def _into_text_log(
     _refuse_corrected_log(recording)
     log = read_directly(existing(recording), topics.log)
     result = _in_memory(SampleBlock(log.imu, None, log.temperature), correction)
+    assert result.imu is not None  # a correction in memory returns its samples
     with files.output_folder(str(Path(output).parent)):
         write_corrected_log(output, log, result.imu)
     return replace(result, imu=None)

@@ -246,8 +246,9 @@ def replay(
     if all('noise_sd' in statistics.get(sensor, {}) for sensor in SENSORS):
         noise = {}
         for sensor in SENSORS:
+            sample_sd, wander_sd = calibration.noise(sensor)
             wander_time = statistics[sensor].get('wander_time_s') or BIAS_TIME
-            noise[sensor] = ReplayNoise(*calibration.noise(sensor), wander_time)
+            noise[sensor] = ReplayNoise(sample_sd, wander_sd, wander_time)
     report('simulating')
     samples, lost = run_replay(
         source, given_table, calibration.model, values=calibration.values, noise=noise, seed=seed
