@@ -4,8 +4,9 @@ Regimes of the motion that contain most of a sensor's residual.
 Permutation test, and comparison with smooth curves and formulas.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -140,6 +141,25 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np
     return starts[source] + (np.arange(len(window)) - starts[place]) % count[source]
 
 
+class ColumnWhitening(Protocol):
+    """Whitening of the rows of one axis."""
+
+    def whiten(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns over the blocks, shape (b, k), with errors of unit variance."""
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentErrors:
+    """Whitening of blocks with independent errors."""
+
+    sd: np.ndarray
+    """Standard deviation of the error of each block, shape (b,)."""
+
+    def whiten(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns over the blocks, shape (b, k), over the sd of each block."""
+        return 1.0 / self.sd[:, None] * columns
+
+
 class AxisResidual:
     """
     The residual of one axis at the fit of the model, independent and of unit variance.
@@ -254,7 +274,7 @@ class RegimeSearch:
         self,
         axis: str,
         rest: AxisResidual,
-        white: Callable,
+        whitening: ColumnWhitening,
         *,
         level: float,
         formula: np.ndarray | None = None,
@@ -277,8 +297,8 @@ class RegimeSearch:
             Axis of the sensor.
         rest : AxisResidual
             Its residual.
-        white : callable
-            Makes columns over the blocks independent and of unit variance, as the rows of `rest`.
+        whitening : ColumnWhitening
+            Of the rows of `rest`.
         level : float
             Largest probability of a regime by chance.
         formula : ndarray, shape (b, k), optional
@@ -290,7 +310,7 @@ class RegimeSearch:
         energy = (exchanged**2).sum(axis=0)
         shares = []
         for ranges in self.ranges:
-            marks = white(ranges.marks)
+            marks = whitening.whiten(ranges.marks)
             products = marks.T @ rest.free(marks)  # of the bins; a range is a sum of bins
             size = np.einsum('rk,kl,rl->r', ranges.member, products, ranges.member)
             projection = ranges.member @ (marks.T @ exchanged)
@@ -303,11 +323,13 @@ class RegimeSearch:
         smooth = [ranges.variable.curves for ranges in self.ranges if len(ranges.variable.edges)]
         if formula is not None:
             smooth.append(formula)
-        least_energy = min([energy[0], *(rest.energy(white(columns)) for columns in smooth)])
+        least_energy = energy[0]
+        for columns in smooth:
+            least_energy = min(least_energy, rest.energy(whitening.whiten(columns)))
         limit = variance_cost(least_energy, len(self.time)) - SURE
         regimes = []
         for ranges, number in likeliest:
-            refined = self._refined(rest, white, ranges, number)
+            refined = self._refined(rest, whitening, ranges, number)
             # Share of the excess over noise, which is 1 for each block.
             n_blocks = len(refined.inside)
             excess = max(energy[0] - n_blocks, TINY)
@@ -334,7 +356,7 @@ class RegimeSearch:
         return largest_share_first(regimes)
 
     def _refined(
-        self, rest: AxisResidual, white: Callable, ranges: Ranges, number: int
+        self, rest: AxisResidual, whitening: ColumnWhitening, ranges: Ranges, number: int
     ) -> _RefinedRange:
         """Return range `number` of a variable with the bounds at which the residual is least."""
         variable = ranges.variable
@@ -353,11 +375,11 @@ class RegimeSearch:
             if not options:
                 continue
             inside = np.stack([variable.inside(*option) for option in options], axis=1)
-            _, squares = rest.offsets(white(inside))
+            _, squares = rest.offsets(whitening.whiten(inside))
             best = int(np.argmin(squares))
             bounds = options[best]
             mark = inside[:, best]
-        (size,), (after,) = rest.offsets(white(mark[:, None]))
+        (size,), (after,) = rest.offsets(whitening.whiten(mark[:, None]))
         return _RefinedRange(mark, bounds, variable.words(chosen, bounds), size, after)
 
     def tested(self, gains: Sequence[np.ndarray]) -> tuple[float, list[tuple[Ranges, int]]]:

@@ -166,7 +166,7 @@ def test_blocks_of_a_recording_that_hides_nothing_are_noise():
     found, blocks, _ = looked()
     for sensor in blocks:
         plain = fits_of(found, blocks[sensor]).fit()
-        assert abs(plain.excess) < 5 * np.sqrt(2 * plain.rest.size)
+        assert abs(plain.excess) < 5 * np.sqrt(2 * plain.locked_residual.size)
 
 
 @pytest.mark.parametrize(

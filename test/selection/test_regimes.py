@@ -18,8 +18,9 @@ def test_a_formula_that_explains_as_much_is_no_place():
         'gyroscope', TIME, ranged('time', TIME, 's', starts=STARTS), exchange=exchange
     )
     rest = regimes.AxisResidual(rows, np.zeros(1), np.zeros(1))
-    assert search.offsets('x', rest, np.asarray, level=0.05)
-    assert not search.offsets('x', rest, np.asarray, level=0.05, formula=step[:, None])
+    unit_noise = regimes.IndependentErrors(np.ones(len(TIME)))
+    assert search.offsets('x', rest, unit_noise, level=0.05)
+    assert not search.offsets('x', rest, unit_noise, level=0.05, formula=step[:, None])
 
 
 def test_windows_exchange_their_residuals_within_kind_and_intensity():

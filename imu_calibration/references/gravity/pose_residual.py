@@ -14,6 +14,7 @@ from imu_calibration.selection.regime_variables import Variable, ranged
 from imu_calibration.selection.regimes import (
     REGIME_LEVEL,
     AxisResidual,
+    IndependentErrors,
     RegimeSearch,
     RestRegime,
     exchanges,
@@ -158,8 +159,8 @@ def regimes_by_hand(
         # A constant and the residual, whitened.
         white = np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None]
         axis_residual = AxisResidual(white, np.zeros(1), np.zeros(1))
-        whiten = partial(np.multiply, 1.0 / sd[:, None])
-        offsets = search.offsets(name, axis_residual, whiten, level=REGIME_LEVEL / len(names))
+        whitening = IndependentErrors(sd)
+        offsets = search.offsets(name, axis_residual, whitening, level=REGIME_LEVEL / len(names))
         regimes += offsets[:1]
     return tuple(regimes)
 

@@ -19,7 +19,7 @@ from imu_calibration.effects.expressions import (
     names_in,
     read,
 )
-from imu_calibration.references.turntable.residuals.residual_blocks import RestBlocks
+from imu_calibration.references.turntable.residuals.residual_blocks import SELECTION, ResidualBlocks
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
 JOINT_ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
@@ -324,7 +324,7 @@ class FormulaSearch:
 
     Parameters
     ----------
-    blocks : RestBlocks
+    blocks : ResidualBlocks
     formulas : sequence of Formula
     plausible : array, shape (q, q)
         Factor of the covariance that the parameters of the space may plausibly have.
@@ -334,7 +334,7 @@ class FormulaSearch:
 
     def __init__(
         self,
-        blocks: RestBlocks,
+        blocks: ResidualBlocks,
         formulas: Sequence[Formula],
         plausible: np.ndarray,
         *,
@@ -351,16 +351,16 @@ class FormulaSearch:
         self.means = self._worked_out(tuple(self._place), reference_temperature)
 
         # Independent rows of the catalogue's columns and residual of each axis, then of the texts.
-        whiten = blocks.white[0]
-        white = whiten(np.concatenate([*blocks.design, self.means], axis=1))
+        whitener = blocks.white[SELECTION]
+        white = whitener.whiten(np.concatenate([*blocks.design, self.means], axis=1))
         ends = np.cumsum([0, *(part.shape[1] for part in blocks.design)])
         self._rest = []
         self._free = []
         self.known = []
         for axis in range(3):
-            catalogue_and_residual = white[:, ends[axis] : ends[axis + 1]] / whiten.scale[axis]
+            catalogue_and_residual = white[:, ends[axis] : ends[axis + 1]] / whitener.scale[axis]
             residual = catalogue_and_residual[:, -1]
-            columns = white[:, ends[3] :] / whiten.scale[axis]
+            columns = white[:, ends[3] :] / whitener.scale[axis]
 
             # Plausible contributions A p of the catalogue, cov(p) = P P', count as noise of unit
             # variance more: with A P = U S V' the rows are multiplied by (1 + U S^2 U')^(-1/2)

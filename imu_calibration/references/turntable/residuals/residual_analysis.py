@@ -25,8 +25,8 @@ from imu_calibration.references.turntable.residuals.proposals import (
 )
 from imu_calibration.references.turntable.residuals.residual_blocks import (
     BlockFits,
-    RestBlocks,
-    rest_blocks,
+    ResidualBlocks,
+    residual_blocks,
 )
 from imu_calibration.references.turntable.residuals.spectrum import find_sway, find_tones
 from imu_calibration.references.turntable.residuals.unexplained_windows import (
@@ -141,9 +141,9 @@ class ResidualAnalysis(Investigation):
         return found
 
     @cached_property
-    def blocks(self) -> dict[str, RestBlocks]:
-        """Sensor -> RestBlocks."""
-        return rest_blocks(self.used, self.table, self.problem, explained=self.explained)
+    def blocks(self) -> dict[str, ResidualBlocks]:
+        """Sensor -> ResidualBlocks."""
+        return residual_blocks(self.used, self.table, self.problem, explained=self.explained)
 
     def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:
         """

@@ -1,7 +1,7 @@
 """
-The residual of one sensor in short blocks.
+The residual of one sensor and the columns of all candidate effects, as means over short blocks.
 
-With the columns of all candidate effects, and fits of columns to it.
+Fits of columns to these means choose on some windows, and predict the locked (held-out) windows.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.effects.forward_equations import References
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
+from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
@@ -39,16 +40,15 @@ from imu_calibration.simulation.replay import predict_windows
 MIN_BLOCK_SECONDS = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
 MAX_RESIDUAL_BLOCKS = 1200
-"""Blocks of one recording, about: their full covariance is factored."""
+"""Approximate number of blocks of one recording, because their full covariance is factored."""
 COVARIANCE_PARTS = 16
 """Parts of the rows of that covariance, which are computed one after the other."""
 AT_A_TIME = 256
 """Blocks whose columns are in memory at once."""
-WHITE_BENDS, PER_FREEDOM = 6.0, 35 / 18
-"""
-Variance of second differences of unit white noise, and their number for each degree of freedom of a
-mean of their squares.
-"""
+VARIANCE_OF_DIFFERENCES = 6.0
+"""Variance of the second differences ``y_(k-1) - 2 y_k + y_(k+1)`` of unit white noise."""
+DIFFERENCES_PER_FREEDOM = 35 / 18
+"""Second differences for each degree of freedom of the mean of their squares: they overlap."""
 SHORT_WINDOW = 8
 """Samples up to which the white noise of a window is unknown."""
 WITHIN = 5
@@ -56,8 +56,12 @@ WITHIN = 5
 
 
 @dataclass(frozen=True, eq=False)
-class RestBlocks:
-    """Means over blocks of one sensor's residual and of the columns of all candidate effects."""
+class ResidualBlocks:
+    """
+    Means over b blocks of one sensor's residual and of the columns of all candidate effects.
+
+    A block is a part of a moving window, or a whole window at rest.
+    """
 
     sensor: str
     """'accelerometer' or 'gyroscope'."""
@@ -71,63 +75,62 @@ class RestBlocks:
     """Number of the window of each block, shape (b,)."""
     locked: np.ndarray
     """Mask of blocks in locked windows, shape (b,)."""
-    design: tuple
+    design: tuple[np.ndarray, ...]
     """Per axis ``[columns of the parameters that act on it | residual]``, shape (b, q_a + 1)."""
-    index: tuple
-    """Per axis the parameters of the space that these columns belong to."""
+    index: tuple[np.ndarray, ...]
+    """Per axis the numbers of these parameters in the `ParameterSpace`, shape (q_a,)."""
     variance: np.ndarray
-    """Variance of a block's residual by the white noise, shape (b, 3)."""
-    processes: tuple
-    """How every bias moves (BiasProcess)."""
+    """Variance of the mean of each block by the white noise, shape (b, 3)."""
+    processes: tuple[BiasProcess, ...]
+    """Bias processes, the same for all axes."""
     rough: np.ndarray
     """
-    Variance of the residual within a block by second differences, which suppress causes that vary
+    Variance of the samples within each block by second differences, which suppress causes that vary
     with the motion, without errors of the stamps, shape (b, 3).
     """
     freedom: np.ndarray
-    """Its degrees of freedom, shape (b,)."""
+    """Degrees of freedom of `rough`, shape (b,)."""
     jitter: StampJitter
     """Errors of the stamps, the same for both sensors."""
 
     @property
     def warms(self) -> bool:
-        """
-        Whether the temperature is known and changes by as much as a thermal effect needs to show.
-        """
+        """Whether the temperature is known and changes enough for a thermal effect to show."""
         return self.ref.temperature_c is not None and bool(
             np.ptp(self.ref.temperature_c) >= TEMPERATURE_SPAN
         )
 
     def means(self, rows: np.ndarray) -> np.ndarray:
-        """Return means over the blocks of something known at the rows, shape (b, ...)."""
+        """Return the means over the blocks of values at the rows of `ref`, shape (b, ...)."""
         return block_means(rows, self.starts)
 
     @cached_property
     def white(self) -> list['BlockWhitener']:
         """
-        Whiteners of the blocks outside locked windows and of those inside.
+        Whiteners of the blocks outside locked windows, and of the locked blocks.
 
-        Large, therefore shared by the fits of all choices.
+        Each holds a factor of shape (b, b), therefore the fits of all choices share them.
         """
         return [BlockWhitener(self, ~self.locked), BlockWhitener(self, self.locked)]
 
 
 class BlockWhitener:
     """
-    Makes rows of the blocks `select` (mask) independent, of unit variance.
+    Whitening of the blocks `select` (mask) by the factor L of their covariance ``C = L L'``.
 
-    White noise of each block and a bias that moves.
+    One covariance serves the three axes, whose white noise differs by the factors `scale`. With the
+    means v_i of the variances of a block over the axes, and the bias processes (sd, T)::
+
+        C_ij = v_i (i = j) + sum over processes of sd^2 exp(-|t_i - t_j| / T)
     """
 
-    def __init__(self, blocks: RestBlocks, select: np.ndarray):
-        # One covariance for the three axes, whose white noise differs by a factor:
-        # C_ij = variance_i (i = j) + sum over the bias processes of sd^2 exp(-|t_i - t_j| / T)
+    def __init__(self, blocks: ResidualBlocks, select: np.ndarray):
         variance = blocks.variance[select]
         time = blocks.time[select]
         mean_variance = variance.mean(axis=1, keepdims=True)
         self.scale = np.sqrt(np.median(variance / mean_variance, axis=0))
         covariance = np.diag(mean_variance[:, 0])
-        # Intermediate arrays of a part, not of the matrix.
+        # By parts of the rows: the intermediate arrays are then smaller than the matrix.
         for rows in np.array_split(np.arange(len(time)), COVARIANCE_PARTS):
             apart = np.abs(time[rows, None] - time[None, :])
             for process in blocks.processes:
@@ -135,25 +138,95 @@ class BlockWhitener:
         self._select = select
         self._factor = cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)
 
-    def __call__(self, rows: np.ndarray, axis: int | None = None) -> np.ndarray:
+    def whiten(self, rows: np.ndarray) -> np.ndarray:
         """
-        Return whitened rows of an axis, shape of the selection.
+        Return ``L^-1 rows`` of the selected blocks, shape (n_selected, k).
 
-        Of all axes, still to be divided by ``scale[axis]``, without `axis`.
+        The errors are independent; on an axis they have the standard deviation ``scale[axis]``.
         """
-        white = solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
-        return white if axis is None else white / self.scale[axis]
+        return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
+
+    def whiten_axis(self, rows: np.ndarray, axis: int) -> np.ndarray:
+        """Return rows of one axis with independent errors of unit variance, (n_selected, k)."""
+        return self.whiten(rows) / self.scale[axis]
 
 
-def rest_blocks(
+@dataclass(frozen=True, eq=False)
+class WhitenedAxis:
+    """Whitening of the blocks of one axis (`ColumnWhitening`)."""
+
+    whitener: BlockWhitener
+    axis: int
+
+    def whiten(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns over the blocks with independent errors of unit variance."""
+        return self.whitener.whiten_axis(columns, self.axis)
+
+
+@dataclass(frozen=True, eq=False)
+class _CutWindows:
+    """Windows of a recording, cut into b blocks."""
+
+    windows: list[Window]
+    """Windows in use."""
+    used: np.ndarray
+    """Their numbers among all windows of the fit, shape (k,)."""
+    motion: JointMotion
+    """Motion at the rows at which columns are evaluated: a few in each block."""
+    temperature_c: np.ndarray | None
+    """Temperature at these rows; None where a window has none."""
+    first_row: np.ndarray
+    """First of these rows of each block, shape (b,)."""
+    first_sample: np.ndarray
+    """First sample of each block among the samples of all windows in use, shape (b,)."""
+    place_of_window: np.ndarray
+    """Place in `windows` of the window of each block, shape (b,)."""
+
+    @classmethod
+    def of(cls, windows: Sequence[Window]) -> '_CutWindows':
+        """Return the windows, or a random part of a long recording, cut into blocks."""
+        moving_time = sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1)
+        length = max(MIN_BLOCK_SECONDS, moving_time / MAX_RESIDUAL_BLOCKS)
+        used = _used_windows(windows, length)
+        windows_in_use = [windows[k] for k in used]
+        cuts = []
+        motions = []
+        rows_per_block = []
+        first_samples = []
+        places = []
+        n_samples = 0
+        for place, window in enumerate(windows_in_use):
+            cut = _cut(window, length)
+            cuts.append(cut)
+            motions.append(window.motion.select(cut.rows))
+            rows_per_block.append(cut.per_block)
+            first_samples.append(n_samples + cut.starts)
+            places.append(np.full(len(cut.starts), place))
+            n_samples += len(window)
+        return cls(
+            windows=windows_in_use,
+            used=used,
+            motion=JointMotion.concatenate(motions),
+            temperature_c=_temperatures(windows_in_use, cuts),
+            first_row=np.cumsum([0, *np.concatenate(rows_per_block)[:-1]]),
+            first_sample=np.concatenate(first_samples),
+            place_of_window=np.concatenate(places),
+        )
+
+    def sample_means(self, samples: np.ndarray) -> np.ndarray:
+        """Return the means over the blocks of values of every sample, shape (b, ...)."""
+        return block_means(samples, self.first_sample)
+
+
+def residual_blocks(
     windows: Sequence[Window],
     table: Table,
     problem: LinearisedProblem,
     *,
     explained: ExplainedWindows,
-) -> dict[str, RestBlocks]:
+) -> dict[str, ResidualBlocks]:
     """
-    Return sensor -> RestBlocks of the windows of the reduced recording.
+    Return sensor -> ResidualBlocks of the windows of the reduced recording.
 
     Parameters
     ----------
@@ -163,71 +236,53 @@ def rest_blocks(
     problem : LinearisedProblem
         The linearisation of the columns.
     explained : ExplainedWindows
-        Expected loss from noise.
+        The noise of each sensor.
 
     """
-    # Blocks of the windows in use: their first samples, and the motion at a few rows of each.
-    moving_time = sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1)
-    length = max(MIN_BLOCK_SECONDS, moving_time / MAX_RESIDUAL_BLOCKS)
-    used = _used_windows(windows, length)
-    windows = [windows[k] for k in used]
-    cuts = []
-    motions = []
-    rows_per_block = []
-    first_of_block = []
-    place_of_block = []
-    n_samples = 0
-    for place, window in enumerate(windows):
-        cut = _cut(window, length)
-        cuts.append(cut)
-        motions.append(window.motion.select(cut.rows))
-        rows_per_block.append(cut.per_block)
-        first_of_block.append(n_samples + cut.starts)
-        place_of_block.append(np.full(len(cut.starts), place))
-        n_samples += len(window)
-    motion = JointMotion.concatenate(motions)
-    temperature = _temperatures(windows, cuts)
-    starts = np.cumsum([0, *np.concatenate(rows_per_block)[:-1]])  # first row of each block
-    edges = np.concatenate(first_of_block)
-    place_of_window = np.concatenate(place_of_block)
-    window_of_block = used[place_of_window]
-    n_samples_of_block = np.diff(edges, append=n_samples).astype(float)
+    cut = _CutWindows.of(windows)
+    window_of_block = cut.used[cut.place_of_window]
 
-    # Columns and residuals.
-    references = References(problem.recording.model, table, motion, temperature_c=temperature)
-    columns_of = _block_means(problem, table, motion, temperature, starts)
+    # Columns at a few rows of each block, residuals of every sample.
+    references = References(
+        problem.recording.model, table, cut.motion, temperature_c=cut.temperature_c
+    )
+    columns_of = _mean_columns(problem, table, cut)
     residual_of = residuals(
-        windows, table, problem.recording.model, values=problem.recording.values
+        cut.windows, table, problem.recording.model, values=problem.recording.values
     )
 
-    # Variance within the blocks, without that of errors of the stamps.
-    inner = _inner(windows)
-    number = np.add.reduceat(inner, edges)
-    freedom = number / PER_FREEDOM
+    # Variance within the blocks by second differences, and what errors of the stamps add to it.
+    inner = _inner_samples(cut.windows)
+    n_differences = np.add.reduceat(inner, cut.first_sample)
+    freedom = n_differences / DIFFERENCES_PER_FREEDOM
     rough = {}
     slope = {}
     for sensor, residual in residual_of.items():
-        rough[sensor] = _roughness(residual, inner, edges, number=number, least=LEAST_NOISE[sensor])
-        slope[sensor] = _slope(residual, windows, edges, sensor)
+        rough[sensor] = _variance_by_differences(
+            residual, inner, cut.first_sample, n_differences, least_sd=LEAST_NOISE[sensor]
+        )
+        slope[sensor] = _mean_square_slope(residual, cut, sensor)
     jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
     by_jitter = {}
     for sensor in residual_of:
         by_jitter[sensor] = jitter_ratio(rough[sensor], slope[sensor], jitter.sd)
     jitter = replace(jitter, ratio=_by_kind(by_jitter, problem.recording.kind[window_of_block]))
 
+    time = np.concatenate([window.time for window in cut.windows])
+    n_samples_of_block = np.diff(cut.first_sample, append=len(time)).astype(float)
     blocks = {}
     for sensor, residual in residual_of.items():
         floor = explained.floor.noise[sensor]
         noise_factor = _white_noise_factor(
-            windows, sensor, floor, problem.recording.kind[used], ~problem.locked[used]
+            cut.windows, sensor, floor, problem.recording.kind[cut.used], ~problem.locked[cut.used]
         )
-        variance = floor.low_variance * noise_factor[place_of_window]
-        rows = np.concatenate([columns_of[sensor], block_means(residual, edges)], axis=1)
-        blocks[sensor] = RestBlocks(
+        variance = floor.low_variance * noise_factor[cut.place_of_window]
+        rows = np.concatenate([columns_of[sensor], cut.sample_means(residual)], axis=1)
+        blocks[sensor] = ResidualBlocks(
             sensor,
             references.at(sensor),
-            starts=starts,
-            time=block_means(np.concatenate([each.time for each in windows]), edges),
+            starts=cut.first_row,
+            time=cut.sample_means(time),
             window=window_of_block,
             locked=problem.locked[window_of_block],
             design=tuple(rows @ join for join in problem.space.join[sensor]),
@@ -244,43 +299,71 @@ def rest_blocks(
 
 
 def _temperatures(windows: Sequence[Window], cuts: Sequence['_Cut']) -> np.ndarray | None:
-    """Return the temperature at the rows of all windows; None where a window has none."""
-    found = []
+    """Return the temperature at the rows of all blocks; None where a window has none."""
+    temperatures = []
     for window, cut in zip(windows, cuts):
         if window.temperature_c is None:
             return None
-        at_rest = len(cut.rows) == 1
-        found.append(
-            window.temperature_c.mean(keepdims=True) if at_rest else window.temperature_c[cut.rows]
-        )
-    return np.concatenate(found)
+        if len(cut.rows) == 1:  # at rest the single row stands for all samples
+            temperatures.append(window.temperature_c.mean(keepdims=True))
+        else:
+            temperatures.append(window.temperature_c[cut.rows])
+    return np.concatenate(temperatures)
 
 
-def _by_kind(louder: dict[str, np.ndarray], kinds: np.ndarray) -> dict[str, dict[str, float]]:
-    """Return sensor -> kind of moving window -> mean factor of its blocks."""
-    found: dict[str, dict[str, float]] = {}
-    for sensor, factor in louder.items():
-        found[sensor] = {}
+def _by_kind(
+    factor_of_blocks: dict[str, np.ndarray], kinds: np.ndarray
+) -> dict[str, dict[str, float]]:
+    """
+    Return sensor -> kind of moving window -> mean over its blocks of a factor, shape (b, 3).
+
+    The blocks belong to windows of the kinds `kinds`, shape (b,).
+    """
+    means: dict[str, dict[str, float]] = {}
+    for sensor, factor in factor_of_blocks.items():
+        means[sensor] = {}
         for kind in np.unique(kinds):
             if kind != 'static':
-                found[sensor][str(kind)] = float(factor[kinds == kind].mean())
-    return found
+                means[sensor][str(kind)] = float(factor[kinds == kind].mean())
+    return means
 
 
-def _roughness(
-    residual: np.ndarray, inner: np.ndarray, edges: np.ndarray, *, number: np.ndarray, least: float
+def _variance_by_differences(
+    residual: np.ndarray,
+    inner: np.ndarray,
+    first_sample: np.ndarray,
+    n_differences: np.ndarray,
+    *,
+    least_sd: float,
 ) -> np.ndarray:
     """
-    Return the variance by the `number` of second differences in blocks, shape (b, 3).
+    Return the variance of the samples of each block by second differences, shape (b, 3).
 
-    The blocks begin at the samples `edges`, and the variance is at least that of rounding.
+    With d_k the second difference about sample k, and the n_b inner samples of a block::
+
+        variance = max(sum d_k^2 / (6 n_b), least_sd^2)
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n, 3)
+        Of every sample.
+    inner : ndarray, shape (n,)
+        1 for samples with a second difference, else 0 (`_inner_samples`).
+    first_sample : ndarray, shape (b,)
+        First sample of each block.
+    n_differences : ndarray, shape (b,)
+        Number n_b of inner samples of each block.
+    least_sd : float
+        Noise of rounding, SI.
+
     """
-    bends = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
-    squares = np.add.reduceat(inner[:, None] * bends**2, edges, axis=0) / WHITE_BENDS
-    return np.maximum(squares / np.maximum(number, 1)[:, None], least**2)
+    differences = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
+    squares = np.add.reduceat(inner[:, None] * differences**2, first_sample, axis=0)
+    squares = squares / VARIANCE_OF_DIFFERENCES
+    return np.maximum(squares / np.maximum(n_differences, 1)[:, None], least_sd**2)
 
 
-def _inner(windows: Sequence[Window]) -> np.ndarray:
+def _inner_samples(windows: Sequence[Window]) -> np.ndarray:
     """Return 1 for samples with two neighbours in their window, 0 for its ends, shape (n,)."""
     ends = np.cumsum([len(window) for window in windows])
     inner = np.ones(ends[-1])
@@ -289,28 +372,34 @@ def _inner(windows: Sequence[Window]) -> np.ndarray:
     return inner
 
 
-def _slope(
-    residual: np.ndarray, windows: Sequence[Window], edges: np.ndarray, sensor: str
-) -> np.ndarray:
+def _mean_square_slope(residual: np.ndarray, cut: _CutWindows, sensor: str) -> np.ndarray:
     """
-    Return the mean square of the rate of change of the predicted output in blocks.
+    Return the mean over each block of ``(dy/dt)^2``, y the predicted output, shape (b, 3).
 
-    The blocks begin at the samples `edges`, and the shape is (b, 3).
+    Parameters
+    ----------
+    residual : ndarray, shape (n, 3)
+        Measured minus predicted output of every sample.
+    cut : _CutWindows
+    sensor : str
+
     """
     squares = np.zeros_like(residual)
     start = 0
-    for window in windows:
+    for window in cut.windows:
         part = slice(start, start + len(window))
         if len(window) > 2:
             predicted = measured(window, sensor) - residual[part]
             squares[part] = np.gradient(predicted, window.time, axis=0) ** 2
         start = part.stop
-    return block_means(squares, edges)
+    return cut.sample_means(squares)
 
 
 def _used_windows(windows: Sequence[Window], length: float) -> np.ndarray:
     """
     Return the numbers of the windows in use: all, or a random part of a long recording, in order.
+
+    `length` is that of a block, s.
     """
     n_blocks = 0
     for window in windows:
@@ -322,18 +411,23 @@ def _used_windows(windows: Sequence[Window], length: float) -> np.ndarray:
 
 
 def _count_blocks(window: Window, length: float) -> int:
-    """Return into how many blocks a moving window is cut."""
+    """Return the number of blocks of about `length` s of a moving window."""
     return max(1, round((window.time[-1] - window.time[0]) / length))
 
 
 def _white_noise_factor(
-    windows: Sequence[Window], sensor: str, floor: NoiseModel, kinds: np.ndarray, judged: np.ndarray
+    windows: Sequence[Window],
+    sensor: str,
+    noise: NoiseModel,
+    kinds: np.ndarray,
+    selected: np.ndarray,
 ) -> np.ndarray:
     """
-    Return by how much each window's white noise exceeds that at rest, shape (k, 3).
+    Return the variance of white noise of each window over that at rest, shape (k, 3).
 
-    By kind, from second differences of the windows `judged` (mask), which suppress causes that vary
-    with the motion; at most the misfit of the kind.
+    It is the same for all windows of a kind: the median of the variances by second differences,
+    which suppress causes that vary with the motion, of the windows `selected` (mask); at least 1,
+    and at most the residual variance of the kind over that at rest.
     """
     # Variance of the white noise in each window; unknown in short ones.
     place = SENSORS.index(sensor)
@@ -342,17 +436,17 @@ def _white_noise_factor(
         if len(window) > SHORT_WINDOW:
             variance[number] = window.noise_sd[place] ** 2
 
-    # That at rest.
-    rests = judged & (kinds == 'static')
-    at_rest = floor.white_variance
-    if rests.any():
-        at_rest = np.nanmedian(variance[rests], axis=0)
+    # Variance at rest.
+    static = selected & (kinds == 'static')
+    at_rest = noise.white_variance
+    if static.any():
+        at_rest = np.nanmedian(variance[static], axis=0)
     at_rest = np.maximum(at_rest, LEAST_NOISE[sensor] ** 2)
 
     factor = np.ones((len(windows), 3))
     for kind in np.unique(kinds[kinds != 'static']):
-        misfit = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
-        of_kind = np.nanmedian(variance[judged & (kinds == kind)], axis=0)
+        misfit = np.maximum(noise.row_variance(kind) / noise.low_variance, 1.0)
+        of_kind = np.nanmedian(variance[selected & (kinds == kind)], axis=0)
         factor[kinds == kind] = np.clip(of_kind / at_rest, 1.0, misfit)
     return factor
 
@@ -361,9 +455,9 @@ def residuals(
     windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
 ) -> dict[str, np.ndarray]:
     """
-    Return sensor -> residual of every sample of all windows at some values, shape (n, 3).
+    Return sensor -> measured minus predicted output of every sample, shape (n, 3).
 
-    Rows within blocks would be too coarse.
+    The windows follow one after the other; `values` are the parameters of the model.
     """
     # Some windows at a time: columns need much memory.
     predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
@@ -374,12 +468,8 @@ def residuals(
     return residual_of
 
 
-def _block_means(
-    problem: LinearisedProblem,
-    table: Table,
-    motion: JointMotion,
-    temperature: np.ndarray | None,
-    starts: np.ndarray,
+def _mean_columns(
+    problem: LinearisedProblem, table: Table, cut: _CutWindows
 ) -> dict[str, np.ndarray]:
     """
     Return sensor -> means of all columns over the blocks, shape (b, p).
@@ -387,17 +477,19 @@ def _block_means(
     Some blocks at a time, as their columns need much memory.
     """
     recording = problem.recording
-    edges = np.append(starts, len(motion))
-    found: dict[str, list[np.ndarray]] = {sensor: [] for sensor in recording.sensors}
-    for first in range(0, len(starts), AT_A_TIME):
-        own = edges[first : first + AT_A_TIME + 1]
-        rows = slice(own[0], own[-1])
-        warmth = None if temperature is None else temperature[rows]
-        references = References(recording.model, table, motion.select(rows), temperature_c=warmth)
-        for sensor, parts in found.items():
+    row_edges = np.append(cut.first_row, len(cut.motion))
+    groups: dict[str, list[np.ndarray]] = {sensor: [] for sensor in recording.sensors}
+    for first in range(0, len(cut.first_row), AT_A_TIME):
+        edges = row_edges[first : first + AT_A_TIME + 1]
+        rows = slice(edges[0], edges[-1])
+        temperature = None if cut.temperature_c is None else cut.temperature_c[rows]
+        references = References(
+            recording.model, table, cut.motion.select(rows), temperature_c=temperature
+        )
+        for sensor, means in groups.items():
             columns = columns_with_bank(references, sensor, recording.bank)
-            parts.append(block_means(columns, own[:-1] - own[0]))
-    return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
+            means.append(block_means(columns, edges[:-1] - edges[0]))
+    return {sensor: np.concatenate(means) for sensor, means in groups.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,7 +505,7 @@ class _Cut:
 
 
 def _cut(window: Window, length: float) -> _Cut:
-    """Return a window cut into blocks of about this length, s; at rest it is one block."""
+    """Return a window cut into blocks of about `length` s; at rest it is one block."""
     if len(window.motion) == 1:
         return _Cut(np.array([0]), np.array([0]), np.array([1]))
     n_blocks = _count_blocks(window, length)
@@ -434,35 +526,53 @@ blocks.
 IMITATED = 1e-6
 """Least singular value of the scaled columns of the catalogue, relative to the largest one."""
 SHARE_RESAMPLES = 500
+"""Samples of the bootstrap of a share."""
 ABOVE_NOISE = 3.0
-"""Least excess of this axis over noise, standard deviations."""
+"""Least excess over noise of an axis with a significant residual, standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlockFit:
-    """A model and further columns, fitted to the selection windows."""
+    """A model and k further columns, fitted to the selection windows, on locked windows."""
 
     amplitudes: np.ndarray
-    """Of the further columns, shape (k, 3)."""
+    """Amplitudes of the further columns on each axis, shape (k, 3)."""
     sd: np.ndarray
-    """Their standard deviations, with the misfit in them, shape (k, 3)."""
-    rest: np.ndarray
-    """Whitened residual of the locked blocks, shape (n_locked, 3)."""
+    """Standard deviations of the amplitudes, larger by the misfit, shape (k, 3)."""
+    locked_residual: np.ndarray
+    """Whitened residual of the locked blocks, by the fit to the others, shape (n_locked, 3)."""
     window: np.ndarray
     """Window of each locked block, shape (n_locked,)."""
 
     @property
     def excess(self) -> float:
         """Sum of squares of the locked blocks above the expectation from noise."""
-        return float((self.rest**2 - 1.0).sum())
+        return float((self.locked_residual**2 - 1.0).sum())
+
+
+SELECTION = 0
+"""Place of the blocks outside locked windows in the lists of `BlockFits`."""
+LOCKED = 1
+"""Place of the locked blocks in these lists."""
 
 
 class BlockFits:
-    """Fits of the blocks of one sensor, whitened once."""
+    """
+    Fits to the blocks of one sensor with a choice of parameters, whitened once.
+
+    Parameters
+    ----------
+    blocks : ResidualBlocks
+    used : sequence of int
+        Parameters of the model, numbers in the `ParameterSpace`.
+    prior_sd, prior_mean : ndarray
+        Prior of all parameters of that space.
+
+    """
 
     def __init__(
         self,
-        blocks: RestBlocks,
+        blocks: ResidualBlocks,
         used: Sequence[int],
         *,
         prior_sd: np.ndarray,
@@ -472,13 +582,15 @@ class BlockFits:
         self.used = frozenset(used)
         self._prior_sd = prior_sd
         self._prior_mean = prior_mean
-        # Independent rows [columns | residual]: of the blocks that choose and of the locked ones,
-        # each a list over the axes.
+        # [SELECTION or LOCKED][axis]: whitened rows [columns | residual].
         self._design = []
-        for whiten in blocks.white:
-            self._design.append([whiten(part, axis) for axis, part in enumerate(blocks.design)])
-        # Per axis the columns of the parameters in use.
-        self._at = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
+        for whitener in blocks.white:
+            of_axes = []
+            for axis, rows in enumerate(blocks.design):
+                of_axes.append(whitener.whiten_axis(rows, axis))
+            self._design.append(of_axes)
+        # Per axis the places of the parameters in use among the columns.
+        self._used_places = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
 
     def fit(
         self,
@@ -493,38 +605,40 @@ class BlockFits:
         Parameters
         ----------
         columns : array, shape (b, k, 3), optional
+            Further columns over all blocks, one amplitude for each column and axis.
         more : sequence of int
             Parameters of the catalogue that join the model.
         half : 0 or 1, optional
-            The half of the choosing windows, by time, that is fitted to.
+            Fit to the earlier (0) or later (1) half of the selection windows only.
 
         """
-        count = 0 if columns is None else columns.shape[1]
-        amplitudes = np.zeros((count, 3))
-        sds = np.zeros((count, 3))
+        n_columns = 0 if columns is None else columns.shape[1]
+        amplitudes = np.zeros((n_columns, 3))
+        sds = np.zeros((n_columns, 3))
         locked_residuals = []
         for axis in range(3):
-            # Fit to the blocks that choose.
             joining = np.flatnonzero(np.isin(self.blocks.index[axis], list(more)))
-            at = np.union1d(self._at[axis], joining).astype(int)
-            values, covariance, residual = self._solved(axis, at, columns, half)
-            n_free = max(len(residual) - len(values), 1)
-            misfit = max(float(residual @ residual) / n_free, 1.0)
-            amplitudes[:, axis] = values[len(at) :]
-            sds[:, axis] = np.sqrt(misfit * np.diag(covariance)[len(at) :])
+            places = np.union1d(self._used_places[axis], joining).astype(int)
+            fit = self._fitted(axis, places, columns, half)
+
+            # The variances grow by the chi-square per degree of freedom.
+            n_free = max(len(fit.residual) - len(fit.values), 1)
+            misfit = max(float(fit.residual @ fit.residual) / n_free, 1.0)
+            amplitudes[:, axis] = fit.values[len(places) :]
+            sds[:, axis] = np.sqrt(misfit * np.diag(fit.covariance)[len(places) :])
 
             # Prediction of the locked blocks.
-            locked = self._rows(1, axis, at, columns)
-            locked_residuals.append(locked[:, -1] - locked[:, :-1] @ values)
+            locked = self._rows(LOCKED, axis, places, columns)
+            locked_residuals.append(locked[:, -1] - locked[:, :-1] @ fit.values)
         locked_window = self.blocks.window[self.blocks.locked]
         return BlockFit(amplitudes, sds, np.stack(locked_residuals, axis=1), locked_window)
 
     def outside_catalogue(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (columns, residual) without all that the columns of the catalogue can imitate.
+        Return (columns, residual) less their projection on all columns of the catalogue.
 
-        Whitened, of the selection windows, the three axes one after the other: shape (3 n, k) and
-        (3 n,).
+        Both are whitened and of the n blocks of the selection windows, the three axes one after the
+        other: shape (3 n, k) and (3 n,).
 
         Parameters
         ----------
@@ -535,7 +649,7 @@ class BlockFits:
         outside_residual = []
         for axis in range(3):
             # Orthonormal basis of the catalogue's columns; x - U U^T x is orthogonal to them.
-            design = self._design[0][axis]
+            design = self._design[SELECTION][axis]
             catalogue = design[:, :-1]
             residual = design[:, -1]
             norm = np.linalg.norm(catalogue, axis=0)
@@ -543,24 +657,24 @@ class BlockFits:
             basis, singular_values, _ = svd(scaled, full_matrices=False)
             basis = basis[:, singular_values > IMITATED * singular_values.max()]
 
-            rows = self.blocks.white[0](columns[:, :, axis], axis)
+            rows = self.blocks.white[SELECTION].whiten_axis(columns[:, :, axis], axis)
             outside_columns.append(rows - basis @ (basis.T @ rows))
             outside_residual.append(residual - basis @ (basis.T @ residual))
         return np.concatenate(outside_columns), np.concatenate(outside_residual)
 
     def axes(self) -> tuple[str, ...]:
         """
-        Return the axes with an excess in the selection windows.
+        Return the axes with a significant excess in the selection windows.
 
-        They are in order of unweighted squares, the largest first.
+        The axis with the largest excess in SI units squared is first.
         """
-        choosing = ~self.blocks.locked
+        selection = ~self.blocks.locked
         excess = self._excess()
         # The sum of n squares of unit noise has the variance 2 n. The axis with the largest excess
         # is named in any case.
-        noise = ABOVE_NOISE * np.sqrt(2.0 * choosing.sum())
+        noise = ABOVE_NOISE * np.sqrt(2.0 * selection.sum())
         least_excess = min(noise, 0.99 * excess.max())
-        squares = excess * np.median(self.blocks.variance[choosing], axis=0)
+        squares = excess * np.median(self.blocks.variance[selection], axis=0)
         named = []
         for axis in largest_axes(squares):
             if excess[AXES.index(axis)] > least_excess:
@@ -569,9 +683,8 @@ class BlockFits:
 
     @property
     def sigma(self) -> float:
-        """
-        Excess of the residual over noise in the selection windows, all axes, standard deviations.
-        """
+        """Excess of the squares of the selection windows over noise, standard deviations."""
+        # The sum of 3 n squares of unit noise has the variance 6 n.
         return float(self._excess().sum() / np.sqrt(6.0 * (~self.blocks.locked).sum()))
 
     def _excess(self) -> np.ndarray:
@@ -582,41 +695,61 @@ class BlockFits:
         """
         excess = np.zeros(3)
         for axis in range(3):
-            _, _, residual = self._solved(axis, self._at[axis])
+            residual = self._fitted(axis, self._used_places[axis]).residual
             excess[axis] = max(float(residual @ residual) - len(residual), 0.0)
         return excess
 
-    def _solved(
-        self, axis: int, at: np.ndarray, columns: np.ndarray | None = None, half: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _fitted(
+        self,
+        axis: int,
+        places: np.ndarray,
+        columns: np.ndarray | None = None,
+        half: int | None = None,
+    ) -> '_AxisFit':
         """
-        Return (values, covariance, residual) of a fit to the selection windows.
+        Return the fit of one axis to the selection windows, or to a `half` of them.
 
-        Of the parameters `at`, then of columns.
+        Its values are those of the parameters with the `places` among the columns of the axis, then
+        the amplitudes of the further `columns`, shape (b, k, 3).
         """
-        rows = self._rows(0, axis, at, columns)
+        rows = self._rows(SELECTION, axis, places, columns)
         if half is not None:
             time = self.blocks.time[~self.blocks.locked]
             rows = rows[(time > np.median(time)) == half]
         # Parameters have the priors of the catalogue, amplitudes nearly none.
-        parameters = self.blocks.index[axis][at]
-        size = np.sqrt(np.maximum((rows[:, len(at) : -1] ** 2).sum(axis=0), 1e-60))
+        parameters = self.blocks.index[axis][places]
+        size = np.sqrt(np.maximum((rows[:, len(places) : -1] ** 2).sum(axis=0), 1e-60))
         sd = np.append(self._prior_sd[parameters], AMPLITUDE_PRIOR_SD / size)
         mean = np.append(self._prior_mean[parameters], np.zeros_like(size))
         values, covariance = solve_normal(rows.T @ rows, np.arange(len(sd)), sd, prior_mean=mean)
-        return values, covariance, rows[:, -1] - rows[:, :-1] @ values
+        return _AxisFit(values, covariance, rows[:, -1] - rows[:, :-1] @ values)
 
-    def _rows(self, part: int, axis: int, at: np.ndarray, columns: np.ndarray | None) -> np.ndarray:
+    def _rows(
+        self, part: int, axis: int, places: np.ndarray, columns: np.ndarray | None
+    ) -> np.ndarray:
         """
-        Return independent rows ``[columns at | further columns | residual]`` of an axis.
+        Return whitened rows ``[columns of parameters | further columns | residual]`` of an axis.
 
-        Of the blocks that choose (`part` 0), or of the locked ones (1).
+        The parameters have the `places` among the columns of the axis; the blocks are those of
+        `part`, `SELECTION` or `LOCKED`.
         """
         design = self._design[part][axis]
-        parts = [design[:, at]]
+        parts = [design[:, places]]
         if columns is not None:
-            parts.append(self.blocks.white[part](columns[:, :, axis], axis))
+            parts.append(self.blocks.white[part].whiten_axis(columns[:, :, axis], axis))
         return np.concatenate([*parts, design[:, -1:]], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _AxisFit:
+    """Least-squares fit of one axis to whitened rows."""
+
+    values: np.ndarray
+    """Parameters, then amplitudes of further columns, shape (n,)."""
+    covariance: np.ndarray
+    """Covariance of the values, shape (n, n)."""
+    residual: np.ndarray
+    """Whitened residual of the fitted blocks, shape (n_blocks,)."""
 
 
 def share_removed(before: BlockFit, after: BlockFit) -> float:
@@ -642,8 +775,8 @@ def share_interval(
     excess_after = []
     for window in np.unique(before.window):
         in_window = before.window == window
-        excess_before.append((before.rest[in_window] ** 2 - 1.0).sum())
-        excess_after.append((after.rest[in_window] ** 2 - 1.0).sum())
+        excess_before.append((before.locked_residual[in_window] ** 2 - 1.0).sum())
+        excess_after.append((after.locked_residual[in_window] ** 2 - 1.0).sum())
 
     excess = np.array([excess_before, excess_after])
 

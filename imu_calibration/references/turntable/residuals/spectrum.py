@@ -13,7 +13,7 @@ from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.residuals.proposals import Proposal, with_formulas
 from imu_calibration.references.turntable.residuals.residual_blocks import (
     BlockFits,
-    RestBlocks,
+    ResidualBlocks,
     residuals,
     share_removed,
 )
@@ -528,7 +528,7 @@ LIKE_THE_JOINTS = 0.5
 """Share of a wave that the joints may follow: their motion has the same period then."""
 
 
-def find_sway(blocks: RestBlocks, fits: BlockFits) -> Tone | None:
+def find_sway(blocks: ResidualBlocks, fits: BlockFits) -> Tone | None:
     """
     Return the periodic tilt of the level frame in the residual of the accelerometer, None without.
 

@@ -1,12 +1,15 @@
 """Regimes of the residual of windows on a table."""
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
 from imu_calibration.effects.base import AXES
-from imu_calibration.references.turntable.residuals.residual_blocks import BlockWhitener, RestBlocks
+from imu_calibration.references.turntable.residuals.residual_blocks import (
+    BlockWhitener,
+    ResidualBlocks,
+    WhitenedAxis,
+)
 from imu_calibration.references.turntable.residuals.scatter_regimes import ScatterSearch
 from imu_calibration.references.turntable.residuals.window_variables import variables_of
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
@@ -19,7 +22,7 @@ from imu_calibration.selection.regimes import (
 
 
 def find_regimes(
-    blocks: RestBlocks,
+    blocks: ResidualBlocks,
     problem: LinearisedProblem,
     used: Sequence[int],
     *,
@@ -30,12 +33,14 @@ def find_regimes(
     """
     Return the regimes of a sensor's axes, the likeliest of each axis first.
 
+    An axis has regimes of another offset, or, without any, those of a larger scatter.
+
     Parameters
     ----------
-    blocks : RestBlocks
+    blocks : ResidualBlocks
     problem : LinearisedProblem
     used : sequence of int
-        Parameters of the model.
+        Parameters of the model, numbers in the space of the problem.
     joint_names : sequence of str
     axes : sequence of str
         Axes with an excess over noise, on which an offset is searched.
@@ -51,25 +56,33 @@ def find_regimes(
     search = ScatterSearch(
         blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange
     )
-    level = REGIME_LEVEL / len(AXES)
-    white, found = None, []
+    # Two tests on each axis.
+    level = REGIME_LEVEL / len(AXES) / 2
+    regimes: list[RestRegime] = []
+    whitener = None
+    if len(axes):
+        whitener = BlockWhitener(blocks, np.ones(len(blocks.time), bool))
     for axis, name in enumerate(AXES):
-        offsets = []
-        if name in axes:
-            white = white or BlockWhitener(blocks, np.ones(len(blocks.time), bool))
-            at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
-            own = blocks.index[axis][at]
-            scaled = partial(white, axis=axis)
-            prior = 1 / problem.space.prior_sd[own] ** 2, problem.space.prior_mean[own]
-            rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), *prior)
-            offsets = search.offsets(
+        regimes_of_axis: list[RestRegime] = []
+        if name in axes and whitener is not None:
+            whitening = WhitenedAxis(whitener, axis)
+            places = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
+            parameters = blocks.index[axis][places]
+            residual = AxisResidual(
+                whitening.whiten(blocks.design[axis][:, [*places, -1]]),
+                information=1 / problem.space.prior_sd[parameters] ** 2,
+                mean=problem.space.prior_mean[parameters],
+            )
+            regimes_of_axis = search.offsets(
                 name,
-                rest,
-                scaled,
-                level=level / 2,
+                residual,
+                whitening,
+                level=level,
                 formula=None if formula is None else formula[:, :, axis],
             )
-        found += offsets or search.scatters(
-            name, blocks.rough[:, axis], blocks.freedom, level=level / 2
-        )
-    return found
+        if not regimes_of_axis:
+            regimes_of_axis = search.scatters(
+                name, blocks.rough[:, axis], blocks.freedom, level=level
+            )
+        regimes += regimes_of_axis
+    return regimes

@@ -7,63 +7,82 @@ import numpy as np
 
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
-from imu_calibration.references.turntable.residuals.residual_blocks import RestBlocks
+from imu_calibration.references.turntable.residuals.residual_blocks import ResidualBlocks
 from imu_calibration.selection.regime_variables import FEWEST, N_BINS, Variable, block_means, ranged
 
 
-def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variable]:
+def variables_of(blocks: ResidualBlocks, joint_names: Sequence[str]) -> list[Variable]:
     """Return the variables of regimes in this recording; the first is reported among equals."""
     ref = blocks.ref
     starts = blocks.starts
-    found = []
-    each = partial(ranged, starts=starts)
-    rates = partial(ranged, unit='deg/s', starts=starts, is_rate=True)
+    of_value = partial(ranged, starts=starts)
+    of_rate = partial(ranged, unit='deg/s', starts=starts, is_rate=True)
+
+    # Joints.
+    variables = []
     for k, name in enumerate(joint_names):
         if np.ptp(ref.joint_angle[:, k]) > 0.5:
-            found.append(_cyclic(f'angle of {name}', ref.joint_angle[:, k] / DEG, starts))
+            variables.append(_cyclic(f'angle of {name}', ref.joint_angle[:, k] / DEG, starts))
         joint_rate = ref.joint_rate[:, k] / DEG
-        found += rates(f'rate of {name}', joint_rate)
-        found += rates(f'speed of {name}', np.abs(joint_rate))
-        found += _before_rest(name, ref.joint_rate[:, k], starts)
+        variables += of_rate(f'rate of {name}', joint_rate)
+        variables += of_rate(f'speed of {name}', np.abs(joint_rate))
+        variables += _approach(name, ref.joint_rate[:, k], starts)
+
+    # Input of the sensor.
     speed = np.linalg.norm(ref.rate_s, axis=1)
-    found += rates('speed', speed / DEG)
-    found += each('specific force', np.linalg.norm(ref.force_s, axis=1), 'm/s^2', least=0.5)
+    variables += of_rate('speed', speed / DEG)
+    force = np.linalg.norm(ref.force_s, axis=1)
+    variables += of_value('specific force', force, 'm/s^2', least=0.5)
     for k, axis in enumerate(AXES):
-        found += rates(f'rate about {axis}', ref.rate_s[:, k] / DEG)
-        found += each(f'specific force along {axis}', ref.force_s[:, k], 'm/s^2', least=0.5)
-    found += each('time', ref.time, 's')
+        variables += of_rate(f'rate about {axis}', ref.rate_s[:, k] / DEG)
+        variables += of_value(f'specific force along {axis}', ref.force_s[:, k], 'm/s^2', least=0.5)
+
+    # Time and temperature.
+    variables += of_value('time', ref.time, 's')
     if blocks.warms and ref.temperature_c is not None:
-        warm = ref.temperature_c
-        found += each('temperature', warm, 'C', least=0.5)
-        slope = np.gradient(
-            np.polynomial.Chebyshev.fit(ref.time, warm, min(12, len(warm) // 10))(ref.time)
+        temperature = ref.temperature_c
+        variables += of_value('temperature', temperature, 'C', least=0.5)
+        # Slope of a polynomial, which smooths the steps of the thermometer.
+        degree = min(12, len(temperature) // 10)
+        course = np.polynomial.Chebyshev.fit(ref.time, temperature, degree)
+        slope = np.gradient(course(ref.time))
+        variables += _classes(
+            'temperature', slope > 0, ('while it cools', 'while it warms up'), starts
         )
-        found += _classes('temperature', slope > 0, ('while it cools', 'while it warms up'), starts)
+
+    # Motion, and time since its end, at most 1000 s.
     moving = speed > DEG
-    found += _classes('kind', moving, ('at rest', 'while it moves'), starts)
-    last = np.maximum.accumulate(np.where(moving, ref.time, -np.inf))
-    return found + each(
-        'time since motion', np.where(np.isfinite(last), np.minimum(ref.time - last, 1e3), 1e3), 's'
+    variables += _classes('kind', moving, ('at rest', 'while it moves'), starts)
+    last_moving = np.maximum.accumulate(np.where(moving, ref.time, -np.inf))
+    since_motion = np.minimum(ref.time - last_moving, 1e3)
+    variables += of_value(
+        'time since motion', np.where(np.isfinite(last_moving), since_motion, 1e3), 's'
     )
+    return variables
 
 
-def _before_rest(name: str, rate: np.ndarray, starts: np.ndarray) -> list[Variable]:
-    """Return from which side a joint reached its rest."""
+def _approach(name: str, rate: np.ndarray, starts: np.ndarray) -> list[Variable]:
+    """
+    Return the variable of the direction of a joint's last motion, none if one direction is rare.
+
+    `rate` is that of the joint, rad/s, at each row, shape (n,).
+    """
     moving = np.abs(rate) > 0.5 * DEG
-    side = np.where(moving, np.sign(rate), 0.0)
-    place = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
-    came = np.where(place >= 0, side[np.maximum(place, 0)], 0.0)
-    if min((came > 0).sum(), (came < 0).sum()) < FEWEST:
+    direction = np.where(moving, np.sign(rate), 0.0)
+    last_moving = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
+    approach = np.where(last_moving >= 0, direction[np.maximum(last_moving, 0)], 0.0)
+    if min((approach > 0).sum(), (approach < 0).sum()) < FEWEST:
         return []
     return _classes(
         f'approach of {name}',
-        came > 0,
+        approach > 0,
         (f'after {name} turned backwards', f'after {name} turned forwards'),
         starts,
     )
 
 
 def _cyclic(name: str, degrees: np.ndarray, starts: np.ndarray) -> Variable:
+    """Return the variable of an angle in degrees at each row, in bins of equal width."""
     edges = np.linspace(0.0, 360.0, N_BINS + 1)
 
     def words(_: str, bounds: tuple[float, float]) -> str:
@@ -77,7 +96,13 @@ def _cyclic(name: str, degrees: np.ndarray, starts: np.ndarray) -> Variable:
 def _classes(
     name: str, mask: np.ndarray, words: tuple[str, str], starts: np.ndarray
 ) -> list[Variable]:
-    if not FEWEST <= block_means(mask.astype(float), starts).sum() <= len(starts) - FEWEST:
+    """
+    Return the variable of two classes of rows, none where one of them has too few blocks.
+
+    `words` are the descriptions of the rows outside and inside of `mask`.
+    """
+    n_blocks_inside = block_means(mask.astype(float), starts).sum()
+    if not FEWEST <= n_blocks_inside <= len(starts) - FEWEST:
         return []
     return [
         Variable(
