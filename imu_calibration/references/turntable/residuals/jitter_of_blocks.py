@@ -8,22 +8,14 @@ from imu_calibration.selection.stamp_jitter import StampJitter
 
 JITTER_STEPS = 6
 """Steps in which the noise at rest and the variance of the stamps are estimated in turn."""
-
-
 BOUND_SDS = 3.0
 """
 Standard deviations above its own estimate to which a sensor limits the variance of the stamps.
 """
-
-
 CLEAR_SDS = 5.0
 """Standard deviations from which the scatter of a sensor shows errors of the stamps."""
-
-
 ALIKE_VARIANCES = 0.3
-"""Largest relative difference of the variances that the two sensors show."""
-
-
+"""Largest relative difference of the variances of the stamps by the two sensors."""
 MEDIAN_SD = np.sqrt(np.pi / 2)
 """Standard deviation of a median over that of a mean, Gaussian."""
 
@@ -50,52 +42,69 @@ def stamp_jitter(
         Degrees of freedom of the variances.
 
     """
-    value, sd = np.array(
-        [_variance(own, steep, freedom) for own, steep in zip(rough, slope, strict=True)]
-    ).T
+    # Estimate of each sensor with its standard deviation, s^2.
+    estimates = []
+    for rough_of_sensor, slope_of_sensor in zip(rough, slope, strict=True):
+        estimates.append(_stamp_variance(rough_of_sensor, slope_of_sensor, freedom))
+    value, sd = np.array(estimates).T
+
     variance = max(min(np.average(value, weights=1 / sd**2), *(value + BOUND_SDS * sd)), 0.0)
-    apart = np.abs(value - variance)
-    alike = (apart < BOUND_SDS * sd) | (apart < ALIKE_VARIANCES * variance)
-    return StampJitter(
-        float(np.sqrt(variance)), bool(np.all(value > CLEAR_SDS * sd) and alike.all())
-    )
+    difference = np.abs(value - variance)
+    alike = (difference < BOUND_SDS * sd) | (difference < ALIKE_VARIANCES * variance)
+    clear = bool(np.all(value > CLEAR_SDS * sd) and alike.all())
+    return StampJitter(float(np.sqrt(variance)), clear)
 
 
 def jitter_ratio(rough: np.ndarray, slope: np.ndarray, jitter: float) -> np.ndarray:
     """
-    Return the variance of noise and stamp errors over that of the noise, shape (b, 3).
+    Return the variance of noise and stamp errors together over that of the noise, shape (b, 3).
 
-    The errors of the stamps have the sd `jitter` in s, and the numerator is the variance of noise
-    and errors together.
+    With the mean square slope of each block, and the noise variance of each axis::
+
+        ratio = 1 + jitter^2 slope / noise
+
+    Parameters
+    ----------
+    rough, slope : ndarray, shape (b, 3)
+        As for `stamp_jitter`, of one sensor.
+    jitter : float
+        Standard deviation of the errors of the stamps, s.
+
     """
     return 1.0 + jitter**2 * slope / _noise(rough, slope, jitter**2)
 
 
 def _noise(rough: np.ndarray, slope: np.ndarray, variance: float) -> np.ndarray:
     """
-    Return the variance of the noise of each axis, from its blocks with the smaller slopes.
+    Return the noise of each axis, shape (3,), with the `variance` of the stamps subtracted.
 
-    Shape (3,).
+    It is the median over the half of the blocks with the smaller slopes.
     """
-    quiet = slope <= np.median(slope, axis=0)
-    left = np.where(quiet, np.maximum(rough - variance * slope, 0.0), np.nan)
-    return np.maximum(np.nanmedian(left, axis=0), 1e-3 * np.median(rough, axis=0))
+    flat = slope <= np.median(slope, axis=0)
+    noise = np.where(flat, np.maximum(rough - variance * slope, 0.0), np.nan)
+    return np.maximum(np.nanmedian(noise, axis=0), 1e-3 * np.median(rough, axis=0))
 
 
-def _variance(rough: np.ndarray, slope: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
+def _stamp_variance(
+    rough: np.ndarray, slope: np.ndarray, freedom: np.ndarray
+) -> tuple[float, float]:
     """
     Return (variance of the stamps by one sensor, its standard deviation), s^2.
 
-    The median of chi-square over its degrees of freedom f is ``(1 - 2 / (9 f))^3`` (Wilson and
-    Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
+    Noise n and variance v are estimated in turn: v is the median of ``(rough - n) / slope`` over
+    all blocks and axes, weighted by the inverse sd of that ratio, ``slope sqrt(f / 2) / (n + v
+    slope)``. The median of chi-square over its degrees of freedom f is ``(1 - 2 / (9 f))^3``
+    (Wilson and Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
     """
-    variance = 0.0
+    # The median of the variances of blocks is then that of the distribution.
     rough = rough / (1.0 - 2.0 / (9.0 * np.maximum(freedom, 1.0)))[:, None] ** 3
+    variance = 0.0
     for _ in range(JITTER_STEPS):
         noise = _noise(rough, slope, variance)
         ratio = ((rough - noise) / np.maximum(slope, np.finfo(float).tiny)).ravel()
         weight = (np.sqrt(freedom / 2)[:, None] * slope / (noise + variance * slope)).ravel()
         order = np.argsort(ratio)
-        share = np.cumsum(weight[order])
-        variance = max(float(ratio[order][np.searchsorted(share, share[-1] / 2)]), 0.0)
+        sum_of_weights = np.cumsum(weight[order])
+        middle = np.searchsorted(sum_of_weights, sum_of_weights[-1] / 2)
+        variance = max(float(ratio[order][middle]), 0.0)
     return variance, MEDIAN_SD / np.sqrt((weight**2).sum() + np.finfo(float).tiny)

@@ -15,11 +15,11 @@ from imu_calibration.selection.regimes import (
 )
 
 NEARLY_ALL = 0.95
-"""Share of the scatter of a range in its reported part."""
+"""Share of the excess variance of a range that its reported part must contain."""
 LOUDER = 1.5
 """Least ratio of the variances inside and outside of a regime of larger scatter."""
-SCORINGS = 12
-"""Steps of the fit of a variance that is a smooth function of a variable."""
+SCORING_STEPS = 12
+"""Steps of Fisher scoring for a variance that is a smooth function of a variable."""
 MAX_VARIANCE_RATIO = 1e3
 """
 Largest ratio of a square and its variance in a step, which limits the influence of few residuals.
@@ -36,64 +36,63 @@ class ScatterSearch(RegimeSearch):
         Return the ranges with a larger variance within blocks, the likeliest first.
 
         The statistic is the largest fall of minus twice the log likelihood by a separate variance
-        in a range.
+        in a range. Its distribution by chance is that with the blocks exchanged.
 
         Parameters
         ----------
         axis : str
         rough : ndarray, shape (b,)
-            Variance within the blocks.
+            Variance of the samples within each block.
         weight : ndarray, shape (b,)
-            Its degrees of freedom.
+            Degrees of freedom of these variances.
         level : float
             Largest probability of a regime by chance.
 
         """
-        # In units of the median; without a louder range no exchange has to be computed.
+        # In units of the median. The exchanges are slow, and not needed without a louder range.
         median = float(np.median(rough))
         if median <= 0:
             return []
         rough = rough / median
         if not any(fall.any() for fall in self._falls(rough[:, None], weight)):
             return []
-
-        # By chance: with the blocks exchanged.
         exchanged = np.column_stack([rough, rough[self.exchange].T])
         p_value, likely = self.tested(self._falls(exchanged, weight))
         if p_value > level:
             return []
 
         # A regime must fit clearly better than a variance that follows a smooth curve.
-        smooth = []
+        fits = []  # (cost, dispersion)
         for each in self.ranges:
             if len(each.variable.edges):
-                smooth.append(_smooth_scatter(each.variable.curves, rough, weight))
+                fits.append(_smooth_scatter(each.variable.curves, rough, weight))
         one_variance = (variance_cost(weight @ rough, weight.sum()), 1.0)
-        smooth_cost, dispersion = min(smooth, default=one_variance)
+        smooth_cost, dispersion = min(fits, default=one_variance)
+        largest_cost = smooth_cost - SURE * dispersion
+        squares = weight * rough
         regimes = []
         for each, number in likely:
             variable = each.variable
             excess_of_bins = np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0)
-            chosen = _tightened(variable.chosen(each.member[number]), excess_of_bins)
-            inside = each.marks[:, chosen].sum(axis=1)
+            bins = _shortest_part(variable.chosen(each.member[number]), excess_of_bins)
+            inside = each.marks[:, bins].sum(axis=1)  # share of each block
             outside = 1.0 - inside
 
-            # Inside and outside: sums of squares, degrees of freedom, and their ratio.
-            squares = weight * rough
+            # Sums of squares inside and outside, degrees of freedom, and their ratio.
             energy = np.array([(inside * squares).sum(), (outside * squares).sum()])
             count = np.array([(inside * weight).sum(), (outside * weight).sum()])
             variance = energy / np.maximum(count, 1.0)
             excess = np.maximum(energy - count, 0.0)
             share = excess[0] / max(excess.sum(), TINY)
             cost = np.sum(variance_cost(energy, count))
-            if share >= MOST_OF_IT and cost < smooth_cost - SURE * dispersion:
-                bounds = variable.bounds(chosen)
+            if share >= MOST_OF_IT and cost < largest_cost:
+                bounds = variable.bounds(bins)
                 regimes.append(
                     RestRegime(
                         self.sensor,
                         axis,
                         variable.name,
-                        variable.words(chosen, bounds) + ', by larger scatter',
+                        variable.words(bins, bounds) + ', by larger scatter',
                         float(share),
                         p_value,
                         float(np.sqrt(median * max(variance[0] - variance[1], 0.0))),
@@ -110,11 +109,23 @@ class ScatterSearch(RegimeSearch):
         """
         Return per variable the fall of the cost by a separate variance in each range.
 
-        It is zero where the variance is hardly larger, and the shape is (r, m). With the sums of
-        squares E and the degrees of freedom n of all blocks, and those inside the range::
+        With the sums of squares E and the degrees of freedom n of all blocks, and those inside the
+        range; the fall is zero where the variance inside is not larger by `LOUDER`::
 
             fall = cost(E, n) - cost(E_in, n_in) - cost(E - E_in, n - n_in)
             louder: E_in / n_in > LOUDER max((E - E_in) / (n - n_in), 1)
+
+        Parameters
+        ----------
+        rough : ndarray, shape (b, m)
+            Variances of the blocks over their median; each column is one order of the blocks.
+        weight : ndarray, shape (b,)
+            Degrees of freedom.
+
+        Returns
+        -------
+        list of ndarray, shape (r, m)
+            For each variable, with r ranges.
 
         """
         squares = rough * weight[:, None]
@@ -128,7 +139,7 @@ class ScatterSearch(RegimeSearch):
             least_outside = np.maximum(energy - energy_inside, count_outside)
             louder = energy_inside * count_outside > LOUDER * least_outside * count_inside
 
-            # Logarithms only where they are needed.
+            # Logarithms only where they are needed: (row, column) are range and order of blocks.
             row, column = np.nonzero(louder)
             whole = energy[column]
             inside = energy_inside[louder]
@@ -143,34 +154,37 @@ class ScatterSearch(RegimeSearch):
         return falls
 
 
-def _tightened(chosen: Sequence[int], excess: np.ndarray) -> Sequence[int]:
-    """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
-    sums = np.append(0.0, np.cumsum(excess[chosen]))
+def _shortest_part(bins: Sequence[int], excess: np.ndarray) -> Sequence[int]:
+    """
+    Return the shortest run of `bins` with at least `NEARLY_ALL` of their excess.
+
+    `excess` is that of every bin of the variable, shape (k,).
+    """
+    sums = np.append(0.0, np.cumsum(excess[bins]))
     parts = []  # (length, minus the excess in it, first): the shortest, then the largest excess
-    for first in range(len(chosen)):
-        for last in range(first + 1, len(chosen) + 1):
+    for first in range(len(bins)):
+        for last in range(first + 1, len(bins) + 1):
             inside = sums[last] - sums[first]
             if inside >= NEARLY_ALL * sums[-1]:
                 parts.append((last - first, -inside, first))
     length, _, first = min(parts)
-    return chosen[first : first + length]
+    return bins[first : first + length]
 
 
 def _smooth_scatter(
     columns: np.ndarray, variance: np.ndarray, weight: np.ndarray
 ) -> tuple[float, float]:
     """
-    Return (minus twice the log likelihood, dispersion) by Fisher scoring.
+    Return (minus twice the log likelihood, dispersion) of a smooth curve of variances.
 
-    The variances are exp(a combination of columns).
-
-    The dispersion is 1 where the variances scatter about the curve as those of Gaussian noise with
-    `weight` degrees of freedom.
+    The variances follow ``exp(X a)``, X a constant and the `columns`, shape (b, k), with the
+    amplitudes a by Fisher scoring. The dispersion is 1 where they scatter about the curve as those
+    of Gaussian noise with `weight` degrees of freedom.
     """
     design = np.column_stack([np.ones(len(columns)), columns])
     root = np.sqrt(weight)
     values = np.zeros(design.shape[1])
-    for _ in range(SCORINGS):
+    for _ in range(SCORING_STEPS):
         # d(log likelihood) / d(log variance) = n (ratio - 1) / 2, information n / 2.
         log_variance = np.maximum(design @ values, 0.0)
         ratio = np.minimum(variance * np.exp(-log_variance), MAX_VARIANCE_RATIO)

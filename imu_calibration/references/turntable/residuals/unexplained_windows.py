@@ -22,16 +22,12 @@ from imu_calibration.selection.unexplained import (
 )
 
 WITHIN_SHARE = 0.02
-"""Least excess of the variance within windows that counts."""
-
-
+"""Least excess of the squares within windows, as a share of their number, that counts."""
 MUCH_SCATTER = 10.0
 """
 Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of
-an axis with a cause of its own.
+an axis with a separate cause.
 """
-
-
 LOUD = 0.5
 """
 Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained
@@ -42,18 +38,22 @@ residual.
 def unexplained(
     problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]
 ) -> dict[str, Unexplained]:
-    """Return sensor -> Unexplained for a choice of effects."""
+    """Return sensor -> Unexplained with the effects `chosen` in the model."""
     excess = explained.excess(chosen)
     used = problem.search.indices(chosen)
     values = weights_of(used, problem.evidence.fit(used)[0], problem.space.size)
-    return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in excess}
+    of_sensors = {}
+    for sensor, excess_of_sensor in excess.items():
+        of_sensors[sensor] = _unexplained(problem, explained, sensor, excess_of_sensor, values)
+    return of_sensors
 
 
 def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> Unexplained:
     """
-    Return the residual of a sensor.
+    Return the residual of a sensor as significant if an axis has loud tones or scatter in motion.
 
-    As significant if loud tones or the scatter in motion of one axis exceed the noise at rest.
+    Loud tones have a mean square above `LOUD` times the variance of the noise at rest. Without both
+    the residual `rest` is returned unchanged.
     """
     scatter = _scatter_of_one_axis(problem, sensor)
     noise = problem.noise[sensor].white_variance
@@ -76,9 +76,7 @@ def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> 
 
 def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     """
-    Return the excess variance of moving samples over the noise at rest, shape (3,).
-
-    It is given for an axis that exceeds the remaining axes, otherwise 0.
+    Return the `scatter_in_motion` of an axis that exceeds the other axes, else 0, shape (3,).
 
     Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a
     cause in the sensor its own axis.
@@ -100,40 +98,58 @@ def scatter_in_motion(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     return np.maximum(in_motion - noise.low_variance, 0.0)
 
 
-def _rest(
+def _unexplained(
     problem: LinearisedProblem,
     explained: ExplainedWindows,
     sensor: str,
     excess: np.ndarray,
     values: np.ndarray,
 ) -> Unexplained:
-    space, recording = problem.space, problem.recording
-    residual = np.stack(
-        [space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1
-    )
+    """
+    Return the Unexplained of a sensor.
+
+    Parameters
+    ----------
+    problem : LinearisedProblem
+    explained : ExplainedWindows
+    sensor : str
+    excess : ndarray, shape (2, 3)
+        Excess squares over noise of the means and within windows, of each axis.
+    values : ndarray, shape (n + 1,)
+        Weights of columns and residual (`weights_of`).
+
+    """
+    space = problem.space
+    recording = problem.recording
+    of_axes = []
+    for axis in range(3):
+        of_axes.append(space.mean[sensor][axis] @ values[space.places(sensor, axis)])
+    residual = np.stack(of_axes, axis=1)
     floor = explained.floor.noise[sensor]
     white = recording.mean_variance(floor)
     noise_sd = np.sqrt(white + floor.bias_variance)
     sigma_means, sigma_within = explained.sigma(sensor, excess)
-    # Quiet axes dilute the excess of one.
-    means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
-    sigma = (
-        max(sigma_means, sigma_within)
-        if within > WITHIN_SHARE * explained.n_within
-        else sigma_means
-    )
+    # At least the excess of one axis, which negative values of the others would lower.
+    excess_of_means, excess_within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
+    sigma = sigma_means
+    if excess_within > WITHIN_SHARE * explained.n_within:
+        sigma = max(sigma_means, sigma_within)
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
     found = Unexplained(significant, rms, float(sigma), None, 0.0, residual, noise_sd)
     if not significant:
         return found
+
+    # An excess within windows only: its rms in units of the variance of their samples.
     if sigma_means <= SIGNIFICANT_SDS:
-        inside = np.mean(
-            [floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])]
-        )
-        return replace(found, rms=float(np.sqrt(inside * within / explained.n_within)))
-    if rms == 0:  # less than biases may wander, and more than neighbours may differ
-        rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
+        moving_kinds = np.unique(recording.kind[recording.moving])
+        variance = np.mean([floor.row_variance(kind) for kind in moving_kinds])
+        rms_within = np.sqrt(variance * excess_within / explained.n_within)
+        return replace(found, rms=float(rms_within))
+
+    # The means differ by less than the wander of the bias, but neighbours by more than white noise.
+    if rms == 0:
+        rms = float(np.sqrt(np.mean(white) * excess_of_means / explained.n_means))
     # The fit has absorbed a part of the cause, as far as the columns of the model resemble it.
     fitted = []
     for axis in range(3):
@@ -144,7 +160,11 @@ def _rest(
 
 
 def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield (name, columns (k, m), windows where they are known)."""
+    """
+    Yield (name, columns, mask of the windows where they are known) of each explanation.
+
+    Columns have shape (k, m), one row for each window.
+    """
     describe = recording.describe
     every = np.ones(len(recording.kind), bool)
     yield from slow_explanations(describe['time'], describe['temperature'])
@@ -154,13 +174,11 @@ def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray
         if name.startswith('angle'):
             number = name[len('angle') :]
             angle = describe[name]
+            # In a window of a larger span the mean angle has no meaning.
             known = describe['span' + number] < 0.7
-            turns = []
+            waves = []
             for multiple in (1, 2, 3):
-                turns += [np.cos(multiple * angle), np.sin(multiple * angle)]
-            yield (
-                f'angle of {recording.model.joint_names[int(number)]}',
-                np.stack(turns, axis=1),
-                known,
-            )
+                waves += [np.cos(multiple * angle), np.sin(multiple * angle)]
+            joint = recording.model.joint_names[int(number)]
+            yield f'angle of {joint}', np.stack(waves, axis=1), known
     yield IN_MOTION, recording.moving[:, None].astype(float), every
