@@ -13,7 +13,8 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
 from imu_calibration.references.turntable.residuals.spectrum import (
-    _stretches,
+    Stretch,
+    _stretches_of_time,
     _without,
     find_tones,
     of_stretches,
@@ -40,11 +41,11 @@ def stretches(amplitudes, frequency=23.7, noise=1.0):
     """
     rng, time = np.random.default_rng(3), STEP * np.arange(400)
     return [
-        (
+        Stretch(
             noise * rng.normal(size=(400, 3))
             + np.outer(size * np.sin(2 * np.pi * frequency * time + k), [0, 1, 0]),
-            STEP,
-            45.0,
+            step=STEP,
+            highest=45.0,
         )
         for k, size in enumerate(amplitudes)
     ]
@@ -90,7 +91,7 @@ def test_a_tone_just_below_half_of_the_rate_is_found(frequency, size):
     for part in np.split(np.arange(len(time)), 40):
         windows.append(TimedWindow(time=time[part], rows=part))
     parts = [rest[window.rows] for window in windows]
-    tones = list(of_stretches('gyroscope', _stretches(windows, parts, None), None))
+    tones = list(of_stretches('gyroscope', _stretches_of_time(windows, parts), None))
     found = [tone for tone in tones if tone.p_value * 3 < 1e-4]
     assert len(found) == (size > 0.0)
     if found:
@@ -99,7 +100,10 @@ def test_a_tone_just_below_half_of_the_rate_is_found(frequency, size):
 
 def test_noise_that_is_not_white_is_no_tone():
     rng = np.random.default_rng(1)
-    walks = [(np.cumsum(rng.normal(size=(600, 3)), axis=0), STEP, 45.0) for _ in range(40)]
+    walks = [
+        Stretch(np.cumsum(rng.normal(size=(600, 3)), axis=0), step=STEP, highest=45.0)
+        for _ in range(40)
+    ]
     assert not list(of_stretches('gyroscope', walks, None))
 
 

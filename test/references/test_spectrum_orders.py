@@ -5,7 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.references.turntable.residuals.spectrum import MIN_ORDER_SHARE, OUT, orders_of
+from imu_calibration.references.turntable.residuals.spectrum import (
+    LEAST_ORDER_POWER,
+    MIN_ORDER_SHARE,
+    orders_of,
+)
 
 TIME = 0.01 * np.arange(1200)
 
@@ -42,7 +46,7 @@ def seen(rest_of):
         for at, order in enumerate(orders.order)
         for axis in range(3)
         if orders.p_value[at, axis] < 1e-7
-        and orders.power[at, axis] > OUT
+        and orders.power[at, axis] > LEAST_ORDER_POWER
         and orders.share[at, axis] > MIN_ORDER_SHARE
     ]
 

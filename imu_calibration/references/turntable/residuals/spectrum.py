@@ -1,4 +1,8 @@
-"""Tones in the rest: at a fixed frequency, or at a fixed multiple of a joint's speed."""
+"""
+Tones in the residual of every sample: at a fixed frequency, or a fixed number per turn of a joint.
+
+Frequencies are in cycles per unit of a variable: seconds, or turns of a joint (then: orders).
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,20 +28,20 @@ LOWEST_ORDER, HIGHEST_ORDER = 4, 64
 PIECE_S = 2.0
 """Length of the pieces for comparison of phases, s."""
 CYCLES_OF_ORDER = 1.5
-"""Of an order in a piece that can show it: less is a slope or a curve."""
+"""Cycles of an order in a piece, more than: fewer are a slope or a curve."""
 MIN_SPECTRUM_PIECES = 8
 """Least number of pieces for an estimate of the scatter."""
-OUT = 10.0
+LEAST_ORDER_POWER = 10.0
 """
 Least power of an order over the median of all orders; residuals that repeat with the motion have
 all orders.
 """
 IN_PHASE = 0.5
-"""Cosine of the angle within which a window is in phase."""
+"""Cosine of the largest phase difference at which a window is in phase with the wave: 60 deg."""
 MIN_ORDER_SHARE = 0.75
-"""Share of the windows that must be, more than."""
+"""Share of the windows in phase with an order, more than."""
 SHORTEST_CYCLE = 2.2
-"""Samples per cycle, at least."""
+"""Samples per cycle of an order, more than."""
 ROUNDING_SHARE = 1e-12
 """
 Least variance over the squared mean, and least determinant over the squared trace: less is
@@ -54,18 +58,20 @@ class Orders:
     order: np.ndarray
     """Cycles per turn, shape (k,)."""
     amplitude: np.ndarray
-    """Of the wave that keeps its phase, in the unit of the rest, shape (k, m)."""
+    """Amplitude of the wave with a constant phase, in the unit of the residual, shape (k, m)."""
     p_value: np.ndarray
     """Probability by noise, with a random phase in every piece; shape (k, m)."""
     power: np.ndarray
     """Squared amplitude over the median of all orders, shape (k, m)."""
     share: np.ndarray
-    """Share of the windows with a phase within 60 degrees of it, shape (k, m)."""
+    """Share of the windows with a phase within 60 deg of that of the wave, shape (k, m)."""
 
 
-def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int) -> Orders | None:
+def orders_of(
+    windows: Sequence[Window], residuals_of_windows: Sequence[np.ndarray], joint: int
+) -> Orders | None:
     """
-    Return the orders of a joint in a rest, or None where too little turns.
+    Return the orders of a joint in a residual, or None where too little turns.
 
     The residual of each piece of two seconds, without terms linear in time or quadratic in the
     angle, is projected on exp(-i k angle). The pieces add coherently for tones fixed to the joint,
@@ -75,8 +81,8 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     Parameters
     ----------
     windows : sequence of Window
-    rests : sequence of ndarray
-        Rest of each window, shape (n, m).
+    residuals_of_windows : sequence of ndarray
+        Residual of each window, shape (n, m).
     joint : int
 
     """
@@ -85,9 +91,9 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     windows_of_pieces = []
     sums_of_pieces = []
     weights_of_pieces = []
-    for window, rest, time, angle in _pieces(windows, rests, joint):
-        sums_of_piece, weight_of_piece = _projected(rest, time, angle, order)
-        windows_of_pieces.append(window)
+    for piece in _pieces(windows, residuals_of_windows, joint):
+        sums_of_piece, weight_of_piece = _projected(piece, order)
+        windows_of_pieces.append(piece.window)
         sums_of_pieces.append(sums_of_piece)
         weights_of_pieces.append(weight_of_piece)
     if not windows_of_pieces:
@@ -134,61 +140,83 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
 
 
 def _share_in_phase(
-    number: np.ndarray, sums: np.ndarray, weight: np.ndarray, wave: np.ndarray
+    window: np.ndarray, sums: np.ndarray, weight: np.ndarray, wave: np.ndarray
 ) -> np.ndarray:
     """
-    Return the share of the windows in phase with a wave.
+    Return the share of the windows in phase with a wave, shape (k, m).
 
-    Effects of a motion have the same phase in all of its pieces only.
+    The phase of a window is that of its sum over pieces. An effect of the motion has the same phase
+    in the pieces of one window, and another one in other windows.
+
+    Parameters
+    ----------
+    window : ndarray, shape (p,)
+        Number of the window of each piece, in order.
+    sums : ndarray of complex, shape (p, k, m)
+        Projections of the pieces on k orders (`_projected`).
+    weight : ndarray, shape (p, k)
+        Zero where a piece does not show an order.
+    wave : ndarray of complex, shape (k, m)
+        Mean over all pieces.
+
     """
-    starts = np.flatnonzero(np.diff(number, prepend=-1))
-    each = np.add.reduceat(sums, starts)
+    starts = np.flatnonzero(np.diff(window, prepend=-1))
+    sums_of_windows = np.add.reduceat(sums, starts)
     known = np.add.reduceat(weight, starts) > 0
-    in_phase = (each * wave.conj()).real > IN_PHASE * np.abs(each) * np.abs(wave)
+    projection = (sums_of_windows * wave.conj()).real
+    in_phase = projection > IN_PHASE * np.abs(sums_of_windows) * np.abs(wave)
     return (in_phase & known[..., None]).sum(axis=0) / known.sum(axis=0)[:, None]
 
 
-def long_enough(
-    windows: Sequence[Window], rests: Sequence[np.ndarray], *, with_joints: bool
-) -> Iterator[tuple[int, Window, np.ndarray]]:
-    """
-    Yield (number, window, rest) of the windows that have enough samples.
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """About two seconds of a moving window, n samples."""
 
-    Enough means enough for a spectrum, and optionally the joints at each sample are given too.
-    """
-    for place, (window, rest) in enumerate(zip(windows, rests)):
-        if len(window) >= FEWEST_SAMPLES and (not with_joints or len(window.motion) == len(window)):
-            yield place, window, rest
+    window: int
+    """Number of the window."""
+    residual: np.ndarray
+    """Shape (n, m)."""
+    time: np.ndarray
+    """Time of each sample, s, shape (n,)."""
+    angle: np.ndarray
+    """Angle of the joint, rad, shape (n,)."""
 
 
 def _pieces(
-    windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
-) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield (number of the window, rest, time, angle) of pieces of moving windows."""
-    for place, window, rest in long_enough(windows, rests, with_joints=True):
-        number = max(1, round((window.time[-1] - window.time[0]) / PIECE_S))
-        yield from zip(
-            [place] * number,
-            np.array_split(rest, number),
-            np.array_split(window.time, number),
-            np.array_split(window.motion.position[:, joint], number),
-        )
+    windows: Sequence[Window], residuals_of_windows: Sequence[np.ndarray], joint: int
+) -> Iterator[_Piece]:
+    """Yield the pieces of the windows with enough samples and the joints at each of them."""
+    for number, (window, residual) in enumerate(zip(windows, residuals_of_windows)):
+        if len(window) < FEWEST_SAMPLES or len(window.motion) != len(window):
+            continue
+        n_pieces = max(1, round((window.time[-1] - window.time[0]) / PIECE_S))
+        residuals_of_pieces = np.array_split(residual, n_pieces)
+        times = np.array_split(window.time, n_pieces)
+        angles = np.array_split(window.motion.position[:, joint], n_pieces)
+        for k in range(n_pieces):
+            yield _Piece(number, residuals_of_pieces[k], times[k], angles[k])
 
 
-def _projected(
-    rest: np.ndarray, time: np.ndarray, angle: np.ndarray, order: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _projected(piece: _Piece, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (sum of the rest against each order, shape (k, m), weight, shape (k,)).
+    Return the projections of a piece on k orders, shape (k, m), and their weights, shape (k,).
 
-    Zero where a piece does not show an order.
+    With the residual r and the waves u, of which terms linear in time and quadratic in the angle
+    are removed; both are zero for an order that the piece does not show::
+
+        u = exp(-i order angle),    projection = u . r,    weight = |u|^2
+
     """
+    residual = piece.residual
+    time = piece.time
+    angle = piece.angle
+
     # Enough cycles in the piece, and enough samples per cycle.
     turned = np.ptp(angle)
     largest_step = np.abs(np.diff(angle)).max()
     shown = turned * order > 2 * np.pi * CYCLES_OF_ORDER
     shown &= 2 * np.pi > SHORTEST_CYCLE * order * largest_step
-    sums = np.zeros((len(order), rest.shape[1]), complex)
+    projections = np.zeros((len(order), residual.shape[1]), complex)
     weight = np.zeros(len(order))
     if shown.any():
         # Waves without terms linear in time and quadratic in the angle.
@@ -197,9 +225,9 @@ def _projected(
         smooth, _ = np.linalg.qr(np.column_stack(smooth_terms))
         waves = np.exp(-1j * np.outer(angle, order[shown]))
         waves -= smooth @ (smooth.T @ waves)
-        sums[shown] = waves.T @ rest
+        projections[shown] = waves.T @ residual
         weight[shown] = (np.abs(waves) ** 2).sum(axis=0)
-    return sums, weight
+    return projections, weight
 
 
 FREQUENCY_STEP = 0.1
@@ -210,25 +238,33 @@ length of a stretch.
 ANGLES_PER_TURN = 128
 """Angles per turn at which the residual of a turning joint is sampled."""
 CYCLES_OF_TONE = 3.0
-"""Of a tone in a stretch that can show it."""
+"""Cycles of a tone in a stretch, at least."""
 MAX_ORDER_SHARE = 0.45
-"""Highest order in that of the samples: interpolation to equal angles weakens higher ones."""
-MIN_LINE_POWER, LINE_CHANCE = 4.0, 0.05
 """
-Least power over its surroundings in a stretch, and its probability by noise: e^-4, and more where
-few frequencies determine the surroundings.
+Highest order over the samples per turn: interpolation to equal angles weakens higher ones.
 """
+MIN_LINE_POWER = 4.0
+"""Least power of a peak over the power around it, in a stretch."""
+LINE_CHANCE = 0.05
+"""
+Probability of such a peak by noise: e^-4, and more where few frequencies determine the power around
+it.
+"""
+FEWEST_AROUND = 8
+"""Least number of frequencies of an octave from which the power around a peak is estimated."""
 TONE_P_VALUE = 1e-4
 """Probability of a tone by noise, times the number of frequencies, axes and joints."""
-MOSTLY = 0.5
-"""Least share of the stretches with the tone; effects of the motion occur in some of them only."""
+MIN_TONE_SHARE = 0.5
+"""
+Share of the stretches with the tone, more than; effects of the motion occur in some of them only.
+"""
 MIN_ORDER_RATE = 1.0 * DEG
 """A joint that turns slower at times has no orders, rad/s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tone:
-    """One line in the spectrum of a sensor's rest."""
+    """One line in the spectrum of a sensor's residual."""
 
     sensor: str
     """'accelerometer' or 'gyroscope'."""
@@ -247,11 +283,11 @@ class Tone:
     frequencies: np.ndarray
     """All frequencies under test, shape (n,)."""
     power: np.ndarray
-    """Mean power of the axis there, over that around it, shape (n,)."""
+    """Mean power of the axis at these frequencies, over the power around each, shape (n,)."""
     rested: bool = False
     """Whether the recording contains rest, so that a fixed frequency is independent of motion."""
     tilts: bool = False
-    """Whether it is a tilt of the level frame, which turns the direction of gravity."""
+    """Whether the tone is a tilt of the level frame, which turns the direction of gravity."""
 
     @property
     def text(self) -> str:
@@ -291,53 +327,52 @@ class Tone:
 
 
 def find_tones(
-    found: Investigation, table: Table, formulas: Sequence[Proposal] = ()
+    investigation: Investigation, table: Table, formulas: Sequence[Proposal] = ()
 ) -> dict[str, tuple[Tone, ...]]:
     """
     Return sensor -> the tones in the residual, the most significant first.
 
-    The residual is that of the findings and of some formulas.
-
-    The residual of every stretch of at most ten seconds, or of at most ten turns of a joint in
-    steady rotation, is transformed to frequencies. A peak has four times the median power around
-    it; a tone has peaks in most stretches, tested against noise (binomial law). Rests and motions
-    are both analysed in seconds; a tone at a multiple of a speed is constant per turn and varies
-    per second. Where few stretches turn, integer orders are searched in all motions of the joint
-    (`orders_of`). Fixed frequencies are removed before multiples of a speed are searched.
+    The model contains the findings and some formulas. The residual of every stretch of at most ten
+    seconds, or of at most ten turns of a joint in steady rotation, is transformed to frequencies. A
+    peak has four times the median power around it; a tone has peaks in most stretches, tested
+    against noise (binomial law). Rests and motions are both analysed in seconds; a tone at a
+    multiple of a speed is constant per turn and varies per second. Where few stretches turn,
+    integer orders are searched in all motions of the joint (`orders_of`). Fixed frequencies are
+    removed before multiples of a speed are searched.
     """
-    model = found.problem.recording.model
-    values = found.problem.values(found.named)[: len(model.param_names)]
+    model = investigation.problem.recording.model
+    values = investigation.problem.values(investigation.named)[: len(model.param_names)]
     model, values = with_formulas(model, values, formulas)
-    edges = np.cumsum([len(window) for window in found.used])[:-1]
+    windows = investigation.used
+    edges = np.cumsum([len(window) for window in windows])[:-1]
     residual_of = {}  # sensor -> residual of each window
-    for sensor, residual in residuals(found.used, table, model, values=values).items():
+    for sensor, residual in residuals(windows, table, model, values=values).items():
         residual_of[sensor] = np.split(residual, edges)
-    tests = 1 + len(table.joint_names)
+    n_tests = 1 + len(table.joint_names)
 
     # Fixed frequencies. They are removed, because sampled at equal angles a fixed frequency would
     # be a multiple of some speeds.
     tones = {}
     for sensor, of_windows in residual_of.items():
-        stretches = _stretches(found.used, of_windows, None)
-        tones[sensor] = _significant(of_stretches(sensor, stretches, None), tests)
+        stretches = _stretches_of_time(windows, of_windows)
+        tones[sensor] = _significant(of_stretches(sensor, stretches, None), n_tests)
         for tone in tones[sensor].values():
             axis = AXES.index(tone.axis)
-            for window, residual in zip(found.used, of_windows):
+            for window, residual in zip(windows, of_windows):
                 residual[:, axis] = _without(tone.frequency, window.time, residual[:, axis])
 
     # Multiples of the speed of each joint: in steady rotation, and in all motions.
     of_all_sensors = [np.concatenate(pair, axis=1) for pair in zip(*residual_of.values())]
-    orders = [
-        orders_of(found.used, of_all_sensors, joint) for joint in range(len(table.joint_names))
-    ]
+    orders = [orders_of(windows, of_all_sensors, joint) for joint in range(len(table.joint_names))]
     for place, (sensor, of_windows) in enumerate(residual_of.items()):
         candidates: list[Tone] = []
         for joint, name in enumerate(table.joint_names):
-            candidates += of_stretches(sensor, _stretches(found.used, of_windows, joint), name)
-            candidates += _whole(sensor, orders[joint], name, place=place)
-        tones[sensor] |= _significant(candidates, tests)
+            stretches = _stretches_of_turns(windows, of_windows, joint)
+            candidates += of_stretches(sensor, stretches, name)
+            candidates += _tones_of_orders(sensor, orders[joint], name, place=place)
+        tones[sensor] |= _significant(candidates, n_tests)
 
-    rested = any(window.kind == 'static' for window in found.used)
+    rested = any(window.kind == 'static' for window in windows)
     in_order = {}
     for sensor, of_sensor in tones.items():
         likeliest_first = sorted(of_sensor.values(), key=lambda tone: tone.p_value)
@@ -345,15 +380,15 @@ def find_tones(
     return in_order
 
 
-def _significant(tones: Iterable[Tone], tests: int) -> dict[tuple[str, str | None], Tone]:
+def _significant(tones: Iterable[Tone], n_tests: int) -> dict[tuple[str, str | None], Tone]:
     """
-    Return (axis, joint) -> the most significant tone.
+    Return (axis, joint) -> the most significant tone, without tones of a larger p-value than noise.
 
-    Its p-value is multiplied by the number of tests and axes.
+    The p-values are multiplied by the number of tests and axes.
     """
     significant = []
     for tone in tones:
-        corrected = replace(tone, p_value=tone.p_value * len(AXES) * tests)
+        corrected = replace(tone, p_value=tone.p_value * len(AXES) * n_tests)
         if corrected.p_value < TONE_P_VALUE:
             significant.append(corrected)
     first: dict[tuple[str, str | None], Tone] = {}
@@ -363,7 +398,11 @@ def _significant(tones: Iterable[Tone], tests: int) -> dict[tuple[str, str | Non
 
 
 def _without(frequency: float, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values without the waves about a frequency, to the resolution of their duration."""
+    """
+    Return values of one axis, shape (n,), without the waves about a frequency.
+
+    The waves are those that the duration does not resolve from the frequency, Hz.
+    """
     # Five frequencies, with a distance of half the resolution 1 / duration.
     frequencies = frequency + 0.5 * np.arange(-2, 3) / np.ptp(time)
     waves = np.exp(2j * np.pi * np.outer(time - time[0], frequencies))
@@ -371,19 +410,23 @@ def _without(frequency: float, time: np.ndarray, values: np.ndarray) -> np.ndarr
     return values - basis @ (basis.T @ values)
 
 
-def _whole(sensor: str, orders: Orders | None, joint: str, *, place: int) -> Iterator[Tone]:
+def _tones_of_orders(
+    sensor: str, orders: Orders | None, joint: str, *, place: int
+) -> Iterator[Tone]:
     """
     Yield the most significant Tone of each axis with a constant phase on a joint, if any.
 
-    From the orders of all sensors with readings, of which `sensor` has the number `place`.
+    The columns of `orders` are the three axes of each sensor with readings, of which `sensor` has
+    the number `place`.
     """
     if orders is None:
         return
     for axis in range(3):
         column = 3 * place + axis
-        out = (orders.power[:, column] > OUT) & (orders.share[:, column] > MIN_ORDER_SHARE)
-        if out.any():
-            best = int(np.argmin(np.where(out, orders.p_value[:, column], np.inf)))
+        clear = orders.power[:, column] > LEAST_ORDER_POWER
+        clear &= orders.share[:, column] > MIN_ORDER_SHARE
+        if clear.any():
+            best = int(np.argmin(np.where(clear, orders.p_value[:, column], np.inf)))
             yield Tone(
                 sensor,
                 AXES[axis],
@@ -397,123 +440,162 @@ def _whole(sensor: str, orders: Orders | None, joint: str, *, place: int) -> Ite
             )
 
 
-def _stretches(
-    windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None
-) -> Iterator[tuple[np.ndarray, float, float]]:
-    """
-    Yield (rest, step, highest frequency) of stretches that can show a tone.
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A residual of n samples at equal steps of time, or of the angle of a joint."""
 
-    The rest is at equal steps, shape (n, 3), and the step is in seconds or turns.
-    """
-    for _, window, rest in long_enough(windows, parts, with_joints=joint is not None):
+    residual: np.ndarray
+    """Shape (n, 3)."""
+    step: float
+    """Seconds, or turns."""
+    highest: float
+    """Highest frequency that the samples show, per second or per turn."""
+
+
+def _stretches_of_time(
+    windows: Sequence[Window], residuals_of_windows: Sequence[np.ndarray]
+) -> Iterator[Stretch]:
+    """Yield stretches of at most ten seconds of the windows with enough samples."""
+    for window, residual in zip(windows, residuals_of_windows):
+        if len(window) < FEWEST_SAMPLES:
+            continue
+        # Few samples are missing: a tone keeps its frequency except in the stretch of the gap.
         step = float(np.median(np.diff(window.time)))
-        if joint is None:
-            # Samples that are missing are few: a tone keeps its frequency but for the stretch that
-            # they are in.
-            # At half of the rate a wave is real: its power has one degree of freedom.
-            highest = 0.5 / step - FREQUENCY_STEP
-            yield from (
-                (piece, step, highest) for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step)))
-            )
-        elif (
-            rate := window.motion.rate[:, joint]
-        ).min() > MIN_ORDER_RATE or rate.max() < -MIN_ORDER_RATE:
-            turns = window.motion.position[:, joint] / (2 * np.pi)
-            order = slice(None, None, int(np.sign(turns[-1] - turns[0])))
-            even = np.arange(turns[order][0], turns[order][-1], 1 / ANGLES_PER_TURN)
-            if len(even) < FEWEST_SAMPLES:
-                continue
-            taken = np.stack(
-                [np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1
-            )
-            fastest = float(np.abs(rate).max()) * step / (2 * np.pi)
-            highest = min(MAX_ORDER_SHARE / fastest, MAX_ORDER_SHARE * ANGLES_PER_TURN)
-            yield from (
-                (piece, 1 / ANGLES_PER_TURN, highest)
-                for piece in _cut(taken, round(ANGLES_PER_TURN / FREQUENCY_STEP))
-            )
+        # At half of the rate a wave is real: its power has one degree of freedom.
+        highest = 0.5 / step - FREQUENCY_STEP
+        for piece in _equal_pieces(residual, round(1 / (FREQUENCY_STEP * step))):
+            yield Stretch(piece, step, highest)
 
 
-def _cut(rest: np.ndarray, longest: int) -> list[np.ndarray]:
-    """Return a rest in pieces of equal length, at most `longest`."""
-    return np.array_split(rest, -(-len(rest) // longest))
+def _stretches_of_turns(
+    windows: Sequence[Window], residuals_of_windows: Sequence[np.ndarray], joint: int
+) -> Iterator[Stretch]:
+    """Yield stretches of at most ten turns of the windows in which a joint turns one way."""
+    for window, residual in zip(windows, residuals_of_windows):
+        if len(window) < FEWEST_SAMPLES or len(window.motion) != len(window):
+            continue
+        rate = window.motion.rate[:, joint]
+        if rate.min() <= MIN_ORDER_RATE and rate.max() >= -MIN_ORDER_RATE:
+            continue
+
+        # Interpolated to equal steps of the angle, which has to increase.
+        turns = window.motion.position[:, joint] / (2 * np.pi)
+        upwards = slice(None, None, int(np.sign(turns[-1] - turns[0])))
+        even_turns = np.arange(turns[upwards][0], turns[upwards][-1], 1 / ANGLES_PER_TURN)
+        if len(even_turns) < FEWEST_SAMPLES:
+            continue
+        of_axes = [np.interp(even_turns, turns[upwards], axis[upwards]) for axis in residual.T]
+
+        step = float(np.median(np.diff(window.time)))
+        most_turns_per_sample = float(np.abs(rate).max()) * step / (2 * np.pi)
+        highest = min(MAX_ORDER_SHARE / most_turns_per_sample, MAX_ORDER_SHARE * ANGLES_PER_TURN)
+        longest = round(ANGLES_PER_TURN / FREQUENCY_STEP)
+        for piece in _equal_pieces(np.stack(of_axes, axis=1), longest):
+            yield Stretch(piece, 1 / ANGLES_PER_TURN, highest)
 
 
-def of_stretches(
-    sensor: str, stretches: Iterable[tuple[np.ndarray, float, float]], joint: str | None
-) -> Iterator[Tone]:
-    """Yield the most significant Tone of each axis, if any; its p-value counts frequencies only."""
+def _equal_pieces(residual: np.ndarray, longest: int) -> list[np.ndarray]:
+    """Return a residual in the fewest pieces of equal length, of at most `longest` samples."""
+    return np.array_split(residual, -(-len(residual) // longest))
+
+
+def of_stretches(sensor: str, stretches: Iterable[Stretch], joint: str | None) -> Iterator[Tone]:
+    """
+    Yield the most significant Tone of each axis, if any; its p-value counts frequencies only.
+
+    A stretch has a peak at a frequency if the power P exceeds `MIN_LINE_POWER` times the power N
+    around it. With h peaks in n stretches, the p-value of a frequency is the probability of at
+    least h peaks by noise (binomial law), times the number of frequencies.
+    """
     every = list(stretches)
     if not every:
         return
-    grid = FREQUENCY_STEP * np.arange(round(1 / (FREQUENCY_STEP * every[0][1])) // 2 + 1)
-    hits, ratios, plain, excess = np.zeros((4, len(grid), 3))
-    count = np.zeros(len(grid), int)
-    for rest, step, highest in every:
-        inside = (grid * len(rest) * step >= CYCLES_OF_TONE) & (grid <= highest)
-        power, around, inside = _powers(rest, round(1 / (FREQUENCY_STEP * every[0][1])), inside)
-        at = np.flatnonzero(inside)
-        count[at] += 1
-        hits[at] += power[at] > MIN_LINE_POWER * around[at]
-        ratios[at] += power[at] / around[at]
-        plain[at] += power[at] / np.maximum(np.median(power, axis=0), 1e-300)
-        # Of a line under a Hann window.
-        excess[at] += np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))
-    if not count.any():
+    # Length of the transform: all stretches are padded to the longest that is possible.
+    size = round(1 / (FREQUENCY_STEP * every[0].step))
+    grid = FREQUENCY_STEP * np.arange(size // 2 + 1)
+    # Sums over the stretches, for each frequency and axis.
+    n_peaks = np.zeros((len(grid), 3))
+    sum_of_ratios = np.zeros((len(grid), 3))  # P / N
+    sum_of_heights = np.zeros((len(grid), 3))  # P over the median of all frequencies
+    sum_of_excess = np.zeros((len(grid), 3))  # squared amplitude by P - N
+    n_stretches = np.zeros(len(grid), int)
+    for stretch in every:
+        length = len(stretch.residual)
+        shown = (grid * length * stretch.step >= CYCLES_OF_TONE) & (grid <= stretch.highest)
+        spectrum = _spectrum(stretch.residual, size, shown)
+        at = np.flatnonzero(spectrum.shown)
+        power = spectrum.power[at]
+        around = spectrum.around[at]
+        n_stretches[at] += 1
+        n_peaks[at] += power > MIN_LINE_POWER * around
+        sum_of_ratios[at] += power / around
+        sum_of_heights[at] += power / np.maximum(np.median(spectrum.power, axis=0), 1e-300)
+        # A line of amplitude A has the power A^2 (2 / 3) n / 4 under a Hann window.
+        sum_of_excess[at] += np.maximum(power - around, 0.0) * 4 / (2 / 3 * length)
+    if not n_stretches.any():
         return
     chance = np.where(
-        hits > MOSTLY * count[:, None],
-        binom_sf(hits - 1, count[:, None], LINE_CHANCE) * np.count_nonzero(count),
+        n_peaks > MIN_TONE_SHARE * n_stretches[:, None],
+        binom_sf(n_peaks - 1, n_stretches[:, None], LINE_CHANCE) * np.count_nonzero(n_stretches),
         1.0,
     )
     for axis in range(3):
-        mean = ratios[:, axis] / np.maximum(count, 1)
+        mean_ratio = sum_of_ratios[:, axis] / np.maximum(n_stretches, 1)
         # The highest significant peak: the surroundings are known by octaves only.
-        best = int(
-            np.argmax(
-                np.where(
-                    chance[:, axis] < TONE_P_VALUE, plain[:, axis] / np.maximum(count, 1), -1.0
-                )
-            )
-        )
+        mean_height = sum_of_heights[:, axis] / np.maximum(n_stretches, 1)
+        significant_height = np.where(chance[:, axis] < TONE_P_VALUE, mean_height, -1.0)
+        best = int(np.argmax(significant_height))
         if chance[best, axis] < TONE_P_VALUE:
             yield Tone(
                 sensor,
                 AXES[axis],
                 joint,
                 float(grid[best]),
-                float(np.sqrt(excess[best, axis] / count[best])),
+                float(np.sqrt(sum_of_excess[best, axis] / n_stretches[best])),
                 float(chance[best, axis]),
-                float(hits[best, axis] / count[best]),
-                grid[count > 0],
-                mean[count > 0],
+                float(n_peaks[best, axis] / n_stretches[best]),
+                grid[n_stretches > 0],
+                mean_ratio[n_stretches > 0],
             )
 
 
-def _powers(
-    rest: np.ndarray, size: int, inside: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Return (power, power around it by octaves, mask of the frequencies).
+@dataclass(frozen=True, eq=False)
+class _Spectrum:
+    """Power spectrum of the three axes of a stretch at f frequencies."""
 
-    Both powers have shape (n, 3), and the mask marks the frequencies that have enough around them.
+    power: np.ndarray
+    """Shape (f, 3)."""
+    around: np.ndarray
+    """Mean power of noise in the octave of each frequency, by its median, shape (f, 3)."""
+    shown: np.ndarray
+    """Mask of the frequencies under test in an octave with enough of them, shape (f,)."""
+
+
+def _spectrum(residual: np.ndarray, size: int, shown: np.ndarray) -> _Spectrum:
     """
-    window = np.hanning(len(rest))
-    line = np.linspace(-1.0, 1.0, len(rest))[:, None]
-    level = rest - rest.mean(axis=0)
+    Return the spectrum of a stretch of n samples, shape (n, 3), with a Hann window.
+
+    It has the `size` of the transform; `shown` (mask) are the frequencies under test.
+    """
+    # Without mean and slope.
+    window = np.hanning(len(residual))
+    line = np.linspace(-1.0, 1.0, len(residual))[:, None]
+    level = residual - residual.mean(axis=0)
     level -= line * (line * level).sum(axis=0) / (line**2).sum()
     power = np.abs(np.fft.rfft(level * window[:, None], size, axis=0)) ** 2 / (window**2).sum()
+
+    # The power of noise has an exponential distribution, whose median is ln 2 times its mean.
     around = np.ones_like(power)
-    inside = inside.copy()
+    shown = shown.copy()
     octave = np.zeros(len(power), int)
     octave[1:] = np.log2(np.arange(1, len(power))).astype(int)
     for number in range(octave.max() + 1):
-        rows = inside & (octave == number)
-        if rows.sum() < 8:
-            inside[rows] = False
+        rows = shown & (octave == number)
+        if rows.sum() < FEWEST_AROUND:
+            shown[rows] = False
         else:
             around[rows] = np.maximum(np.median(power[rows], axis=0) / np.log(2), 1e-300)
-    return power, around, inside
+    return _Spectrum(power, around, shown)
 
 
 SWAY_CYCLES = 3.0
@@ -521,11 +603,11 @@ SWAY_CYCLES = 3.0
 FASTEST_SWAY = 0.1
 """Highest frequency of a sway, Hz: at rest a window is one mean."""
 SWAY_STEPS = 2.0
-"""Frequencies under test, per inverse duration."""
+"""Frequencies under test in each interval of the resolution, 1 / duration."""
 SWAY_SHARE = 0.2
 """Least share of the excess that a sway removes from windows that were held out."""
 LIKE_THE_JOINTS = 0.5
-"""Share of a wave that the joints may follow: their motion has the same period then."""
+"""Share of a wave explained by the joints, above which their motion has its period."""
 
 
 def find_sway(blocks: ResidualBlocks, fits: BlockFits) -> Tone | None:
@@ -544,54 +626,67 @@ def find_sway(blocks: ResidualBlocks, fits: BlockFits) -> Tone | None:
     ref = blocks.ref
     horizontal = np.moveaxis(ref.mat_sn[:, :, :2], 1, 2)  # (rows, two level axes, axes of s)
     waves = [np.exp(2j * np.pi * frequency * ref.time) for frequency in frequencies]
-    columns = []
+    columns = []  # of each frequency, shape (b, 4, 3): cosine, then sine, along two level axes
     for wave in waves:
-        turned = wave[:, None, None] * horizontal
-        columns.append(blocks.means(np.concatenate([turned.real, turned.imag], axis=1)))
+        along_level_axes = wave[:, None, None] * horizontal
+        cosine_and_sine = [along_level_axes.real, along_level_axes.imag]
+        columns.append(blocks.means(np.concatenate(cosine_and_sine, axis=1)))
 
     # Fall of the sum of squares by the four amplitudes of each frequency.
-    count = columns[0].shape[1]
-    every, residual = fits.outside_catalogue(np.concatenate(columns, axis=1))
+    n_amplitudes = columns[0].shape[1]
+    white_columns, residual = fits.outside_catalogue(np.concatenate(columns, axis=1))
+    columns_of_waves = []
     falls = []
     for place in range(len(frequencies)):
-        basis = np.linalg.qr(every[:, place * count : (place + 1) * count])[0]
+        of_wave = white_columns[:, place * n_amplitudes : (place + 1) * n_amplitudes]
+        basis = np.linalg.qr(of_wave)[0]
+        columns_of_waves.append(of_wave)
         falls.append(float(np.sum((basis.T @ residual) ** 2)))
     best = int(np.argmax(falls))
-    own = slice(best * count, (best + 1) * count)
-    total = float(residual @ residual)
-    spare = len(residual) - 3 * max(design.shape[1] for design in blocks.design) - count
-    if spare < len(residual) / 2:
+
+    # F test, with at least half of the blocks as degrees of freedom of the residual.
+    squares = float(residual @ residual)
+    n_columns = max(design.shape[1] for design in blocks.design)
+    freedom = len(residual) - 3 * n_columns - n_amplitudes
+    if freedom < len(residual) / 2:
         return None
-    scatter = max(total - falls[best], 1e-300) / spare
-    p_value = float(f_sf(falls[best] / count / scatter, count, spare)) * len(frequencies)
+    variance = max(squares - falls[best], 1e-300) / freedom
+    ratio = falls[best] / n_amplitudes / variance
+    p_value = float(f_sf(ratio, n_amplitudes, freedom)) * len(frequencies)
     if p_value > TONE_P_VALUE or _follows_joints(waves[best], ref.joint_angle):
         return None
     share = share_removed(fits.fit(), fits.fit(columns[best]))
     if share < SWAY_SHARE:
         return None
 
-    values = np.linalg.lstsq(every[:, own], residual, rcond=None)[0]
-    on_axes = np.sqrt(np.mean(np.einsum('bka,k->ba', columns[best], values) ** 2, axis=0))
+    amplitudes = np.linalg.lstsq(columns_of_waves[best], residual, rcond=None)[0]
+    output = np.einsum('bka,k->ba', columns[best], amplitudes)
+    rms_of_axes = np.sqrt(np.mean(output**2, axis=0))
     return Tone(
         blocks.sensor,
-        AXES[int(np.argmax(on_axes))],
+        AXES[int(np.argmax(rms_of_axes))],
         None,
         float(frequencies[best]),
-        float(np.linalg.norm(values)),
+        float(np.linalg.norm(amplitudes)),
         p_value,
         share,
         frequencies,
-        np.array(falls) / count / scatter,
+        np.array(falls) / n_amplitudes / variance,
         tilts=True,
     )
 
 
 def _follows_joints(wave: np.ndarray, angles: np.ndarray | None) -> bool:
-    """Return whether the joints move with the period of a wave."""
+    """
+    Return whether the joints move with the period of a wave, shape (n,), complex.
+
+    That is: a constant and the angles of the joints, shape (n, n_joints), with their cosines and
+    sines, explain more than `LIKE_THE_JOINTS` of its squares.
+    """
     if angles is None:
         return False
     design = np.column_stack([np.ones(len(wave)), angles, np.cos(angles), np.sin(angles)])
     target = np.column_stack([wave.real, wave.imag])
     target = target - target.mean(axis=0)
-    left = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
-    return bool(1 - np.sum(left**2) / np.sum(target**2) > LIKE_THE_JOINTS)
+    residual = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
+    return bool(1 - np.sum(residual**2) / np.sum(target**2) > LIKE_THE_JOINTS)
