@@ -571,7 +571,7 @@ BEYOND = _of(
     ),
     (
         'formulas of a temperature that stays',
-        'ResidualBlocks.warms',
+        'BlockMeans.warms',
         '... and bool(...)',
         '...',
         'test_beyond_catalogue.py::test_a_temperature_that_stays_is_no_cause',

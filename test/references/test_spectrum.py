@@ -13,7 +13,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
 from imu_calibration.references.turntable.residuals.spectrum import (
-    Stretch,
+    EvenStretch,
     _stretches_of_time,
     _without,
     find_tones,
@@ -41,7 +41,7 @@ def stretches(amplitudes, frequency=23.7, noise=1.0):
     """
     rng, time = np.random.default_rng(3), STEP * np.arange(400)
     return [
-        Stretch(
+        EvenStretch(
             noise * rng.normal(size=(400, 3))
             + np.outer(size * np.sin(2 * np.pi * frequency * time + k), [0, 1, 0]),
             step=STEP,
@@ -101,7 +101,7 @@ def test_a_tone_just_below_half_of_the_rate_is_found(frequency, size):
 def test_noise_that_is_not_white_is_no_tone():
     rng = np.random.default_rng(1)
     walks = [
-        Stretch(np.cumsum(rng.normal(size=(600, 3)), axis=0), step=STEP, highest=45.0)
+        EvenStretch(np.cumsum(rng.normal(size=(600, 3)), axis=0), step=STEP, highest=45.0)
         for _ in range(40)
     ]
     assert not list(of_stretches('gyroscope', walks, None))

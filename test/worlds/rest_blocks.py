@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from imu_calibration.estimation.sensor_noise import BiasProcess
-from imu_calibration.references.turntable.residuals.residual_blocks import ResidualBlocks
+from imu_calibration.references.turntable.residuals.residual_blocks import BlockMeans
 from imu_calibration.selection.stamp_jitter import StampJitter
 
 WINDOWS, EACH = 60, 4
@@ -16,7 +16,7 @@ STARTS = np.arange(len(TIME))
 
 def blocks_of(rest, rough, locked=np.zeros(len(TIME), bool)):
     """Return the blocks of a residual with a bias as the only parameter."""
-    return ResidualBlocks(
+    return BlockMeans(
         'gyroscope',
         SimpleNamespace(rate_s=np.ones((len(TIME), 3))),
         starts=STARTS,

@@ -19,7 +19,7 @@ from imu_calibration.effects.expressions import (
     names_in,
     read,
 )
-from imu_calibration.references.turntable.residuals.residual_blocks import SELECTION, ResidualBlocks
+from imu_calibration.references.turntable.residuals.residual_blocks import SELECTION, BlockMeans
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
 JOINT_ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
@@ -324,7 +324,7 @@ class FormulaSearch:
 
     Parameters
     ----------
-    blocks : ResidualBlocks
+    blocks : BlockMeans
     formulas : sequence of Formula
     plausible : array, shape (q, q)
         Factor of the covariance that the parameters of the space may plausibly have.
@@ -334,7 +334,7 @@ class FormulaSearch:
 
     def __init__(
         self,
-        blocks: ResidualBlocks,
+        blocks: BlockMeans,
         formulas: Sequence[Formula],
         plausible: np.ndarray,
         *,

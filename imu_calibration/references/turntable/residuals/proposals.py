@@ -25,7 +25,7 @@ from imu_calibration.references.turntable.residuals.formulas import (
 from imu_calibration.references.turntable.residuals.residual_blocks import (
     BlockFit,
     BlockFits,
-    ResidualBlocks,
+    BlockMeans,
     share_interval,
     share_removed,
 )
@@ -157,7 +157,7 @@ def with_formulas(
     return model, values
 
 
-def find_formulas(blocks: ResidualBlocks, problem: LinearisedProblem) -> list[FormulaChoice]:
+def find_formulas(blocks: BlockMeans, problem: LinearisedProblem) -> list[FormulaChoice]:
     """
     Return the formulas that a sensor's residual follows most likely.
 
@@ -184,7 +184,7 @@ def find_formulas(blocks: ResidualBlocks, problem: LinearisedProblem) -> list[Fo
 
 
 def propose(
-    blocks: ResidualBlocks,
+    blocks: BlockMeans,
     problem: LinearisedProblem,
     fits: BlockFits,
     *,
@@ -245,7 +245,7 @@ def _plausible(sensor: str, problem: LinearisedProblem) -> np.ndarray:
     return plausible
 
 
-def _grammar(blocks: ResidualBlocks) -> tuple[Formula, ...]:
+def _grammar(blocks: BlockMeans) -> tuple[Formula, ...]:
     duration = float(f'{max(float(np.ptp(blocks.time)), 1.0):.2g}')
     return grammar(blocks.ref.joint_angle.shape[1], blocks.warms, duration)
 
@@ -266,7 +266,7 @@ def _stable(fits: BlockFits, choices: Sequence[FormulaChoice]) -> bool:
 
 
 def _proposal_of(
-    blocks: ResidualBlocks,
+    blocks: BlockMeans,
     problem: LinearisedProblem,
     fits: BlockFits,
     plain: BlockFit,

@@ -25,7 +25,7 @@ from imu_calibration.references.turntable.residuals.proposals import (
 )
 from imu_calibration.references.turntable.residuals.residual_blocks import (
     BlockFits,
-    ResidualBlocks,
+    BlockMeans,
     residual_blocks,
 )
 from imu_calibration.references.turntable.residuals.spectrum import find_sway, find_tones
@@ -141,8 +141,8 @@ class ResidualAnalysis(Investigation):
         return found
 
     @cached_property
-    def blocks(self) -> dict[str, ResidualBlocks]:
-        """Sensor -> ResidualBlocks."""
+    def blocks(self) -> dict[str, BlockMeans]:
+        """Sensor -> BlockMeans."""
         return residual_blocks(self.used, self.table, self.problem, explained=self.explained)
 
     def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:

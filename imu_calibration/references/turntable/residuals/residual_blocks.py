@@ -56,7 +56,7 @@ WITHIN = 5
 
 
 @dataclass(frozen=True, eq=False)
-class ResidualBlocks:
+class BlockMeans:
     """
     Means over b blocks of one sensor's residual and of the columns of all candidate effects.
 
@@ -124,7 +124,7 @@ class BlockWhitener:
         C_ij = v_i (i = j) + sum over processes of sd^2 exp(-|t_i - t_j| / T)
     """
 
-    def __init__(self, blocks: ResidualBlocks, select: np.ndarray):
+    def __init__(self, blocks: BlockMeans, select: np.ndarray):
         variance = blocks.variance[select]
         time = blocks.time[select]
         mean_variance = variance.mean(axis=1, keepdims=True)
@@ -224,9 +224,9 @@ def residual_blocks(
     problem: LinearisedProblem,
     *,
     explained: ExplainedWindows,
-) -> dict[str, ResidualBlocks]:
+) -> dict[str, BlockMeans]:
     """
-    Return sensor -> ResidualBlocks of the windows of the reduced recording.
+    Return sensor -> BlockMeans of the windows of the reduced recording.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def residual_blocks(
         cut.windows, table, problem.recording.model, values=problem.recording.values
     )
 
-    # Variance within the blocks by second differences, and what errors of the stamps add to it.
+    # Variance within the blocks by second differences, with and without errors of the stamps.
     inner = _inner_samples(cut.windows)
     n_differences = np.add.reduceat(inner, cut.first_sample)
     freedom = n_differences / DIFFERENCES_PER_FREEDOM
@@ -278,7 +278,7 @@ def residual_blocks(
         )
         variance = floor.low_variance * noise_factor[cut.place_of_window]
         rows = np.concatenate([columns_of[sensor], cut.sample_means(residual)], axis=1)
-        blocks[sensor] = ResidualBlocks(
+        blocks[sensor] = BlockMeans(
             sensor,
             references.at(sensor),
             starts=cut.first_row,
@@ -304,7 +304,7 @@ def _temperatures(windows: Sequence[Window], cuts: Sequence['_Cut']) -> np.ndarr
     for window, cut in zip(windows, cuts):
         if window.temperature_c is None:
             return None
-        if len(cut.rows) == 1:  # at rest the single row stands for all samples
+        if len(cut.rows) == 1:  # a window at rest
             temperatures.append(window.temperature_c.mean(keepdims=True))
         else:
             temperatures.append(window.temperature_c[cut.rows])
@@ -562,7 +562,7 @@ class BlockFits:
 
     Parameters
     ----------
-    blocks : ResidualBlocks
+    blocks : BlockMeans
     used : sequence of int
         Parameters of the model, numbers in the `ParameterSpace`.
     prior_sd, prior_mean : ndarray
@@ -572,7 +572,7 @@ class BlockFits:
 
     def __init__(
         self,
-        blocks: ResidualBlocks,
+        blocks: BlockMeans,
         used: Sequence[int],
         *,
         prior_sd: np.ndarray,

@@ -18,7 +18,7 @@ NEARLY_ALL = 0.95
 """Share of the excess variance of a range that its reported part must contain."""
 LOUDER = 1.5
 """Least ratio of the variances inside and outside of a regime of larger scatter."""
-SCORING_STEPS = 12
+FISHER_STEPS = 12
 """Steps of Fisher scoring for a variance that is a smooth function of a variable."""
 MAX_VARIANCE_RATIO = 1e3
 """
@@ -184,7 +184,7 @@ def _smooth_scatter(
     design = np.column_stack([np.ones(len(columns)), columns])
     root = np.sqrt(weight)
     values = np.zeros(design.shape[1])
-    for _ in range(SCORING_STEPS):
+    for _ in range(FISHER_STEPS):
         # d(log likelihood) / d(log variance) = n (ratio - 1) / 2, information n / 2.
         log_variance = np.maximum(design @ values, 0.0)
         ratio = np.minimum(variance * np.exp(-log_variance), MAX_VARIANCE_RATIO)

@@ -17,7 +17,7 @@ from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.residuals.proposals import Proposal, with_formulas
 from imu_calibration.references.turntable.residuals.residual_blocks import (
     BlockFits,
-    ResidualBlocks,
+    BlockMeans,
     residuals,
     share_removed,
 )
@@ -441,7 +441,7 @@ def _tones_of_orders(
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class EvenStretch:
     """A residual of n samples at equal steps of time, or of the angle of a joint."""
 
     residual: np.ndarray
@@ -454,7 +454,7 @@ class Stretch:
 
 def _stretches_of_time(
     windows: Sequence[Window], residuals_of_windows: Sequence[np.ndarray]
-) -> Iterator[Stretch]:
+) -> Iterator[EvenStretch]:
     """Yield stretches of at most ten seconds of the windows with enough samples."""
     for window, residual in zip(windows, residuals_of_windows):
         if len(window) < FEWEST_SAMPLES:
@@ -464,12 +464,12 @@ def _stretches_of_time(
         # At half of the rate a wave is real: its power has one degree of freedom.
         highest = 0.5 / step - FREQUENCY_STEP
         for piece in _equal_pieces(residual, round(1 / (FREQUENCY_STEP * step))):
-            yield Stretch(piece, step, highest)
+            yield EvenStretch(piece, step, highest)
 
 
 def _stretches_of_turns(
     windows: Sequence[Window], residuals_of_windows: Sequence[np.ndarray], joint: int
-) -> Iterator[Stretch]:
+) -> Iterator[EvenStretch]:
     """Yield stretches of at most ten turns of the windows in which a joint turns one way."""
     for window, residual in zip(windows, residuals_of_windows):
         if len(window) < FEWEST_SAMPLES or len(window.motion) != len(window):
@@ -491,7 +491,7 @@ def _stretches_of_turns(
         highest = min(MAX_ORDER_SHARE / most_turns_per_sample, MAX_ORDER_SHARE * ANGLES_PER_TURN)
         longest = round(ANGLES_PER_TURN / FREQUENCY_STEP)
         for piece in _equal_pieces(np.stack(of_axes, axis=1), longest):
-            yield Stretch(piece, 1 / ANGLES_PER_TURN, highest)
+            yield EvenStretch(piece, 1 / ANGLES_PER_TURN, highest)
 
 
 def _equal_pieces(residual: np.ndarray, longest: int) -> list[np.ndarray]:
@@ -499,7 +499,9 @@ def _equal_pieces(residual: np.ndarray, longest: int) -> list[np.ndarray]:
     return np.array_split(residual, -(-len(residual) // longest))
 
 
-def of_stretches(sensor: str, stretches: Iterable[Stretch], joint: str | None) -> Iterator[Tone]:
+def of_stretches(
+    sensor: str, stretches: Iterable[EvenStretch], joint: str | None
+) -> Iterator[Tone]:
     """
     Yield the most significant Tone of each axis, if any; its p-value counts frequencies only.
 
@@ -584,7 +586,7 @@ def _spectrum(residual: np.ndarray, size: int, shown: np.ndarray) -> _Spectrum:
     level -= line * (line * level).sum(axis=0) / (line**2).sum()
     power = np.abs(np.fft.rfft(level * window[:, None], size, axis=0)) ** 2 / (window**2).sum()
 
-    # The power of noise has an exponential distribution, whose median is ln 2 times its mean.
+    # The power of noise has an exponential distribution: its median is ln 2 times its mean.
     around = np.ones_like(power)
     shown = shown.copy()
     octave = np.zeros(len(power), int)
@@ -610,7 +612,7 @@ LIKE_THE_JOINTS = 0.5
 """Share of a wave explained by the joints, above which their motion has its period."""
 
 
-def find_sway(blocks: ResidualBlocks, fits: BlockFits) -> Tone | None:
+def find_sway(blocks: BlockMeans, fits: BlockFits) -> Tone | None:
     """
     Return the periodic tilt of the level frame in the residual of the accelerometer, None without.
 

@@ -129,7 +129,7 @@ def _unexplained(
     white = recording.mean_variance(floor)
     noise_sd = np.sqrt(white + floor.bias_variance)
     sigma_means, sigma_within = explained.sigma(sensor, excess)
-    # At least the excess of one axis, which negative values of the others would lower.
+    # At least the excess of one axis, which negative values of other axes would lower.
     excess_of_means, excess_within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
     sigma = sigma_means
     if excess_within > WITHIN_SHARE * explained.n_within:
@@ -150,7 +150,7 @@ def _unexplained(
     # The means differ by less than the wander of the bias, but neighbours by more than white noise.
     if rms == 0:
         rms = float(np.sqrt(np.mean(white) * excess_of_means / explained.n_means))
-    # The fit has absorbed a part of the cause, as far as the columns of the model resemble it.
+    # The fit has absorbed the part of the cause that the columns of the model resemble.
     fitted = []
     for axis in range(3):
         used = np.flatnonzero(values[space.places(sensor, axis)[:-1]])

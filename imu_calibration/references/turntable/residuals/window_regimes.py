@@ -6,8 +6,8 @@ import numpy as np
 
 from imu_calibration.effects.base import AXES
 from imu_calibration.references.turntable.residuals.residual_blocks import (
+    BlockMeans,
     BlockWhitener,
-    ResidualBlocks,
     WhitenedAxis,
 )
 from imu_calibration.references.turntable.residuals.scatter_regimes import ScatterSearch
@@ -22,7 +22,7 @@ from imu_calibration.selection.regimes import (
 
 
 def find_regimes(
-    blocks: ResidualBlocks,
+    blocks: BlockMeans,
     problem: LinearisedProblem,
     used: Sequence[int],
     *,
@@ -37,7 +37,7 @@ def find_regimes(
 
     Parameters
     ----------
-    blocks : ResidualBlocks
+    blocks : BlockMeans
     problem : LinearisedProblem
     used : sequence of int
         Parameters of the model, numbers in the space of the problem.

@@ -7,11 +7,11 @@ import numpy as np
 
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
-from imu_calibration.references.turntable.residuals.residual_blocks import ResidualBlocks
+from imu_calibration.references.turntable.residuals.residual_blocks import BlockMeans
 from imu_calibration.selection.regime_variables import FEWEST, N_BINS, Variable, block_means, ranged
 
 
-def variables_of(blocks: ResidualBlocks, joint_names: Sequence[str]) -> list[Variable]:
+def variables_of(blocks: BlockMeans, joint_names: Sequence[str]) -> list[Variable]:
     """Return the variables of regimes in this recording; the first is reported among equals."""
     ref = blocks.ref
     starts = blocks.starts
