@@ -585,7 +585,7 @@ BEYOND = _of(
     ),
     (
         'a finding that a formula does without stays',
-        '_done_without',
+        '_is_superseded',
         'sum(_1.values()) < NOT_NEEDED * sum(_2.values())',
         'False',
         'test_beyond_catalogue.py',
@@ -636,7 +636,7 @@ BEYOND = _of(
     ),
     (
         'a place is no reason to withdraw a name',
-        '_places',
+        '_regime_columns',
         'not _1',
         'True',
         'test_residual_analysis.py',
@@ -650,7 +650,7 @@ BEYOND = _of(
     ),
     (
         'a finding goes for any formula',
-        '_done_without',
+        '_is_superseded',
         'sum(_1.values()) < NOT_NEEDED * sum(_2.values())',
         'True',
         'test_beyond_catalogue.py',

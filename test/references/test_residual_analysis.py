@@ -42,12 +42,12 @@ def test_an_offset_in_a_regime_replaces_a_finding_that_is_needless_beside_it(
     fits = {True: Fits(2.0, 2.0), False: Fits(12.0, 2.0 + beside)}
     found = SimpleNamespace(
         named=[question],
-        rests={'gyroscope': SimpleNamespace(significant=True)},
+        residual_of={'gyroscope': SimpleNamespace(significant=True)},
         proposals={'gyroscope': None},
         blocks={'gyroscope': SimpleNamespace(time=np.arange(8.0))},
         fits=lambda sensor, chosen: fits[bool(chosen)],
         columns=lambda sensor, formula: None,
-        proposed=lambda sensor, left_out: None,
+        proposed=lambda sensor, fits: None,
         regimes=lambda sensor, chosen: [SimpleNamespace(axis='y', inside=PLACE, offset=offset)],
     )
     assert superseded(found) == ([question] if withdrawn else [])
@@ -77,7 +77,7 @@ def test_a_course_of_the_temperature_that_predicts_better_replaces_a_drift(
     fits = {True: Fits(drift), False: Fits(900.0)}
     found = SimpleNamespace(
         named=[question],
-        rests={'gyroscope': SimpleNamespace(significant=False)},
+        residual_of={'gyroscope': SimpleNamespace(significant=False)},
         proposals={'gyroscope': None},
         problem=SimpleNamespace(recording=SimpleNamespace(session=np.arange(sessions))),
         blocks={
@@ -88,5 +88,5 @@ def test_a_course_of_the_temperature_that_predicts_better_replaces_a_drift(
         fits=lambda sensor, chosen: fits[bool(chosen)],
     )
     found._excess_with_courses = lambda *given: ResidualAnalysis._excess_with_courses(found, *given)
-    found.late_temperature = lambda *given: ResidualAnalysis.late_temperature(found, *given)
+    found.better_course = lambda *given: ResidualAnalysis.better_course(found, *given)
     assert superseded(found) == ([question] if withdrawn else [])
