@@ -8,7 +8,7 @@ together with nuisances that belong to single rows.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -37,7 +37,10 @@ class WeightedRows(Protocol):
         """
 
 
-class EstimateProblem(Protocol[StateT]):
+RowsT = TypeVar('RowsT', bound=WeightedRows, covariant=True)
+
+
+class EstimateProblem(Protocol[StateT, RowsT]):
     """What an estimate needs of a reference; a state has parameters, noise and nuisances."""
 
     @property
@@ -57,7 +60,7 @@ class EstimateProblem(Protocol[StateT]):
     def holding(self, state: StateT, held: np.ndarray) -> StateT:
         """Return the values of least cost with the held parameters (mask) at their prior."""
 
-    def weighted(self, state: StateT) -> WeightedRows:
+    def weighted(self, state: StateT) -> RowsT:
         """Return the rows at a state."""
 
     def not_believed(self, state: StateT, free: np.ndarray, sd: np.ndarray) -> Mapping[int, float]:
@@ -69,12 +72,12 @@ class EstimateProblem(Protocol[StateT]):
 
 
 @dataclass(frozen=True, eq=False)
-class JointEstimate(Generic[StateT]):
+class JointEstimate(Generic[StateT, RowsT]):
     """Joint estimate of parameters."""
 
     state: StateT
     """Parameters, noise and nuisances."""
-    rows: WeightedRows
+    rows: RowsT
     """The rows at this state."""
     terms: dict[str, np.ndarray]
     """Covariance of the parameters as named terms, each of shape (n, n)."""
@@ -86,7 +89,9 @@ class JointEstimate(Generic[StateT]):
     """Number -> value of the parameters that were held because misfit alone can cause the value."""
 
 
-def estimate(problem: EstimateProblem[StateT], state: StateT) -> JointEstimate[StateT]:
+def estimate(
+    problem: EstimateProblem[StateT, RowsT], state: StateT
+) -> JointEstimate[StateT, RowsT]:
     """
     Return the estimate of all parameters that the data determine.
 

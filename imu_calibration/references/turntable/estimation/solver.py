@@ -12,7 +12,6 @@ from imu_calibration.estimation.estimate import estimate
 from imu_calibration.estimation.gauss_newton import gauss_newton, halved
 from imu_calibration.estimation.held_parameters import Factors, undetermined_parameters, weak_alone
 from imu_calibration.estimation.prior import fixed_parameters
-from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.sensor_noise import BiasProcess
 from imu_calibration.estimation.solution import (
@@ -39,18 +38,18 @@ from imu_calibration.references.turntable.noise_model import NoiseModel
 
 NOISE_ROUNDS = 6
 """Largest number of alternating estimates of noise and parameters."""
-LEAVING_ROUNDS = 5
+OUTLIER_ROUNDS = 5
 """Largest number of rounds of outlier exclusion; one outlier may hide another."""
 MAX_SOLVE_STEPS = 40
 """Largest number of Gauss-Newton steps of one solve."""
 SMALL_STEP = 1e-7
 """A solve ends with a step below this many standard deviations."""
 SMALL_STEP_OF_NOISE = 0.01
-"""The same while the noise is not known yet."""
+"""As `SMALL_STEP`, while the noise is not known yet."""
 MAX_HALVINGS = 11
-"""Largest number of times that a step is halved which raises the cost."""
+"""Largest number of halvings of a step that raises the cost."""
 EQUALLY_WEAK = 0.99
-"""Part of the largest share of a prior's sd from which parameters are equally undetermined."""
+"""Ratio to the largest sd, in sds of the prior, from which parameters are equally undetermined."""
 START_PENALTY = 1e-6
 """Weight of the nominal sensor in the first values, for motions that do not determine them."""
 Noises = dict[str, NoiseModel]
@@ -105,24 +104,23 @@ def solve(
     problem = _WindowProblem(system, allow_holding, noises_are_known=noise is not None)
     values = start(system)
     noises = noise or first_noise(system, values, bias_processes or {})
-    found = estimate(problem, _Fit(values, noises))
-    values = found.state.values
-    noises = found.state.noises
+    joint = estimate(problem, _Fit(values, noises))
+    values = joint.state.values
+    noises = joint.state.noises
 
-    data = system.linearise(values, found.state.factors).columns
-    of_model = model_error(system, values, noises, free=found.free)
+    of_model = model_error(system, values, noises, free=joint.free)
     quality = _fit_quality(system, values, noises)
     return Solution(
         model,
         values,
-        {**found.terms, **of_model.terms(total(found.terms))},
-        found.held,
+        {**joint.terms, **of_model.terms(total(joint.terms))},
+        joint.held,
         noises,
         quality.chi2,
-        data.T @ data,
+        joint.rows.data.T @ joint.rows.data,
         quality.rms,
         _session_biases(system, values, noises),
-        {model.param_names[number]: value for number, value in found.not_believed.items()},
+        {model.param_names[number]: value for number, value in joint.not_believed.items()},
         slow_over_fast=quality.slow_over_fast,
         attitude=quality.attitude,
     )
@@ -136,7 +134,7 @@ class _Fit:
     """Shape (n_params,)."""
     noises: Noises
     factors: Factors = field(default_factory=dict)
-    """Triangular factors of the weighted rows; none before the noise is known."""
+    """Triangular factors of the rows weighted by `noises`; empty before they are computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,23 +156,23 @@ class _WindowProblem:
         return ~fixed_parameters(self.system.model)
 
     def fitted(self, fit: _Fit) -> _Fit:
-        """Return the values with the noise, without the windows that deviate."""
+        """Return the values of least cost with the noise, both without outlying windows."""
         if not self.noises_are_known:
-            fit = self._alternately(fit)
+            fit = self._values_and_noise(fit)
             # One outlier may hide another.
-            for _ in range(LEAVING_ROUNDS):
-                more = outlier_windows(self.system, fit.values, fit.noises)
-                if not any(more.values()):
+            for _ in range(OUTLIER_ROUNDS):
+                outliers = outlier_windows(self.system, fit.values, fit.noises)
+                if not any(outliers.values()):
                     break
-                without = {}
+                noises = {}
                 for sensor, noise in fit.noises.items():
-                    without[sensor] = replace(noise, left_out=noise.left_out | more[sensor])
-                fit = self._alternately(_Fit(fit.values, without))
+                    noises[sensor] = replace(noise, left_out=noise.left_out | outliers[sensor])
+                fit = self._values_and_noise(_Fit(fit.values, noises))
         return self._minimised(fit.values, self._weighed(fit), self.asked)
 
-    def _alternately(self, fit: _Fit) -> _Fit:
+    def _values_and_noise(self, fit: _Fit) -> _Fit:
         """
-        Return values and noise, estimated alternately.
+        Return values and noise, estimated in turn until the weights remain the same.
 
         One round usually suffices: the likelihood of the offsets is restricted, so it does not
         depend on the values of the parameters. With separate weights of slow and fast parts,
@@ -192,22 +190,27 @@ class _WindowProblem:
         return fit
 
     def _weighed(self, fit: _Fit) -> _Fit:
-        """Return the same with the triangular factors of rows weighted by the noise."""
+        """Return the fit with the triangular factors of the rows weighted by its noise."""
         factors = {}
         for sensor in self.system.sensors:
             factors[sensor] = self.system.factors(sensor, fit.noises[sensor])
         return replace(fit, factors=factors)
 
     def _minimised(
-        self, values: np.ndarray, fit: _Fit, free: np.ndarray, enough: float = SMALL_STEP
+        self, values: np.ndarray, fit: _Fit, free: np.ndarray, small_step: float = SMALL_STEP
     ) -> _Fit:
-        """Return the values of least cost; steps below `enough` sds are the last."""
-        squares = _WindowSquares(self.system, fit.factors, free, enough)
+        """
+        Return the fit with the values of least cost for its factors.
+
+        The iteration starts at `values`, of which those `free` (mask) change, and ends with a step
+        below `small_step` standard deviations.
+        """
+        squares = _WindowSquares(self.system, fit.factors, free, small_step)
         last = gauss_newton(squares, squares.at(values), n_steps=MAX_SOLVE_STEPS)
         return replace(fit, values=last.values)
 
     def undetermined(self, fit: _Fit) -> np.ndarray:
-        """Return the parameters that the windows do not determine or separate."""
+        """Return a mask of the parameters that the windows do not determine or separate."""
         rows = self.weighted(fit)
         held = undetermined_parameters(
             rows.design,
@@ -221,7 +224,11 @@ class _WindowProblem:
         return held
 
     def holding(self, fit: _Fit, held: np.ndarray) -> _Fit:
-        """Return the values with the held ones at their prior; the noise depends little on them."""
+        """
+        Return the values of least cost with the parameters `held` (mask) at their prior.
+
+        The noise depends little on them, and remains the same.
+        """
         if not held.any():
             return fit
         values = np.where(held, self.system.prior.mean, fit.values)
@@ -233,7 +240,11 @@ class _WindowProblem:
         return _WeightedWindows(self.system, fit, data)
 
     def not_believed(self, fit: _Fit, free: np.ndarray, sd: np.ndarray) -> Mapping[int, float]:
-        """Return the values that misfit gives, unless no parameter would remain."""
+        """
+        Return number -> value of the `implausible_parameters`.
+
+        None if parameters must not be fixed, or if no parameter would remain free.
+        """
         implausible = implausible_parameters(
             self.system, fit.values, sd=sd, noises=fit.noises, free=free
         )
@@ -244,7 +255,7 @@ class _WindowProblem:
 
 @dataclass(frozen=True, eq=False)
 class _WeightedWindows:
-    """Rows of all windows (`WeightedRows`)."""
+    """Weighted rows of all windows at a fit (`WeightedRows`)."""
 
     system: WeightedSystem
     fit: _Fit
@@ -264,7 +275,7 @@ class _WeightedWindows:
 def _refuse_held(
     held: np.ndarray, free: np.ndarray, model: SensorModel, allow_holding: bool
 ) -> None:
-    """Raise where no parameter is determined, or one is not and must be."""
+    """Raise if no free parameter is determined, or if one is not and `allow_holding` is False."""
     if (held | ~free).all():
         raise NotObservableError(
             'the recording must determine at least one parameter, it determines none; '
@@ -283,7 +294,8 @@ def start(system: WeightedSystem) -> np.ndarray:
     """
     Return the solution for bias and matrix of each sensor, all other parameters at their prior.
 
-    Shape (n_params,).
+    Shape (n_params,). The means of windows, weighted by their numbers of samples, are fitted with
+    the columns of bias and matrix, drawn slightly to the nominal sensor: bias 0, matrix 1.
     """
     model = system.model
     values = model.start()
@@ -306,17 +318,17 @@ def start(system: WeightedSystem) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """Values of the parameters with their rows."""
+    """Values of the parameters with their residual."""
 
     values: np.ndarray
     """Shape (n_params,)."""
-    rows: Rows
-    """Weighted, those of the prior last."""
+    residual: np.ndarray
+    """Residual of the weighted rows, then of the prior, shape (m,)."""
 
     @property
     def cost(self) -> float:
         """Sum of squares."""
-        return float(self.rows.residual @ self.rows.residual)
+        return float(self.residual @ self.residual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,32 +338,41 @@ class _Step:
     change: np.ndarray
     """Shape (n_free,)."""
     length: float
-    """Largest change in sds of each parameter if all other ones were known."""
+    """Largest change of a parameter, in its sd if all other ones were known."""
 
 
 @dataclass(frozen=True, eq=False)
 class _WindowSquares:
-    """Sum of squares of triangular factors of all windows and of the prior (`LeastSquares`)."""
+    """
+    Sum of squares of all windows and of the prior as a function of the values (`LeastSquares`).
+
+    With the triangular factors ``[R | y]``, the coefficients B, the root P of the information of
+    the prior and its mean m::
+
+        residual = [y - R B(values), P (m - values)]
+    """
 
     system: WeightedSystem
     factors: Factors
     """Triangular factors of the whitened rows."""
     free: np.ndarray
     """True for the parameters that are estimated, shape (n_params,)."""
-    enough: float
-    """Length of the last step."""
+    small_step: float
+    """A shorter step is the last one, standard deviations."""
 
     def at(self, values: np.ndarray) -> _Point:
-        """Return values with their rows."""
+        """Return values with their residual."""
         prior = self.system.prior
-        rows = self.system.linearise(values, self.factors)
-        return _Point(values, rows.with_prior(prior.mean - values, prior.root))
+        of_windows = self.system.residual(values, self.factors)
+        return _Point(values, np.append(of_windows, prior.root @ (prior.mean - values)))
 
     def step(self, point: _Point) -> _Step:
         """Return the step from a point."""
         prior = self.system.prior
-        columns = point.rows.columns[:, self.free]
-        change = scaled_lstsq(columns, point.rows.residual)
+        rows = self.system.linearise(point.values, self.factors)
+        rows = rows.with_prior(prior.mean - point.values, prior.root)
+        columns = rows.columns[:, self.free]
+        change = scaled_lstsq(columns, rows.residual)
         data = columns[: -len(prior.root)]
         information = (data**2).sum(axis=0) + 1 / prior.sd[self.free] ** 2
         return _Step(change, float(np.max(np.abs(change) * np.sqrt(information), initial=0.0)))
@@ -360,6 +381,7 @@ class _WindowSquares:
         """Return the point after the longest of the halved steps that does not raise the cost."""
 
         def after(share: float) -> _Point:
+            """Return the point after a share of the step."""
             values = point.values.copy()
             values[self.free] += step.change * share
             return self.at(values)
@@ -368,7 +390,7 @@ class _WindowSquares:
 
     def is_last(self, point: _Point, step: _Step) -> bool:
         """Return whether a step is small; a large misfit limits the accuracy."""
-        return step.length < self.enough * max(1.0, 1e-7 * np.sqrt(point.cost))
+        return step.length < self.small_step * max(1.0, 1e-7 * np.sqrt(point.cost))
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,7 +408,7 @@ class _FitQuality:
 
 
 def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> _FitQuality:
-    """Return the `_FitQuality` at the estimate."""
+    """Return the fit quality at the estimate `values` with the noise of each sensor."""
     chi2 = {}
     rms = {}
     slow_over_fast = {}
@@ -400,6 +422,8 @@ def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> 
         white = system.mean_rows(misfit[:, :, None], noise).white()
         freedom = max(white.size - _parameters_of_means(system, sensor), 1)
         chi2[sensor] = {'means': float((white**2).sum() / freedom)}
+
+        # Centred rows of each kind of moving window.
         slow_over_fast[sensor] = {}
         moving_squares = 0.0
         moving_count = 0
@@ -420,24 +444,25 @@ def _session_biases(
     system: WeightedSystem, values: np.ndarray, noises: Noises
 ) -> dict[str, np.ndarray]:
     """
-    Return the bias of each recording for sensors with a bias of its own per recording.
+    Return sensor -> its bias in each recording, shape (n_sessions, 3).
 
-    The best linear prediction.
+    Only sensors of which the bias differs between recordings. It is the common bias and the best
+    linear prediction of the difference (`predict_session_offsets`).
     """
-    found = {}
+    biases = {}
     for sensor in system.sensors:
         noise = noises[sensor]
         if noise.session_variance <= 0:
             continue
         misfit = system.misfit(sensor, system.means[sensor], values)
         offsets = predict_session_offsets(system.mean_rows(misfit[:, :, None], noise))
-        found[sensor] = values[system.model.part(sensor, Role.OFFSET)] + offsets
-    return found
+        biases[sensor] = values[system.model.part(sensor, Role.OFFSET)] + offsets
+    return biases
 
 
 def _parameters_of_means(system: WeightedSystem, sensor: str) -> int:
     """
-    Return how many parameters the means determine: the ones of the sensor, at most half the data.
+    Return how many parameters the means determine: those of the sensor, at most half the data.
     """
-    own = sum(effect.size for effect in system.model.concerning(sensor))
-    return min(own, system.means[sensor].shape[0] * 3 // 2)
+    n_params = sum(effect.size for effect in system.model.concerning(sensor))
+    return min(n_params, system.means[sensor].shape[0] * 3 // 2)

@@ -1,8 +1,4 @@
-"""
-The rows of one solve.
-
-Accumulated windows with the columns of a model, weighted by a noise model, and the prior.
-"""
+"""Accumulated windows as rows of least squares, with the columns of a model and the prior."""
 
 from collections.abc import Iterator
 
@@ -22,14 +18,17 @@ from imu_calibration.references.turntable.noise_model import NoiseModel
 
 class WeightedSystem(WindowMeans):
     """
-    Accumulated windows as rows ``[columns | output]``.
+    Accumulated windows as rows ``[columns | output]``, for any parameters and noise.
 
-    With residuals and derivatives for given parameters and noise.
+    A sensor has mean rows, one for each window, and centred rows: the deviations of the samples of
+    moving windows from their means, reduced to one triangular factor for each kind of window. With
+    the coefficients B(values) of a sensor, the residual is ``output - columns @ B``.
 
     Parameters
     ----------
     accumulator : Accumulator
     model : SensorModel
+        Its columns are those of the rows.
 
     """
 
@@ -102,28 +101,29 @@ class WeightedSystem(WindowMeans):
     def factors(self, sensor: str, noise: NoiseModel) -> list[np.ndarray]:
         """
         Return for each axis the triangular factor of all whitened rows ``[columns | output]``.
+
+        Each has the shape (p + 1, p + 1) or less, and the sums of squares of all rows.
         """
         white = self.whitened_means(sensor, noise)
         centred = list(self.weighed_rows(sensor, noise))
-        found = []
+        factors = []
         for axis in range(3):
-            own = self.columns_and(sensor, axis)
+            places = self.columns_and(sensor, axis)
             parts = [white[:, axis]]
-            parts += [rows[:, own] * weight[axis] for rows, weight in centred]
-            found.append(triangular(np.concatenate(parts)))
-        return found
+            parts += [rows[:, places] * weight[axis] for rows, weight in centred]
+            factors.append(triangular(np.concatenate(parts)))
+        return factors
 
     def weighed_rows(
-        self, sensor: str, noise: NoiseModel, part: WindowBlock | None = None
+        self, sensor: str, noise: NoiseModel, block: WindowBlock | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
-        Yield (centred rows, weight of each axis (3,)).
+        Yield (centred rows ``[columns | output]``, weight of each axis, shape (3,)).
 
-        All rows of each kind, and again the slow ones where these have more weight.
-
-        From all windows, or from one block.
+        For each kind of window all rows, then the rows of their slow part with the weight that they
+        have in addition, if any. Of all windows, or of one block.
         """
-        source: Accumulator | WindowBlock = part or self.accumulator
+        source: Accumulator | WindowBlock = block or self.accumulator
         for kind in self.within[sensor]:
             if (sensor, kind) in source.within:
                 yield source.within[sensor, kind], 1 / np.sqrt(noise.row_variance(kind))
@@ -132,7 +132,11 @@ class WeightedSystem(WindowMeans):
                 yield source.slow[sensor, kind], extra
 
     def linearise(self, values: np.ndarray, factors: Factors) -> Rows:
-        """Return the rows of all sensors and axes at values, from the factors of their weights."""
+        """
+        Return the rows ``[design | residual]`` of all sensors and axes, linearised at the values.
+
+        `factors` are the triangular factors of the weighted rows (`factors`).
+        """
         parts = []
         for sensor in self.sensors:
             of_axes = coefficients(self.model, sensor, values)
@@ -143,22 +147,31 @@ class WeightedSystem(WindowMeans):
         equations = np.concatenate(parts)[:, None]
         return Rows(equations=equations, variance=np.ones(equations.shape[:2]))
 
+    def residual(self, values: np.ndarray, factors: Factors) -> np.ndarray:
+        """Return the residual of `linearise` without the derivatives, shape (m,)."""
+        parts = []
+        for sensor in self.sensors:
+            of_axes = coefficients(self.model, sensor, values)
+            for axis, factor in enumerate(factors[sensor]):
+                parts.append(factor[:, -1] - factor[:, :-1] @ of_axes[:, axis])
+        return np.concatenate(parts)
+
     def linearised(self, sensor: str, values: np.ndarray, noise: NoiseModel) -> Rows:
         """
-        Return the mean rows of one sensor, with the products of centred rows and prior.
+        Return the mean rows ``[design | residual]`` of one sensor at the values.
 
-        They are in coordinates of the parameters of the sensor.
-
-        Directions fixed by the gauge are excluded: their weight would dominate the products.
+        Their `products` are those of the weighted centred rows and of the prior. The columns are
+        coordinates of the parameters that act on the sensor, without the directions that the gauge
+        fixes: their weight would dominate the products.
         """
-        # Coordinates: the parameters of the sensor, without the directions that the gauge fixes.
+        # Coordinates: an orthonormal basis of the directions that the gauge leaves free.
         slope = coefficient_jacobian(self.model, sensor, values)
-        own = np.flatnonzero(np.any(slope != 0, axis=(0, 1)))
-        gauge = self.prior.gauge[:, own]
-        basis = np.eye(len(own))
+        acting = np.flatnonzero(np.any(slope != 0, axis=(0, 1)))
+        gauge = self.prior.gauge[:, acting]
+        basis = np.eye(len(acting))
         if gauge.any():
             basis = scipy.linalg.null_space(gauge)
-        slope = slope[:, :, own] @ basis
+        slope = slope[:, :, acting] @ basis
 
         # Mean rows.
         means = self.means[sensor]
@@ -166,7 +179,7 @@ class WeightedSystem(WindowMeans):
         rows = np.concatenate([design, self.misfit(sensor, means, values)[:, :, None]], axis=2)
 
         # Rows of the prior, then weighted centred rows of the three axes.
-        root = self.prior.root[: -len(gauge) or None, own]
+        root = self.prior.root[: -len(gauge) or None, acting]  # the gauge has the last rows
         used = np.flatnonzero(np.any(root != 0, axis=1))
         offset = self.prior.root[used] @ (self.prior.mean - values)
         parts = [np.concatenate([root[used] @ basis, offset[:, None]], axis=1)]
