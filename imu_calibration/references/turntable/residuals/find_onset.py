@@ -1,4 +1,8 @@
-"""Search for parameters that change at one moment."""
+"""
+Search for parameters that change at one moment (an onset).
+
+A moment is first the number of the last window before it, then a time.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,34 +32,22 @@ MIN_ONSET_WINDOWS = MIN_FOLD_WINDOWS + 1
 Least number of moving windows before and after an onset: the longer part, without the window of the
 onset, can be searched.
 """
-
-
 SUDDEN = 1e-3
 """
 Least share of its gain by which an onset exceeds the gain of a gradual change of the same
 parameters; a gradual change has five times as many parameters and gains more.
 """
-
-
 GRADUAL = 5
 """Degree of the polynomial in time of a gradual change."""
-
-
 COARSE = 40
-"""Moments that are tried first; then all about the best of them."""
-
-
+"""Number of moments that are tried first; then all between the neighbours of the best."""
 MOST_LIMITS = 100
-"""Temperatures at which a step is tried."""
-
-
+"""Largest number of temperatures at which a step is tried."""
 LIKELY = 16.0
 """
 A moment between two windows is refined if its loss is at most the least one and this (a likelihood
 ratio of 3e-4).
 """
-
-
 SIMPLER = 1.25
 """
 A group of fewer parameters is preferred if its excess is at most this many times the least one.
@@ -83,32 +75,33 @@ def find_onset(
     space = problem.evidence.space
     groups = _groups(problem.recording.model, problem.recording.sensors)
 
-    # The chosen parameters and those that may change, the chosen ones first.
+    # The parameters of the fits: the chosen ones first, then all that may change.
     parameters = list(used)
     for group in groups:
         parameters += [k for k in group.parameters.tolist() if k not in parameters]
-    kept = np.array(parameters)
-    rows = WindowRows.of(space.restricted(kept), explained.floor.noise)
+    rows = WindowRows.of(space.restricted(np.array(parameters)), explained.floor.noise)
 
-    # Both parts must hold enough moving windows for a search of their own.
-    moving = np.cumsum(space.recording.moving)
+    # Both parts must contain enough moving windows for a separate search.
+    n_moving = np.cumsum(space.recording.moving)
     allowed = np.flatnonzero(
-        (moving >= MIN_ONSET_WINDOWS) & (moving[-1] - moving >= MIN_ONSET_WINDOWS)
+        (n_moving >= MIN_ONSET_WINDOWS) & (n_moving[-1] - n_moving >= MIN_ONSET_WINDOWS)
     )
     if not len(allowed):
         return None
-    found = []
+    candidates = []
     for group in groups:
-        candidate = _candidate(rows, group, kept, n_base=len(used), allowed=allowed)
+        candidate = _candidate(
+            rows, group, np.array(parameters), n_chosen=len(used), allowed=allowed
+        )
         if candidate is not None:
-            found.append(candidate)
-    if not found:
+            candidates.append(candidate)
+    if not candidates:
         return None
 
     # The fewest parameters that explain as much as the best, then the least excess.
-    most = SIMPLER * min(max(entry.excess, entry.noise) for entry in found)
-    good = [entry for entry in found if entry.excess <= most]
-    best = min(good, key=lambda entry: (len(entry.group.parameters), entry.excess))
+    most = SIMPLER * min(max(candidate.excess, candidate.noise) for candidate in candidates)
+    good = [candidate for candidate in candidates if candidate.excess <= most]
+    best = min(good, key=lambda candidate: (len(candidate.group.parameters), candidate.excess))
     return _onset_of(best, problem, windows=windows, table=table)
 
 
@@ -119,9 +112,9 @@ class _Group:
     name: str
     """Name of the effect of the reference, or the sensors of which biases or matrices change."""
     parameters: np.ndarray
-    """Their numbers in the model, in order."""
+    """Numbers of the parameters in the model, in order."""
     role: Role | None
-    """Place in the equation of the sensors; None for an effect of the reference."""
+    """Role of the parameters: bias or matrix; None for an effect of the reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,20 +122,20 @@ class _Candidate:
     """A group of parameters that changes, at the moment at which this fits best."""
 
     group: _Group
-    own: np.ndarray
-    """Parameters of the fit, numbers in the parameter space."""
+    parameters: np.ndarray
+    """Parameters of the fit: chosen ones and the group, numbers in the parameter space."""
     ends: tuple[int, int]
     """Windows between which the moment lies."""
     excess: float
-    """Squares that remain beyond noise, without the windows about the moment."""
+    """Remaining squares beyond noise, without the windows about the moment."""
     noise: float
-    """Limit of an excess that is significant, in the parts in which one remains."""
+    """Largest `excess` that is not significant."""
     share: float
-    """Share of the excess that the second state removes."""
+    """Share of the excess that the change removes."""
     fit: ChangeFit
     """The first state and the change."""
     temperature_c: float | None
-    """Temperature that is passed at the moment only; None without one."""
+    """Temperature that separates the windows before and after the moment; None without one."""
 
 
 def _groups(model: SensorModel, sensors: Sequence[str]) -> list[_Group]:
@@ -164,7 +157,12 @@ def _groups(model: SensorModel, sensors: Sequence[str]) -> list[_Group]:
 
 
 def _candidate(
-    rows: WindowRows, group: _Group, kept: np.ndarray, *, n_base: int, allowed: np.ndarray
+    rows: WindowRows,
+    group: _Group,
+    parameters: np.ndarray,
+    *,
+    n_chosen: int,
+    allowed: np.ndarray,
 ) -> _Candidate | None:
     """
     Return the _Candidate of a group, None where its change does not explain the excess.
@@ -173,105 +171,121 @@ def _candidate(
     ----------
     rows : WindowRows
     group : _Group
-    kept : ndarray
-        Parameters of the rows, numbers in the parameter space.
-    n_base : int
-        Number of chosen parameters, which are the first of them.
+    parameters : ndarray
+        Parameters of the columns of `rows`, numbers in the parameter space.
+    n_chosen : int
+        Number of chosen parameters, which are the first of these.
     allowed : ndarray
-        Windows after which a moment may lie.
+        Windows after which the moment may lie.
 
     """
-    base = np.arange(n_base)
-    at = np.flatnonzero(np.isin(kept, group.parameters))
-    own = np.union1d(base, at)
-    changing = rows.changing(at)
-    losses = _losses_of_moments(rows, own, changing, allowed)
+    # Places of the columns: chosen, changing, and all of the fit.
+    chosen = np.arange(n_chosen)
+    of_group = np.flatnonzero(np.isin(parameters, group.parameters))
+    fitted = np.union1d(chosen, of_group)
+
+    # The best moment.
+    changing = rows.changing(of_group)
+    losses = _losses_of_moments(rows, fitted, changing, allowed)
     last = min(losses, key=losses.__getitem__)
     least = losses[last]
-    warmth = rows.space.recording.describe['temperature']
-    passed = None
+    temperature_passed = None
     if group.role is Role.OFFSET:
-        passed = _passed_once(warmth, last)
-        if passed is None and _follows_temperature(rows, own, changing, least):
+        temperature = rows.space.recording.describe['temperature']
+        temperature_passed = _passed_once(temperature, last)
+        if temperature_passed is None and _follows_temperature(rows, fitted, changing, least):
             return None
 
     # The change lies within one of the windows about the moment, which hold both states: all
     # models are compared without them.
     clear = ~np.isin(np.arange(rows.count), (last, last + 1))
-    apart = rows.selected(clear)
-    changing = apart.changing(at)
-    change = changing.along(_after(rows, last))
-    alone = apart.fit(base)
-    step = apart.fit(own, change)
-    gradual = apart.fit(own, changing.along(_curves(rows.space.recording.time)))
-    before = apart.excess(base, alone)
-    after = apart.excess(own, step, change)
+    compared = rows.selected(clear)
+    changing = compared.changing(of_group)
+    step_columns = changing.along(_after(rows, last))
+    constant = compared.fit(chosen)
+    step = compared.fit(fitted, step_columns)
+    gradual = compared.fit(fitted, changing.along(_curves(rows.space.recording.time)))
+    before = compared.excess(chosen, constant)
+    after = compared.excess(fitted, step, step_columns)
     if after.squares >= (1 - MIN_EXPLAINED_SHARE) * before.squares:
         return None
-    if gradual.loss - step.loss <= SUDDEN * (alone.loss - step.loss):
+    if gradual.loss - step.loss <= SUDDEN * (constant.loss - step.loss):
         return None
     likely = [k for k, loss in losses.items() if loss < least + LIKELY]
     return _Candidate(
         group,
-        kept[own],
+        parameters[fitted],
         ends=(min(likely), max(likely) + 1),
         excess=after.squares,
         noise=after.limit,
         share=1 - after.squares / before.squares,
         fit=step,
-        temperature_c=passed,
+        temperature_c=temperature_passed,
     )
 
 
 def _losses_of_moments(
-    rows: WindowRows, own: np.ndarray, changing: ChangingColumns, allowed: np.ndarray
+    rows: WindowRows, fitted: np.ndarray, changing: ChangingColumns, allowed: np.ndarray
 ) -> dict[int, float]:
-    """Return last window before a moment -> loss of the fit with a change there."""
+    """
+    Return last window before a moment -> loss of the fit with a change there.
+
+    The fit has the columns `fitted`, of which the amplitudes of `changing` change after one of the
+    windows `allowed`.
+    """
     coarse = np.unique(np.linspace(0, len(allowed) - 1, min(COARSE, len(allowed))).astype(int))
     losses = {}
     for last in allowed[coarse].tolist():
-        losses[last] = _loss_of_step(rows, own, changing, _after(rows, last))
+        losses[last] = _loss_of_step(rows, fitted, changing, _after(rows, last))
     # All moments between the neighbours of the best one.
     place = int(np.searchsorted(allowed[coarse], min(losses, key=losses.__getitem__)))
     first = coarse[max(place - 1, 0)]
     end = coarse[min(place + 1, len(coarse) - 1)]
     for last in allowed[first:end].tolist():
         if last not in losses:
-            losses[last] = _loss_of_step(rows, own, changing, _after(rows, last))
+            losses[last] = _loss_of_step(rows, fitted, changing, _after(rows, last))
     return losses
 
 
 def _loss_of_step(
-    rows: WindowRows, own: np.ndarray, changing: ChangingColumns, second: np.ndarray
+    rows: WindowRows, fitted: np.ndarray, changing: ChangingColumns, in_second_state: np.ndarray
 ) -> float:
-    """Return the loss with another value of some parameters where `second` (n, 1) is one."""
-    return rows.fit(own, changing.along(second)).loss
+    """
+    Return the loss with other values of the changing columns in some windows.
+
+    `in_second_state` is 1 in these windows and 0 in the other ones, shape (n, 1).
+    """
+    return rows.fit(fitted, changing.along(in_second_state)).loss
 
 
 def _follows_temperature(
-    rows: WindowRows, own: np.ndarray, changing: ChangingColumns, loss: float
+    rows: WindowRows, fitted: np.ndarray, changing: ChangingColumns, loss: float
 ) -> bool:
     """
-    Return whether a step where the temperature passes a value fits as well as one at a moment.
+    Return whether a step above some temperature fits as well as one at a moment with a `loss`.
 
     An offset above a temperature is a place (`selection.regimes`), not an onset.
     """
-    warmth = rows.space.recording.describe['temperature']
-    if not np.all(np.isfinite(warmth)) or np.ptp(warmth) == 0:
+    temperature = rows.space.recording.describe['temperature']
+    if not np.all(np.isfinite(temperature)) or np.ptp(temperature) == 0:
         return False
-    limits = np.sort(warmth)[MIN_ONSET_WINDOWS:-MIN_ONSET_WINDOWS]
+    limits = np.sort(temperature)[MIN_ONSET_WINDOWS:-MIN_ONSET_WINDOWS]
     for limit in limits[:: max(len(limits) // MOST_LIMITS, 1)]:
-        warm = (warmth > limit).astype(float)[:, None]
-        if _loss_of_step(rows, own, changing, warm) <= loss:
+        above = (temperature > limit).astype(float)[:, None]
+        if _loss_of_step(rows, fitted, changing, above) <= loss:
             return True
     return False
 
 
-def _passed_once(warmth: np.ndarray, last: int) -> float | None:
-    """Return a temperature on different sides of which the windows up to and after `last` are."""
-    first = warmth[: last + 1]
-    second = warmth[last + 1 :]
-    for lower, upper in ((first, second), (second, first)):
+def _passed_once(temperature: np.ndarray, last: int) -> float | None:
+    """
+    Return a temperature between all windows up to the window `last` and all later ones.
+
+    None if the ranges of both parts overlap.
+    """
+    before = temperature[: last + 1]
+    after = temperature[last + 1 :]
+    for lower, upper in ((before, after), (after, before)):
         if lower.max() < upper.min():
             return float(0.5 * (lower.max() + upper.min()))
     return None
@@ -292,15 +306,15 @@ def _curves(time: np.ndarray) -> np.ndarray:
 def _onset_of(
     candidate: _Candidate, problem: LinearisedProblem, *, windows: Sequence[Window], table: Table
 ) -> Onset:
-    """Return the Onset of a _Candidate, with its moment refined to a sample."""
+    """Return the Onset of a candidate, with its moment refined to a sample."""
     model = problem.recording.model
     group = candidate.group
     change = candidate.fit.change
     sd = candidate.fit.change_sd
 
-    # Both states of all parameters; the change is added to the first.
+    # All parameters before and after the moment.
     values = np.zeros(problem.space.size)
-    values[candidate.own] = candidate.fit.values
+    values[candidate.parameters] = candidate.fit.values
     changed = np.zeros(problem.space.size)
     changed[group.parameters] = change
     first_state = problem.absolute(values)
@@ -317,12 +331,12 @@ def _onset_of(
     after = dict(zip(names, states[1][group.parameters].tolist()))
     sensor_axes: dict[str, tuple[str, ...]] = {}
     if group.role is not None:
-        # Of each sensor of the group three biases, or the nine elements of a matrix row by row.
-        per_row = 1 if group.role is Role.OFFSET else 3
+        # Each axis of a sensor has one bias, or three elements in its row of the matrix.
+        n_per_axis = 1 if group.role is Role.OFFSET else 3
         # Biases of the two sensors have different units: they are compared in standard deviations.
         unit = sd if group.role is Role.OFFSET else 1.0
         squares = np.maximum((change / unit) ** 2 - (sd / unit) ** 2, 0.0)
-        squares = squares.reshape(-1, 3, per_row).sum(axis=2)
+        squares = squares.reshape(-1, 3, n_per_axis).sum(axis=2)
         sensors = dict.fromkeys(name.partition('.')[0] for name in names)
         for sensor, squares_of_axes in zip(sensors, squares, strict=True):
             sensor_axes[sensor] = largest_axes(squares_of_axes)
@@ -356,12 +370,13 @@ def _refined(
     """
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
     noise = dict(zip(SENSORS, np.median([w.noise_sd for w in near], axis=0)))
-    squares = []  # of each state, at each sample
+    squares: list[np.ndarray] = []  # of each state, at each sample
     for state in states:
         residual_of = residuals(near, table, model, values=state[: len(model.param_names)])
-        squares.append(
-            sum(((rest / noise[sensor]) ** 2).sum(axis=1) for sensor, rest in residual_of.items())
-        )
+        of_state = np.zeros(sum(len(window) for window in near))
+        for sensor, residual in residual_of.items():
+            of_state = of_state + ((residual / noise[sensor]) ** 2).sum(axis=1)
+        squares.append(of_state)
 
     # S up to a constant, for a moment between each sample and the next one.
     cost = np.cumsum(squares[0] - squares[1])[:-1]

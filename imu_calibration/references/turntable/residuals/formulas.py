@@ -1,4 +1,4 @@
-"""Formulas of regressors for a residual: grammar, search, and evaluation."""
+"""Formulas of the motion, the temperature and the time for a residual, and their search."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,16 +22,21 @@ from imu_calibration.effects.expressions import (
 from imu_calibration.references.turntable.residuals.residual_blocks import SELECTION, BlockMeans
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
-JOINT_ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
-"""Harmonics per turn: of one joint, of two joints at once, of a joint times another quantity."""
-CONSTANTS = (0.07, 0.2, 0.6)
-"""Time constants of settling, as shares of the recording."""
+JOINT_ORDERS = range(1, 9)
+"""Harmonics per turn of one joint."""
+PAIR_ORDERS = range(1, 7)
+"""Harmonics per turn of each of two joints in a product."""
+FEW_ORDERS = range(1, 4)
+"""Harmonics per turn of a joint in a product with another quantity."""
+TIME_CONSTANT_SHARES = (0.07, 0.2, 0.6)
+"""Time constants of settling, as shares of the duration."""
 SOFT_SIGN = 'tanh({} / 0.005)'
 """
-The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise,
-and would shake the bias there.
+Smooth sign of a rate, which changes over 0.3 deg/s: at rest the sign would be that of the Earth's
+rate or of noise.
 """
 TEMPERATURE_FACTOR = f'({TEMPERATURE_RISE})'
+"""Text of the temperature above its reference."""
 UNIT_OF = {
     'force': 'm/s^2',
     'rate': 'rad/s',
@@ -57,7 +62,7 @@ class Product:
 
     @property
     def as_factor(self) -> str:
-        """The text in front of what it multiplies."""
+        """The text in front of another factor; empty for the empty product."""
         return f'{self.text} * ' if self.text else ''
 
 
@@ -65,19 +70,19 @@ class Product:
 class Formula:
     """Columns that are tried together: with one amplitude for each column and axis."""
 
-    columns: tuple
-    """Texts: each a str for all axes, or three, one for each axis."""
-    factors: tuple
-    """Quantities that a column is the product of, with repetition; its unit follows."""
+    columns: tuple[Column, ...]
+    """Texts of the columns."""
+    factors: tuple[str, ...]
+    """Quantities that a column is the product of, with repetition, which give its unit."""
     phased: str = ''
     """
-    The same with a phase, where the columns are the cosine and the sine of one angle: text with
-    {phase}.
+    Text with {phase} of the sum of both columns, where they are the cosine and the sine of one
+    angle.
     """
 
     @property
     def family(self) -> frozenset[str]:
-        """Quantities in it."""
+        """Quantities in the columns."""
         quantities = set()
         for column in self.columns:
             for text in (column,) if isinstance(column, str) else column:
@@ -92,13 +97,13 @@ class Formula:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Measure of complexity: columns; factors and functions."""
+        """(number of columns, number of factors and functions)."""
         text = str(self.columns[0])
         n_functions = sum(text.count(f'{name}(') for name in FUNCTIONS)
         return len(self.columns), len(self.factors) + n_functions
 
     def unit(self, output: str) -> str:
-        """Return the unit of an amplitude, with `output` that of the sensor."""
+        """Return the unit of an amplitude: that of the `output` over those of the factors."""
         powers = Counter(UNIT_OF[factor] for factor in self.factors if factor in UNIT_OF)
         text = output
         for unit, power in powers.items():
@@ -148,12 +153,12 @@ def _atoms(*letters: str) -> list[Product]:
 
 
 def _sense(text: str) -> str:
-    """Return the sign of a quantity; of a rate a smooth one."""
+    """Return the text of the sign of a component of force or rate; that of a rate is smooth."""
     return SOFT_SIGN.format(text) if text.startswith('w') else f'sign({text})'
 
 
 def _times(*parts: Product) -> Product:
-    """Return the product of some parts, powers gathered: f_x, f_x, w_y is f_x ** 2 * w_y."""
+    """Return a product, with equal factors as a power: f_x, f_x, w_y gives f_x ** 2 * w_y."""
     powers: dict[str, int] = {}
     factors: tuple[str, ...] = ()
     for part in parts:
@@ -199,7 +204,7 @@ def _of_motion() -> Iterator[Product]:
 
 
 def _slow(thermal: bool, duration: float) -> Iterator[Product]:
-    """Yield the formulas with temperature or time, alone and times motion."""
+    """Yield the formulas of temperature or time, and their products with motion."""
     warm = Product(TEMPERATURE_FACTOR, ('temperature',))
     slow: list[Product] = []
     if thermal:
@@ -207,7 +212,7 @@ def _slow(thermal: bool, duration: float) -> Iterator[Product]:
         for power in (2, 3):
             yield Product(f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power)
         slow.append(warm)
-    for share in CONSTANTS:
+    for share in TIME_CONSTANT_SHARES:
         slow.append(Product(f'(1 - exp(-time / {share * duration:.3g}))'))
     slow.append(Product('time', ('time',)))
 
@@ -222,14 +227,18 @@ def _slow(thermal: bool, duration: float) -> Iterator[Product]:
             yield _times(warm, warm, entry)
 
 
-def _turn(joint: int, order: int, before: str = '') -> tuple[str, str, str]:
-    """Return (cosine, sine, text with a phase) of an order of a joint."""
-    inside = f'angle_{joint}' if order == 1 else f'{order} * angle_{joint}'
-    return f'{before}cos({inside})', f'{before}sin({inside})', f'{before}cos({inside} - {{phase}})'
+def _turn(joint: int, order: int, factor: str = '') -> tuple[str, str, str]:
+    """
+    Return (cosine, sine, cosine with a phase) of an order of a joint's angle, as texts.
+
+    All are multiplied with a `factor`, a text that ends in ``*`` or is empty.
+    """
+    angle = f'angle_{joint}' if order == 1 else f'{order} * angle_{joint}'
+    return f'{factor}cos({angle})', f'{factor}sin({angle})', f'{factor}cos({angle} - {{phase}})'
 
 
 def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
-    """Yield cosine and sine of the angle of one joint, and their products for two joints."""
+    """Yield cosines and sines of the angle of a joint, with other factors and of two joints."""
     joints = range(1, n_joints + 1)
     for joint, order in product(joints, JOINT_ORDERS):
         yield _harmonic(joint, order)
@@ -288,13 +297,16 @@ def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
 
 
 def _each_times(prefix: str, vector: Sequence[str]) -> tuple[str, ...]:
+    """Return the texts of a vector, each after the text of a factor."""
     return tuple(prefix + text for text in vector)
 
 
 NEW = 1e-3
-"""Least share of a column's size outside the span of the catalogue for a test of it."""
+"""
+Least norm of a tested column outside the span of the catalogue, over the norm of the column.
+"""
 COLUMN_CHUNK = 128
-"""Columns that are worked out at once."""
+"""Columns that are evaluated at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,31 +316,34 @@ class FormulaChoice:
     formula: Formula
     """The candidate."""
     columns: np.ndarray
-    """Means over the blocks, shape (b, k, 3): the last index is the axis it acts on."""
+    """Means over the blocks, shape (b, k, 3): of k columns, for each axis."""
     p_value: float
-    """Probability of such a reduction of the misfit by noise, times the number of formulas."""
+    """Probability of such a fall of the misfit by noise, times the number of formulas."""
     alike: tuple[Formula, ...]
-    """Formulas that are not separable from it, the likeliest first."""
+    """Formulas with nearly the same evidence, the likeliest first."""
 
 
 @lru_cache(maxsize=64)
 def _function(texts: Iterable[str]) -> Callable:
+    """Return the function that evaluates some texts together (`array_function`)."""
     return array_function([read(text) for text in texts])
 
 
 class FormulaSearch:
     """
-    Formulas on one sensor's blocks.
+    Search of formulas for the residual of one sensor, in the blocks outside locked windows.
 
-    With baseline and catalogue projected out up to plausible sizes.
+    Contributions of the model and of the catalogue of plausible size are projected out.
 
     Parameters
     ----------
     blocks : BlockMeans
     formulas : sequence of Formula
+        Candidates.
     plausible : array, shape (q, q)
-        Factor of the covariance that the parameters of the space may plausibly have.
+        Factor P of the plausible covariance ``P P'`` of the parameters of the space.
     reference_temperature : float
+        Of the temperature factor, degrees Celsius.
 
     """
 
@@ -342,36 +357,37 @@ class FormulaSearch:
     ):
         self.blocks = blocks
         self.formulas = formulas
-        # Text -> its column; many formulas have the same ones.
+        # Text -> its place among the columns; many formulas have the same texts.
         self._place: dict[str, int] = {}
         for formula in formulas:
             for column in formula.columns:
                 for text in _three(column):
                     self._place.setdefault(text, len(self._place))
-        self.means = self._worked_out(tuple(self._place), reference_temperature)
+        # Means over the blocks of the column of each text, shape (b, n_texts).
+        self.means = self._evaluated(tuple(self._place), reference_temperature)
 
-        # Independent rows of the catalogue's columns and residual of each axis, then of the texts.
+        # Whitened rows of the catalogue's columns and residual of each axis, then of the texts.
         whitener = blocks.white[SELECTION]
         white = whitener.whiten(np.concatenate([*blocks.design, self.means], axis=1))
         ends = np.cumsum([0, *(part.shape[1] for part in blocks.design)])
-        self._rest = []
-        self._free = []
-        self.known = []
+        self._residual = []  # of each axis, outside of the catalogue, shape (n_selection,)
+        self._free = []  # of each axis: columns of the texts outside of it, (n_selection, n_texts)
+        self.n_explained = []  # of each axis: directions of the catalogue and of project_out
         for axis in range(3):
             catalogue_and_residual = white[:, ends[axis] : ends[axis + 1]] / whitener.scale[axis]
             residual = catalogue_and_residual[:, -1]
             columns = white[:, ends[3] :] / whitener.scale[axis]
 
-            # Plausible contributions A p of the catalogue, cov(p) = P P', count as noise of unit
-            # variance more: with A P = U S V' the rows are multiplied by (1 + U S^2 U')^(-1/2)
-            # = 1 - U diag(1 - 1 / sqrt(1 + S^2)) U'.
+            # Plausible contributions A p of the catalogue, cov(p) = P P', are noise in addition to
+            # that of unit variance: with A P = U S V' the rows are multiplied by
+            # (1 + U S^2 U')^(-1/2) = 1 - U diag(1 - 1 / sqrt(1 + S^2)) U'.
             basis, sizes, _ = svd(
                 catalogue_and_residual[:, :-1] @ plausible[blocks.index[axis]],
                 full_matrices=False,
                 lapack_driver='gesdd',
             )
             damped = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)
-            self._rest.append(residual - basis @ (damped * (basis.T @ residual)))
+            self._residual.append(residual - basis @ (damped * (basis.T @ residual)))
             free = columns - basis @ (damped[:, None] * (basis.T @ columns))
 
             # A column that the catalogue contains is no formula beyond it.
@@ -379,119 +395,123 @@ class FormulaSearch:
             free_square = np.einsum('bt,bt->t', free, free)
             is_new = free_square > NEW**2 * np.maximum(square, 1e-300)
             self._free.append(np.where(is_new, free, 0.0))
-            self.known.append(int((sizes > 1.0).sum()))
+            self.n_explained.append(int((sizes > 1.0).sum()))
 
-    def _worked_out(self, texts: Sequence[str], reference_temperature: float) -> np.ndarray:
+    def _evaluated(self, texts: Sequence[str], reference_temperature: float) -> np.ndarray:
+        """Return the means over the blocks of texts, shape (b, n_texts); 0 where not finite."""
+        # Name of a quantity -> its value at each row.
         ref = self.blocks.ref
-        known = {
-            name: (getattr(ref, field), index) for name, (field, *index) in PLACES.items() if field
-        }
-        places = {'temperature_ref_c': reference_temperature}
-        for name, (values, index) in known.items():
+        quantities = {'temperature_ref_c': reference_temperature}
+        for name, (attribute, *index) in PLACES.items():
+            if not attribute:
+                continue
+            values = getattr(ref, attribute)
+            # Neither a missing temperature nor a joint that the table does not have.
             if values is not None and (not index or index[-1] < values.shape[-1]):
-                column = (slice(None), *index)  # of every sample
-                places[name] = values[column]
+                at_all_rows = (slice(None), *index)
+                quantities[name] = values[at_all_rows]
+
         means = np.empty((len(self.blocks.time), len(texts)))
         with np.errstate(all='ignore'):
             for first in range(0, len(texts), COLUMN_CHUNK):
-                worked = _function(texts[first : first + COLUMN_CHUNK])(places)
-                rows = np.stack(
-                    [np.broadcast_to(np.asarray(column, float), len(ref)) for column in worked],
-                    axis=1,
-                )
-                means[:, first : first + len(worked)] = self.blocks.means(rows)
+                values_of_texts = _function(texts[first : first + COLUMN_CHUNK])(quantities)
+                columns = []
+                for values in values_of_texts:
+                    columns.append(np.broadcast_to(np.asarray(values, float), len(ref)))
+                last = first + len(columns)
+                means[:, first:last] = self.blocks.means(np.stack(columns, axis=1))
         return np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0)
 
-    @property
-    def misfit(self) -> float:
-        """Chi-square per degree of freedom of the part outside the catalogue, at least 1."""
-        dof = max(3 * len(self._rest[0]) - sum(self.known), 1)
-        return max(sum(float(rest @ rest) for rest in self._rest) / dof, 1.0)
-
     def best(self) -> FormulaChoice | None:
-        """Return the simplest of the likeliest formulas, or None where none is significant."""
-        gains, counts = self._gains()
-        price = 2.0 * counts
-        order = np.argsort(price - gains)
+        """
+        Return the simplest of the likeliest formulas, or None where none is significant.
+
+        The likeliest formula has the largest ``fall of chi-square - 2 n_amplitudes``. Formulas with
+        nearly the same value, within `TIE` in units of the remaining misfit, are as likely.
+        """
+        falls, n_amplitudes = self._falls()
+        price = 2.0 * n_amplitudes
+        order = np.argsort(price - falls)
         likeliest = order[0]
-        p_value = min(
-            1.0, float(chi2_sf(gains[likeliest], max(counts[likeliest], 1))) * len(self.formulas)
-        )
-        if p_value > FAMILY_WISE or gains[likeliest] <= price[likeliest]:
+        by_noise = float(chi2_sf(falls[likeliest], max(n_amplitudes[likeliest], 1)))
+        p_value = min(1.0, by_noise * len(self.formulas))
+        if p_value > FAMILY_WISE or falls[likeliest] <= price[likeliest]:
             return None
-        dof = max(3 * len(self._rest[0]) - sum(self.known), 1)
-        left = max((sum(float(rest @ rest) for rest in self._rest) - gains[likeliest]) / dof, 1.0)
-        near = [
-            k
-            for k in order[:200]
-            if (gains - price)[likeliest] - (gains - price)[k] < 2 * TIE * left and counts[k]
-        ]
-        chosen = min(near, key=lambda k: (self.formulas[k].complexity, price[k] - gains[k]))
+
+        # Chi-square per degree of freedom with the likeliest formula, at least 1.
+        freedom = max(3 * len(self._residual[0]) - sum(self.n_explained), 1)
+        squares = sum(float(residual @ residual) for residual in self._residual)
+        misfit = max((squares - falls[likeliest]) / freedom, 1.0)
+
+        advantage = falls - price
+        as_likely = []
+        for k in order[:200]:
+            if advantage[likeliest] - advantage[k] < 2 * TIE * misfit and n_amplitudes[k]:
+                as_likely.append(k)
+        simplest = min(as_likely, key=lambda k: (self.formulas[k].complexity, price[k] - falls[k]))
+        formula = self.formulas[simplest]
         return FormulaChoice(
-            self.formulas[chosen],
-            self.columns_of(self.formulas[chosen]),
+            formula,
+            np.stack([self.means[:, self._places(column)] for column in formula.columns], axis=1),
             p_value,
-            tuple(self.formulas[k] for k in near if k != chosen),
+            tuple(self.formulas[k] for k in as_likely if k != simplest),
         )
 
-    def columns_of(self, formula: Formula) -> np.ndarray:
-        """Return the means of a formula's columns, shape (b, k, 3)."""
-        return np.stack([self.means[:, self._at(column)] for column in formula.columns], axis=1)
-
-    def take(self, choice: FormulaChoice) -> None:
+    def project_out(self, choice: FormulaChoice) -> None:
         """Project a choice out, so that the next is tested conditional on it."""
         for axis in range(3):
-            columns = self._free[axis][
-                :, [self._at(column)[axis] for column in choice.formula.columns]
-            ]
-            basis, sizes = svd(columns, full_matrices=False)[:2]
+            places = [self._places(column)[axis] for column in choice.formula.columns]
+            columns = self._free[axis][:, places]
+            basis, sizes, _ = svd(columns, full_matrices=False)
             basis = basis[:, sizes > 1e-9 * max(sizes.max(), 1e-300)]
-            self._rest[axis] = self._rest[axis] - basis @ (basis.T @ self._rest[axis])
+            self._residual[axis] = self._residual[axis] - basis @ (basis.T @ self._residual[axis])
             self._free[axis] = self._free[axis] - basis @ (basis.T @ self._free[axis])
-            self.known[axis] += basis.shape[1]
+            self.n_explained[axis] += basis.shape[1]
 
-    def _at(self, column: Column) -> list[int]:
+    def _places(self, column: Column) -> list[int]:
+        """Return the places of the texts of a column for the three axes."""
         return [self._place[text] for text in _three(column)]
 
-    def _gains(self) -> tuple[np.ndarray, np.ndarray]:
+    def _falls(self) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (fall of chi-square, number of amplitudes) of each formula, shape (n,) both.
+        Return (fall of chi-square, number of amplitudes) of each of n formulas, shape (n,) both.
 
         With the columns X of a formula, scaled to unit length, and the residual r of an axis::
 
             fall = (X'r)' (X'X)^-1 (X'r)
 
         """
-        gains = np.zeros(len(self.formulas))
-        counts = np.zeros(len(self.formulas))
+        falls = np.zeros(len(self.formulas))
+        n_amplitudes = np.zeros(len(self.formulas))
         # All formulas with the same number of columns at once.
         for width in {len(formula.columns) for formula in self.formulas}:
             chosen = [k for k, formula in enumerate(self.formulas) if len(formula.columns) == width]
             places = []
             for k in chosen:
-                places.append([self._at(column) for column in self.formulas[k].columns])
+                places.append([self._places(column) for column in self.formulas[k].columns])
             place_on_axes = np.array(places)  # (n_chosen, width, 3)
             for axis in range(3):
-                at = place_on_axes[:, :, axis]
+                places_of_axis = place_on_axes[:, :, axis]
                 free = self._free[axis]
                 size = np.sqrt(np.maximum(np.einsum('bt,bt->t', free, free), 1e-300))
-                slopes = (free.T @ self._rest[axis]) / size
+                slopes = (free.T @ self._residual[axis]) / size
                 gram = np.eye(width) * np.ones((len(chosen), 1, 1))
                 for i in range(width):
                     for j in range(i):
-                        first = at[:, i]
-                        second = at[:, j]
+                        first = places_of_axis[:, i]
+                        second = places_of_axis[:, j]
                         inner = np.einsum('bg,bg->g', free[:, first], free[:, second])
                         cosine = np.clip(inner / (size[first] * size[second]), -1.0, 1.0)
                         gram[:, i, j] = cosine
                         gram[:, j, i] = cosine
                 gram += 1e-6 * np.eye(width)  # collinear columns
-                right = slopes[at]
+                right = slopes[places_of_axis]
                 amplitudes = np.linalg.solve(gram, right[..., None])[..., 0]
-                gains[chosen] += np.einsum('gk,gk->g', right, amplitudes)
-                counts[chosen] += (size[at] > 1e-100).sum(axis=1)
-        return gains, counts
+                falls[chosen] += np.einsum('gk,gk->g', right, amplitudes)
+                n_amplitudes[chosen] += (size[places_of_axis] > 1e-100).sum(axis=1)
+        return falls, n_amplitudes
 
 
 def _three(column: Column) -> tuple[str, ...]:
+    """Return the text of a column for each axis."""
     return (column,) * 3 if isinstance(column, str) else column

@@ -1,8 +1,4 @@
-"""
-A formula for the unexplained residual.
-
-Search, test on held-out windows, description and a term for a model.
-"""
+"""Formulas for the unexplained residual of a sensor, tested on held-out windows."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,12 +29,16 @@ from imu_calibration.references.turntable.selection.linearised_problem import Li
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
 
 MIN_FORMULA_SHARE = 0.6
-"""Share of the excess that a formula removes from held-out windows at least."""
+"""Share of the excess of held-out windows that a formula must remove."""
 WORTH_A_SECOND = 0.1
-"""Share that a second formula adds at least."""
+"""Share of the excess that a second formula must remove in addition."""
 MOST_TERMS = 2
+"""Largest number of terms of a proposal."""
 ONE_SHAPE = 0.9
-"""Share of a formula's amplitudes, all axes, that one shape must have to replace all of it."""
+"""
+Share of the squared amplitudes of a formula, all axes, that one combination of its columns must
+have to replace all of them.
+"""
 OTHER_SENSOR = 3.0
 """
 Standard deviations by which a cause of the table may differ from the estimate of the other sensor.
@@ -58,21 +58,21 @@ class Proposal:
     effects: tuple[Effect, ...]
     """The formulas as terms: each a text, a unit and a tolerance."""
     values: tuple[np.ndarray, ...]
-    """Their amplitudes on the three axes, SI."""
+    """Amplitudes of each formula on the three axes, SI."""
     sds: tuple[np.ndarray, ...]
-    """Standard deviations, with the misfit in them."""
+    """Standard deviations of the amplitudes, larger by the misfit."""
     family: frozenset[str]
-    """Quantities in them."""
+    """Quantities in the formulas."""
     axes: tuple[str, ...]
-    """Axes of the sensor on which they show."""
+    """Axes of the sensor on which the formulas are significant."""
     share: float
-    """Share of the rest that they remove from held-out windows, in squares."""
+    """Share of the excess of held-out windows, in squares, that the formulas remove."""
     ci95: tuple[float, float]
-    """Its interval."""
+    """95 % interval of the share."""
     reduction: float
-    """By how much the rms beyond noise falls there, as a share."""
+    """Share of the rms beyond noise that they remove there."""
     p_value: float
-    """Probability of the first by noise, times the number of formulas."""
+    """Probability of the first formula by noise, times the number of formulas."""
     alike: tuple[str, ...]
     """Formulas that are not separable from the first in this recording."""
     nearest: tuple[str, float] | None
@@ -95,14 +95,12 @@ class Proposal:
     @property
     def relation(self) -> str:
         """Description of the proposal."""
-        parts = [
-            f'{_size(effect, value, sd)}'
-            for effect, value, sd in zip(self.effects, self.values, self.sds)
-        ]
+        formulas = []
+        for column, effect, value, sd in zip(self.columns, self.effects, self.values, self.sds):
+            formulas.append(f'{column}, {_size(effect, value, sd)}')
         text = (
             f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f}'
-            ' %, on windows held out) follows '
-            + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts))
+            f' %, on windows held out) follows {" and ".join(formulas)}'
         )
         if self.nearest is not None:
             text += (
@@ -159,28 +157,26 @@ def with_formulas(
 
 def find_formulas(blocks: BlockMeans, problem: LinearisedProblem) -> list[FormulaChoice]:
     """
-    Return the formulas that a sensor's residual follows most likely.
+    Return the likeliest formulas for a sensor's residual, at most `MOST_TERMS`.
 
-    Each one is in addition to the earlier ones, and there are at most `MOST_TERMS`.
-
-    They are chosen on the selection windows, with all plausible contributions of the catalogue
-    projected out.
+    Each one is significant in addition to the earlier ones. They are chosen on the selection
+    windows, with all plausible contributions of the catalogue projected out.
     """
     search = FormulaSearch(
         blocks,
         _grammar(blocks),
-        _plausible(blocks.sensor, problem),
+        _plausible_sizes(blocks.sensor, problem),
         reference_temperature=problem.recording.model.temperature_ref_c,
     )
-    found: list[FormulaChoice] = []
-    while len(found) < MOST_TERMS:
-        if found:
-            search.take(found[-1])
+    choices: list[FormulaChoice] = []
+    while len(choices) < MOST_TERMS:
+        if choices:
+            search.project_out(choices[-1])
         choice = search.best()
         if choice is None:
             break
-        found.append(choice)
-    return found
+        choices.append(choice)
+    return choices
 
 
 def propose(
@@ -191,103 +187,110 @@ def propose(
     formulas: Sequence[FormulaChoice],
 ) -> Proposal | None:
     """
-    Return a Proposal for the residual of a sensor with the chosen effects.
+    Return a Proposal for the residual of a sensor with the model of some fits.
 
-    Or None where no formula removes most of it.
-
-    Of the `formulas` (`find_formulas`) the first ones are taken on which both halves of the
-    selection windows agree and that add enough; the share is from the locked windows with the
-    findings in the model.
+    None where no formula removes most of the excess. Of the `formulas` (`find_formulas`) it
+    contains the first ones on which both halves of the selection windows agree and that add enough.
+    The shares are those of the locked windows.
     """
-    plain = fits.fit()
-    if plain.excess <= 0:
+    without_formula = fits.fit()
+    if without_formula.excess <= 0:
         return None
     choices: list[FormulaChoice] = []
     share = 0.0
-    for found in formulas:
-        if not _stable(fits, [*choices, found]):
+    for formula in formulas:
+        more_choices = [*choices, formula]
+        if not _stable(fits, more_choices):
             break
-        grown = share_removed(plain, fits.fit(_joined([*choices, found])))
-        if choices and grown < share + WORTH_A_SECOND:
+        larger_share = share_removed(without_formula, fits.fit(_joined(more_choices)))
+        if choices and larger_share < share + WORTH_A_SECOND:
             break
-        choices = [*choices, found]
-        share = grown
-    needed = (
-        MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
-    )
-    if not choices or share < needed:
+        choices = more_choices
+        share = larger_share
+    smooth = any(choice.formula.smooth for choice in choices)
+    least_share = MIN_SMOOTH_SHARE if smooth else MIN_FORMULA_SHARE
+    if not choices or share < least_share:
         return None
-    return _proposal_of(blocks, problem, fits, plain, choices)
+    return _proposal_of(blocks, problem, fits, without_formula, choices)
 
 
-def _plausible(sensor: str, problem: LinearisedProblem) -> np.ndarray:
+def _plausible_sizes(sensor: str, problem: LinearisedProblem) -> np.ndarray:
     """
-    Return a factor of the covariance that the catalogue's parameters may have, shape (q, q).
+    Return a factor P of the plausible covariance ``P P'`` of the catalogue's parameters, (q, q).
 
-    A cause in the table acts on both sensors: its explained share here is limited by its estimate
-    there.
+    It is that of the priors, except for a cause in the table or the clock, which acts on both
+    sensors: its estimate from the other sensor limits what it may explain in this one.
     """
     plausible = np.diag(problem.space.prior_sd)
     (other,) = (each for each in SENSORS if each != sensor)
     if other not in problem.space.sensors:
         return plausible
     for question in problem.questions:
-        if (
-            question.sensor not in SENSORS
-            and other in question.effect.acts_on
-            and len(question.effect.acts_on) > 1
-        ):
-            own = list(question.parameters)
-            known = problem.evidence.known_from(other, [*problem.search.baseline, *own])[
-                -len(own) :, -len(own) :
-            ]
-            plausible[np.ix_(own, own)] = OTHER_SENSOR * np.linalg.cholesky(known)
+        acts_on = question.effect.acts_on
+        if question.sensor not in SENSORS and other in acts_on and len(acts_on) > 1:
+            parameters = list(question.parameters)
+            n = len(parameters)
+            known = problem.evidence.known_from(other, [*problem.search.baseline, *parameters])
+            factor = np.linalg.cholesky(known[-n:, -n:])
+            plausible[np.ix_(parameters, parameters)] = OTHER_SENSOR * factor
     return plausible
 
 
 def _grammar(blocks: BlockMeans) -> tuple[Formula, ...]:
+    """Return the formulas that are tried in a recording."""
     duration = float(f'{max(float(np.ptp(blocks.time)), 1.0):.2g}')
     return grammar(blocks.ref.joint_angle.shape[1], blocks.warms, duration)
 
 
 def _joined(choices: Sequence[FormulaChoice]) -> np.ndarray:
+    """Return the columns of all choices over the blocks, shape (b, k, 3)."""
     return np.concatenate([choice.columns for choice in choices], axis=1)
 
 
 def _stable(fits: BlockFits, choices: Sequence[FormulaChoice]) -> bool:
     """
-    Return whether the halves of the recording agree on the last choice within their precision.
+    Return whether the halves of the recording agree on the amplitudes of the last choice.
+
+    Their difference is on average below three standard deviations, or small compared with the
+    amplitudes themselves.
     """
-    width = choices[-1].columns.shape[1]
-    early, late, whole = (fits.fit(_joined(choices), half=half) for half in (0, 1, None))
-    apart = ((early.amplitudes - late.amplitudes) / np.sqrt(early.sd**2 + late.sd**2))[-width:]
-    strength = (whole.amplitudes / whole.sd)[-width:]
-    return bool((apart**2).mean() < 9.0 or (apart**2).sum() < 0.1 * (strength**2).sum())
+    columns = _joined(choices)
+    early = fits.fit(columns, half=0)
+    late = fits.fit(columns, half=1)
+    both = fits.fit(columns)
+    last = slice(-choices[-1].columns.shape[1], None)
+    difference_sds = (early.amplitudes - late.amplitudes) / np.sqrt(early.sd**2 + late.sd**2)
+    squared_difference = difference_sds[last] ** 2
+    squared_amplitude = (both.amplitudes / both.sd)[last] ** 2
+    return bool(
+        squared_difference.mean() < 9.0 or squared_difference.sum() < 0.1 * squared_amplitude.sum()
+    )
 
 
 def _proposal_of(
     blocks: BlockMeans,
     problem: LinearisedProblem,
     fits: BlockFits,
-    plain: BlockFit,
+    without_formula: BlockFit,
     choices: Sequence[FormulaChoice],
 ) -> Proposal:
     """Return the chosen formulas as effects with their amplitudes, fitted together."""
-    terms = []
+    shapes = []
     for choice in choices:
-        terms += _shapes(fits, choices, choice)
-    terms = terms[:MOST_TERMS]
-    columns = np.concatenate([column for column, _, _ in terms], axis=1)
+        shapes += _shapes(fits, choices, choice)
+    shapes = shapes[:MOST_TERMS]
+    columns = np.concatenate([shape.columns for shape in shapes], axis=1)
     after = fits.fit(columns)
 
-    # Names that the catalogue has not.
-    taken = {name for _, name in problem.baseline.catalogue.effects(problem.baseline.joint_names)}
+    # Effects, with names that are not in the catalogue.
+    catalogue = problem.baseline.catalogue
+    used_names = {name for _, name in catalogue.effects(problem.baseline.joint_names)}
     families: set[str] = set()
     effects = []
-    for number, (_, text, formula) in enumerate(terms):
+    for number, shape in enumerate(shapes):
         amplitudes = after.amplitudes[number]
-        effects.append(_effect(blocks.sensor, number, text, formula, amplitudes, taken))
-        families |= formula.family
+        effects.append(_effect(blocks.sensor, number, shape, amplitudes, used_names))
+        families |= shape.formula.family
 
     # Formulas of the same evidence, of which these are the simplest.
     alike = []
@@ -308,7 +311,7 @@ def _proposal_of(
         rms_of_terms.append(float(np.sqrt((rms[k] ** 2 * amplitudes**2).sum())))
 
     # The excess is a sum of squares; its reduction as a root mean square.
-    share = share_removed(plain, after)
+    share = share_removed(without_formula, after)
     return Proposal(
         blocks.sensor,
         tuple(effects),
@@ -317,38 +320,50 @@ def _proposal_of(
         frozenset(families),
         tuple(axes),
         share,
-        share_interval(plain, after, np.random.default_rng(1)),
+        share_interval(without_formula, after, np.random.default_rng(1)),
         1.0 - float(np.sqrt(max(1.0 - share, 0.0))),
         choices[0].p_value,
         tuple(alike),
-        _nearest(fits, plain, problem),
+        _nearest(fits, without_formula, problem),
         _motion(effects),
         tuple(rms_of_terms),
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """One combination of the columns of a formula, with one amplitude on each axis."""
+
+    columns: np.ndarray
+    """Means over the blocks, shape (b, 1, 3)."""
+    text: Column
+    """The combination as text."""
+    formula: Formula
+    """The formula of the columns."""
+
+
 def _shapes(
     fits: BlockFits, choices: Sequence[FormulaChoice], choice: FormulaChoice
-) -> list[tuple[np.ndarray, Column, Formula]]:
+) -> list[_Shape]:
     """
-    Return (column means (b, 1, 3), text or three texts, Formula) of shapes.
+    Return the one or two shapes that contain most of the amplitudes of a choice.
 
-    They are the one or two shapes that hold a choice's amplitudes.
+    The amplitudes are fitted together with the other `choices`.
     """
     formula = choice.formula
     columns = choice.columns
     if len(formula.columns) == 1:
-        return [(columns, formula.columns[0], formula)]
+        return [_Shape(columns, formula.columns[0], formula)]
 
     # Amplitudes (k columns, 3 axes) in units of output: A = U S V'. A column of U is a combination
     # of columns that all axes have in common, with the amplitudes S V'.
     first = sum(other.columns.shape[1] for other in choices[: choices.index(choice)])
     amplitudes = fits.fit(_joined(choices)).amplitudes[first : first + columns.shape[1]]
     scale = np.sqrt((columns**2).mean(axis=(0, 2)))
-    left, sizes, _ = np.linalg.svd(amplitudes * scale[:, None])
-    count = 1 if sizes[0] ** 2 > ONE_SHAPE * (sizes**2).sum() else 2
+    combinations, sizes, _ = np.linalg.svd(amplitudes * scale[:, None])
+    n_shapes = 1 if sizes[0] ** 2 > ONE_SHAPE * (sizes**2).sum() else 2
     shapes = []
-    for weights in (left[:, :count] / scale[:, None]).T:
+    for weights in (combinations[:, :n_shapes] / scale[:, None]).T:
         # Rounded as the text has them, so that the text reproduces the fit.
         weights = weights / weights[np.argmax(np.abs(weights))]
         if formula.phased:
@@ -360,7 +375,8 @@ def _shapes(
             rounded = np.array([float(f'{weight:.4g}') for weight in weights])
             weights = np.where(output > 0.03 * np.max(output), rounded, 0.0)
             text = _summed(formula.columns, weights)
-        shapes.append((np.einsum('bka,k->ba', columns, weights)[:, None], text, formula))
+        column = np.einsum('bka,k->ba', columns, weights)
+        shapes.append(_Shape(column[:, None], text, formula))
     return shapes
 
 
@@ -373,7 +389,7 @@ def _summed(columns: Sequence[Column], weights: Sequence[float] | np.ndarray) ->
 
 
 def _weighted_sum(columns: Sequence[Any], weights: Sequence[float] | np.ndarray) -> str:
-    """Return the text of a weighted sum of texts; terms of weight zero are left out."""
+    """Return the text of a weighted sum of texts, without terms of weight zero."""
     terms = []
     for column, weight in zip(columns, weights):
         if weight:
@@ -384,24 +400,29 @@ def _weighted_sum(columns: Sequence[Any], weights: Sequence[float] | np.ndarray)
 def _effect(
     sensor: str,
     number: int,
-    text: Column,
-    formula: Formula,
-    values: np.ndarray,
-    taken: Collection[str],
+    shape: _Shape,
+    amplitudes: np.ndarray,
+    used_names: Collection[str],
 ) -> Effect:
-    unit = formula.unit('m/s^2' if sensor == SENSORS[0] else 'rad/s')
-    largest = float(np.abs(values).max())
+    """
+    Return a shape as an effect of a sensor, with its amplitudes on the three axes, shape (3,).
+
+    Its name is the one with the place `number` among the unused names of proposed effects.
+    """
+    text = shape.text
+    unit = shape.formula.unit('m/s^2' if sensor == SENSORS[0] else 'rad/s')
+    largest = float(np.abs(amplitudes).max())
     names = (f'{PREFIXES[sensor]}_proposed_{k}' for k in range(1, 100))
-    free = [name for name in names if name not in taken][number]
+    unused_names = [name for name in names if name not in used_names]
     return term(
-        free,
+        unused_names[number],
         sensor=sensor,
         column=text if isinstance(text, str) else list(text),
         unit=unit,
-        tolerance=_digits(0.1 * largest),
+        tolerance=_two_digits(0.1 * largest),
         tolerance_reason='a tenth of the estimate',
-        prior_sd=_digits(10 * largest),
-        largest=_digits(3 * largest),
+        prior_sd=_two_digits(10 * largest),
+        largest=_two_digits(3 * largest),
         text=(
             f'The {sensor} output follows {_joined_text(text)}: a formula that a diagnosis'
             ' proposed, its cause is not known.'
@@ -409,21 +430,25 @@ def _effect(
     )
 
 
-def _digits(value: float) -> float:
+def _two_digits(value: float) -> float:
+    """Return a value rounded to two digits."""
     return float(f'{value:.2g}')
 
 
 def _joined_text(text: Column) -> str:
+    """Return the text of a column; three texts, one for each axis, in brackets."""
     return text if isinstance(text, str) else f'({", ".join(text)})'
 
 
 def _text_of(effect: Effect) -> str:
+    """Return the formula of a proposed effect."""
     assert effect.definition is not None, 'a proposed effect has a formula'
     column = effect.definition['column']
     return _joined_text(column if isinstance(column, str) else tuple(column))
 
 
 def _size(effect: Effect, values: np.ndarray, sd: np.ndarray) -> str:
+    """Return the largest amplitude of an effect with its sd, unit and axis as text."""
     k = int(np.argmax(np.abs(values)))
     factor, unit = for_people(effect.unit_of(k), effect.sensor)
     size = ' ± '.join(with_sd(values[k] * factor, sd[k] * factor))
@@ -431,21 +456,27 @@ def _size(effect: Effect, values: np.ndarray, sd: np.ndarray) -> str:
 
 
 def _motion(effects: Iterable[Effect]) -> str:
+    """Return the text of the first motion of each effect, which would confirm it."""
     first = dict.fromkeys(effect.motion[0] for effect in effects if effect.motion)
     return '; '.join(dict.fromkeys(ALL_MOTIONS[name] for name in first if name in ALL_MOTIONS))
 
 
 def _nearest(
-    fits: BlockFits, plain: BlockFit, problem: LinearisedProblem
+    fits: BlockFits, without_formula: BlockFit, problem: LinearisedProblem
 ) -> tuple[str, float] | None:
-    """Return (effect, share removed) of the best fit in the catalogue."""
+    """
+    Return (effect of the catalogue, share that it removes) of the effect that removes most.
+
+    None if all effects that act on the sensor are in the model.
+    """
     best: tuple[str, float] | None = None
+    acting = np.concatenate(fits.blocks.index)  # parameters that act on the sensor
     for question in problem.questions:
-        if set(question.parameters) <= fits.used or not any(
-            np.isin(question.parameters, index).any() for index in fits.blocks.index
-        ):
+        if set(question.parameters) <= fits.used:
             continue
-        share = share_removed(plain, fits.fit(more=question.parameters))
+        if not np.isin(question.parameters, acting).any():
+            continue
+        share = share_removed(without_formula, fits.fit(more=question.parameters))
         if best is None or share > best[1]:
             best = (question.name, share)
     return best
