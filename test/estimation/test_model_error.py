@@ -16,7 +16,9 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable import accumulator as accumulator_module
 from imu_calibration.references.turntable.accumulator import Accumulator, restrict
 from imu_calibration.references.turntable.collector import from_bytes, to_bytes
-from imu_calibration.references.turntable.estimation.model_error_of_windows import NO_BIAS
+from imu_calibration.references.turntable.estimation.model_error_of_windows import (
+    SHORTEST_BIAS_TIME,
+)
 from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.window_statistics import reduce_windows
@@ -216,7 +218,7 @@ def test_biases_carry_what_goes_with_the_attitude_as_offsets_or_as_a_bias_too_fa
         found.solution.model.slices['accelerometer', 'bias'],
     )
     assert any(
-        process.time < NO_BIAS and process.sd > 2 * noise.offset_sd
+        process.time < SHORTEST_BIAS_TIME and process.sd > 2 * noise.offset_sd
         for process in noise.bias_processes
     )
     error = (found.solution.values[part] - found.truth['accelerometer'].bias) / found.solution.sd[

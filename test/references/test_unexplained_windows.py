@@ -35,7 +35,7 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
         n_within=1,
         sigma=lambda sensor, excess: (20.0, 0.0),
     )
-    rest = unexplained_windows._rest(
+    rest = unexplained_windows._unexplained(
         problem, explained, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1)
     )
     assert rest.significant

@@ -971,7 +971,7 @@ def rest_of(sigma, residual):
     )
     explained.n_means, explained.n_within = 3.0 * count, 0.0
     explained.numbers = {'accelerometer': np.array([3.0 * count, 0.0])}
-    return rests._rest(
+    return rests._unexplained(
         SimpleNamespace(space=space, recording=recording),
         explained,
         'accelerometer',

@@ -1,4 +1,4 @@
-"""Means at rest that depend on the attitude, which the parameters of the model do not explain."""
+"""Dependence of the means at rest on the attitude, beyond the parameters of the model."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def attitude_dependence(
 
     The offsets of windows and the bias processes of `noise` are part of the whitening. They absorb
     the dependence, which a ratio does not notice because it divides S0 and S1 alike. A bias that
-    changes with time is no function of the attitude.
+    changes with time does not depend on the attitude.
 
     Parameters
     ----------
@@ -57,8 +57,9 @@ def attitude_dependence(
     of_force = model.columns_of('accelerometer', Role.LINEAR)
     force = system.means['accelerometer'][:, of_force]
     first, second = PRODUCT_AXES
-    shapes = np.concatenate([force, force[:, first] * force[:, second]], axis=1)
-    candidates = np.einsum('ks,ab->kabs', shapes, np.eye(3)).reshape(len(means), 3, -1)
+    functions = np.concatenate([force, force[:, first] * force[:, second]], axis=1)
+    # Separate amplitudes on each axis.
+    candidates = np.einsum('ks,ab->kabs', functions, np.eye(3)).reshape(len(means), 3, -1)
     equations = np.concatenate([design, candidates, misfit[:, :, None]], axis=2)
 
     # Independent rows of unit variance.
@@ -66,16 +67,16 @@ def attitude_dependence(
     n_design = design.shape[2]
 
     # S0: without the part along the design. S1: also without the attitude.
-    basis = orthonormal_basis(white[:, :n_design])
+    of_design = orthonormal_basis(white[:, :n_design])
     of_both = orthonormal_basis(white[:, :-1])
     residual = white[:, -1]
-    before = float(residual @ residual - np.sum((basis.T @ residual) ** 2))
-    after = float(residual @ residual - np.sum((of_both.T @ residual) ** 2))
-    freedom = len(residual) - basis.shape[1]
-    spare = len(residual) - of_both.shape[1]
-    n_added = freedom - spare
-    if n_added == 0 or spare < MIN_SPARE or after <= 0:
+    squares_0 = float(residual @ residual - np.sum((of_design.T @ residual) ** 2))
+    squares_1 = float(residual @ residual - np.sum((of_both.T @ residual) ** 2))
+    freedom_0 = len(residual) - of_design.shape[1]
+    freedom_1 = len(residual) - of_both.shape[1]
+    n_added = freedom_0 - freedom_1
+    if n_added == 0 or freedom_1 < MIN_SPARE or squares_1 <= 0:
         return None
-    ratio = (before / freedom) / (after / spare)
-    fall = ((before - after) / n_added) / (after / spare)
-    return AttitudeDependence(ratio, float(f_sf(fall, n_added, spare)))
+    ratio = (squares_0 / freedom_0) / (squares_1 / freedom_1)
+    f_value = ((squares_0 - squares_1) / n_added) / (squares_1 / freedom_1)
+    return AttitudeDependence(ratio, float(f_sf(f_value, n_added, freedom_1)))

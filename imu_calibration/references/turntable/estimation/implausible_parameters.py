@@ -8,8 +8,6 @@ from imu_calibration.references.turntable.noise_model import NoiseModel
 
 MAX_PRIOR_SDS = 3.0
 """Prior standard deviations beyond which an entry of a matrix needs a reason that is not misfit."""
-
-
 REST_NOISE_MARGIN = 1.1
 """
 Residuals up to this times the variance at rest are noise: the rest used for its estimate may have
@@ -26,13 +24,13 @@ def implausible_parameters(
     free: np.ndarray,
 ) -> np.ndarray:
     """
-    Return a mask of the parameters whose information may be an artefact of misfit.
+    Return a mask of the parameters of which the estimate may be an artefact of misfit.
 
-    The value exceeds the range of known instruments, and it is no larger than the shift that all
-    excess misfit of moving windows causes along the parameter. Example: an accelerometer's scale
-    along an axis without gravity, determined only through arms and wrong angles. A gyroscope at the
-    wrong full-scale setting has a value larger than its misfit explains, and is kept. All
-    parameters of an effect are fixed, of a matrix single entries.
+    Its distance from the prior exceeds the range of known instruments, and is no larger than the
+    shift that all excess misfit of moving windows causes along the parameter. Example: an
+    accelerometer's scale along an axis without gravity, determined only through arms and wrong
+    angles. A gyroscope at the wrong full-scale setting has a value larger than its misfit explains,
+    and is kept. All parameters of an effect are fixed, of a matrix single entries.
 
     Parameters
     ----------
@@ -49,7 +47,7 @@ def implausible_parameters(
         sensor: _shift_of_misfit(system, sensor, values, noises[sensor])
         for sensor in system.sensors
     }
-    found = np.zeros(len(values), bool)
+    mask = np.zeros(len(values), bool)
     for effect in system.model.effects:
         part = system.model.slices[effect.key]
         limit = _plausible_limit(effect)
@@ -62,10 +60,10 @@ def implausible_parameters(
         largest_shift = max(shift_of_misfit[sensor] for sensor in sensors)
         implausible = free[part] & (size > limit) & (size < sd[part] * largest_shift)
         if effect.role is Role.LINEAR:
-            found[part] = implausible
+            mask[part] = implausible
         else:
-            found[part] = free[part] & implausible.any()
-    return found
+            mask[part] = free[part] & implausible.any()
+    return mask
 
 
 def _plausible_limit(effect: Effect) -> float:
@@ -79,10 +77,13 @@ def _shift_of_misfit(
     system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel
 ) -> float:
     """
-    Return the largest shift of a parameter by excess misfit, in sds of noise.
+    Return the largest shift of a parameter by the excess misfit of moving windows, in its sds.
 
-    It is the shift of a parameter of the worst axis by all excess misfit of moving windows: the
-    root of the excess squares in units of the variance with which they were weighted.
+    With the squares S of the centred rows of a kind on n degrees of freedom, the noise v at rest
+    and the variance w with which the rows were weighted, of the axis with the largest sum::
+
+        shift^2 = sum over kinds of max(S - n v, 0) / w
+
     """
     noise_at_rest = np.zeros(3)
     if any(row.kind == 'static' for row in system.accumulator.rows):

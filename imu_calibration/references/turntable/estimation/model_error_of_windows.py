@@ -18,17 +18,15 @@ COMMON_MEAN_FACTOR = 1.5
 Factor on the scatter of means in the variance of an accelerometer's bias, which absorbs an error
 with a mean as large as its scatter.
 """
-
-
-NO_BIAS = 30.0
-"""Biases wander with longer correlation times than this, s."""
+SHORTEST_BIAS_TIME = 30.0
+"""Correlation time below which a bias process is no wander of a bias but model error, s."""
 
 
 def model_error(
     system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray
 ) -> ModelError:
     """
-    Return the model error from the scatter of parameters between blocks, beyond noise.
+    Return the model error from the scatter of parameters between blocks of windows, beyond noise.
 
     Parameters
     ----------
@@ -44,53 +42,50 @@ def model_error(
     if len(system.accumulator.blocks) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
     waves = waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free=free)
-    found, misfits = errors_of_waves(waves, system.model)
+    error, misfits = errors_of_waves(waves, system.model)
     if 'accelerometer' in misfits:
         # An error that depends on the attitude has a mean as large as its scatter, absorbed by the
-        # bias
-        offset = system.model.part('accelerometer', Role.OFFSET)
-        found.scatter_variance[offset] += COMMON_MEAN_FACTOR * _scatter_of_means(
-            noises['accelerometer']
-        )
-    return found
+        # bias.
+        bias = system.model.part('accelerometer', Role.OFFSET)
+        scatter = _scatter_of_means(noises['accelerometer'])
+        error.scatter_variance[bias] += COMMON_MEAN_FACTOR * scatter
+    return error
 
 
 def _scatter_of_means(noise: NoiseModel) -> float:
     """
-    Return the variance of the means between windows.
-
-    From offsets and from bias processes too fast for a bias.
+    Return the variance of the means between windows, by offsets and by fast bias processes.
     """
-    return noise.offset_sd**2 + sum(
-        process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS
-    )
+    processes = [p for p in noise.bias_processes if p.time < SHORTEST_BIAS_TIME]
+    return noise.offset_sd**2 + sum(process.sd**2 for process in processes)
 
 
 def _block_scores(
     system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the information of each block of windows.
+    Return (information, gradient) of each of k blocks of windows at the values.
 
-    Shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params).
+    With the whitened design A and residual r of a block they are A'A, shape (k, n_params,
+    n_params), and A'r, shape (k, n_params).
     """
     blocks = system.accumulator.blocks
     information = np.zeros((len(blocks), len(values), len(values)))
     gradient = np.zeros((len(blocks), len(values)))
-    block = system.accumulator.block_of(system.session, system.time)
+    block_of_window = system.accumulator.block_of(system.session, system.time)
     for sensor in system.sensors:
-        own = coefficients(system.model, sensor, values)
+        of_axes = coefficients(system.model, sensor, values)
         slope = coefficient_jacobian(system.model, sensor, values)
         noise = noises[sensor]
         white = system.whitened_means(sensor, noise)
-        for number, part in enumerate(blocks):
-            weighed = list(system.weighed_rows(sensor, noise, part))
+        for number, block in enumerate(blocks):
+            weighed = list(system.weighed_rows(sensor, noise, block))
             for axis in range(3):
                 # The means of the block's windows, and their centred rows.
-                at = system.columns_and(sensor, axis)
-                centred = [rows[:, at] * weight[axis] for rows, weight in weighed]
-                rows = np.concatenate([white[block == number, axis], *centred])
+                places = system.columns_and(sensor, axis)
+                centred = [rows[:, places] * weight[axis] for rows, weight in weighed]
+                rows = np.concatenate([white[block_of_window == number, axis], *centred])
                 design = rows[:, :-1] @ slope[:, axis]
                 information[number] += design.T @ design
-                gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ own[:, axis])
+                gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ of_axes[:, axis])
     return information, gradient

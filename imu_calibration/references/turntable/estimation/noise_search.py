@@ -1,8 +1,10 @@
 """
 Search for the noise of mean rows: offsets of windows, a bias process, steps between recordings.
 
-`estimate_offsets` averages over the likelihood; `BiasProcessSearch` finds the best noise for a
-choice of parameters.
+A shape of the noise (`NoiseShape`) is the sd of the offsets and that of the bias process, in units
+of the typical noise of a window mean, and the correlation time of the process in s.
+`estimate_offsets` averages over the likelihood of shapes; `BiasProcessSearch` finds the best shape
+for a choice of parameters. A loss is minus twice a log likelihood.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,11 +20,13 @@ from imu_calibration.estimation.noise_likelihood import (
 from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.sensor_noise import dof_factor
 
-TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
+TYPICAL_TIME = 100.0
 """
-Correlation times of MEMS biases: around 100 s, log-normal; a short session does not determine them
-(field catalogue, section 6).
+Median of the log-normal prior of the correlation times of MEMS biases, s; a short session does not
+determine them (field catalogue, section 6).
 """
+TIME_SPREAD = 0.8
+"""Prior sd of the logarithm of the correlation time."""
 CLEAR_GAIN = 30.0
 """
 Fall of minus twice the log likelihood beyond which a bias process is significant and its
@@ -30,22 +34,22 @@ maximum-likelihood estimate is used.
 """
 SESSION_GAIN = 6.6
 """
-The same for biases that differ between recordings: chi-square, one degree of freedom on its
-boundary, 0.5 %.
+Fall of minus twice the log likelihood beyond which the biases of recordings differ: chi-square, one
+degree of freedom on its boundary, 0.5 %.
 """
 OFFSET_GRID = np.array([0.0, 0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0])
+"""Sds of offsets, in units of the typical noise of a window mean."""
 BIAS_GRID = np.array([0.15, 0.25, 0.4, 0.63, 1.0, 1.6, 2.5, 4.0, 6.3, 10.0, 25.0, 60.0])
+"""Sds of a bias process, in the same units."""
 TIME_GRID = np.array([40.0, 100.0, 250.0])
-"""
-Offset and bias process in units of the typical noise of a window mean; correlation times in s.
-"""
+"""Correlation times, s."""
 LIKELY_SPAN = 20.0
-"""Offsets whose cost exceeds the least one by more than this are not tried with a process."""
+"""Largest cost above the least one of an offset that is tried with a process."""
 LOG_TIME_RANGE = (1.6, 8.0)
 """Range of the logarithm of the correlation time, s."""
 SESSION_GRID = 4.0 ** np.arange(-3, 8)
 """
-Steps from recording to recording in the same units; the best of them is refined by factors of two
+Sds of the bias between recordings in the same units; the best of them is refined by factors of two
 and of the root of two.
 """
 
@@ -70,19 +74,21 @@ def estimate_offsets(rows: Rows) -> dict[str, Any]:
     """
     likelihood = NoiseLikelihood(rows)
     n_sessions = len(rows.sessions)
-    search = _Search(likelihood)
-    trials, costs = search.grid(0.0)
+    search = _ShapeSearch(likelihood)
+    shapes, costs = search.grid(0.0)
 
     # A bias for each recording, if the likelihood gains enough over the best fit without.
     session = 0.0
     if n_sessions > 1:
-        likeliest = search.best_session(trials[np.argmin(costs)])
+        likeliest = search.best_session(shapes[np.argmin(costs)])
         if likeliest > 0:
-            with_biases = search.grid(likeliest)
-            if costs.min() - with_biases[1].min() > SESSION_GAIN:
-                session, (trials, costs) = likeliest, with_biases
+            shapes_with_biases, costs_with_biases = search.grid(likeliest)
+            if costs.min() - costs_with_biases.min() > SESSION_GAIN:
+                session = likeliest
+                shapes = shapes_with_biases
+                costs = costs_with_biases
 
-    shape = search.conclusion(trials, costs, session)
+    shape = search.conclusion(shapes, costs, session)
     typical = likelihood.typical
     # The few recordings widen the variance that enters standard deviations.
     dof = 3 * (n_sessions - 1)
@@ -95,15 +101,17 @@ def estimate_offsets(rows: Rows) -> dict[str, Any]:
     }
 
 
-class _Search:
+class _ShapeSearch:
     """
-    The likelihood times the prior of correlation times, on a grid of shapes.
+    Search for the shape of the noise by its likelihood and the prior of correlation times.
 
-    For a given sd between recordings.
+    In the methods `session` is the sd of the bias between recordings, in units of the typical noise
+    of a window mean.
     """
 
     def __init__(self, likelihood: NoiseLikelihood):
         self.likelihood = likelihood
+        # Bias processes only with enough windows.
         self.biases = BIAS_GRID if likelihood.many else BIAS_GRID[:0]
 
     def cost(self, shape: Sequence[float], session: float = 0.0) -> float:
@@ -114,26 +122,27 @@ class _Search:
 
     def grid(self, session: float) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the shapes tried, shape (k, 3), and their costs, shape (k,).
+        Return the tried shapes of the noise, shape (k, 3), and their costs, shape (k,).
 
-        Shapes without bias process are first.
+        The shapes without a bias process are first, as many as `OFFSET_GRID` has.
         """
-        trials = [NoiseShape(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID]
-        without_process = np.array([self.cost(trial, session) for trial in trials])
+        shapes = [NoiseShape(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID]
+        without_process = np.array([self.cost(shape, session) for shape in shapes])
         # Offsets that are much too large without a process are so with one.
         likely = OFFSET_GRID[without_process < without_process.min() + LIKELY_SPAN]
         offsets = np.unique(np.concatenate([[0.0], likely]))
         for bias in self.biases:
             for time in TIME_GRID:
-                trials += [NoiseShape(offset, bias, time) for offset in offsets]
-        with_process = [self.cost(trial, session) for trial in trials[len(OFFSET_GRID) :]]
-        return np.array(trials), np.concatenate([without_process, with_process])
+                shapes += [NoiseShape(offset, bias, time) for offset in offsets]
+        with_process = [self.cost(shape, session) for shape in shapes[len(OFFSET_GRID) :]]
+        return np.array(shapes), np.concatenate([without_process, with_process])
 
     def best_session(self, shape: Sequence[float]) -> float:
         """
-        Return the likeliest sd between recordings, over three choices of the noise.
+        Return the likeliest sd of the bias between recordings.
 
-        The choices are the best offsets and process, the offsets without process, and neither.
+        For each sd the noise within recordings is the likeliest of a few: the best `shape` without
+        such biases, its offsets only, none, and some bias processes only.
         """
         offset, _, _ = shape
         shapes = [
@@ -144,6 +153,7 @@ class _Search:
         ]
 
         def cost(session: float) -> float:
+            """Return the least cost over the shapes."""
             return min(self.cost(candidate, session) for candidate in shapes)
 
         best = min(SESSION_GRID, key=cost)
@@ -151,23 +161,30 @@ class _Search:
             best = min((best, best / factor, best * factor), key=cost)
         return float(best)
 
-    def conclusion(self, trials: np.ndarray, costs: np.ndarray, session: float) -> NoiseShape:
-        """Return the best shape where its bias process is significant, otherwise the mean one."""
+    def conclusion(self, shapes: np.ndarray, costs: np.ndarray, session: float) -> NoiseShape:
+        """
+        Return the best shape where its bias process is significant, otherwise the posterior mean.
+
+        The shapes and costs are those of a `grid`. With known bias processes the mean is over
+        shapes without a further one.
+        """
         best = int(np.argmin(costs))
-        if costs[: len(OFFSET_GRID)].min() - costs[best] > CLEAR_GAIN:
-            return self._refined(trials[best], session)
+        n_without_process = len(OFFSET_GRID)
+        if costs[:n_without_process].min() - costs[best] > CLEAR_GAIN:
+            return self._refined(shapes[best], session)
         if self.likelihood.known:
-            trials = trials[: len(OFFSET_GRID)]
-            costs = costs[: len(OFFSET_GRID)]
-        return _posterior_mean(trials, costs - costs.min())
+            shapes = shapes[:n_without_process]
+            costs = costs[:n_without_process]
+        return _posterior_mean(shapes, costs - costs.min())
 
     def _refined(self, start: np.ndarray, session: float) -> NoiseShape:
-        """Return the best values near a grid point."""
+        """Return the shape of least cost near a shape of the grid."""
         from scipy.optimize import minimize  # here, because its import is slow
 
         unit = self.likelihood.typical
 
         def shape(logs: np.ndarray) -> NoiseShape:
+            """Return the shape of the logarithms of its sds, SI, and of its time."""
             offset = np.exp(logs[0])
             bias = np.exp(logs[1])
             time = np.exp(np.clip(logs[2], *LOG_TIME_RANGE))
@@ -183,42 +200,50 @@ class _Search:
         return shape(found.x)
 
 
-def _posterior_mean(trials: np.ndarray, costs: np.ndarray) -> NoiseShape:
+def _posterior_mean(shapes: np.ndarray, costs: np.ndarray) -> NoiseShape:
     """
-    Return averages over the likelihood of the shapes of the noise.
+    Return the average over the likelihood of the shapes of the noise.
 
-    They are the roots of the mean variances, and the mean logarithm of the correlation time.
+    The sds are the roots of the mean variances. The correlation time is the mean of its logarithm,
+    weighted by the variance of the bias process too.
+
+    Parameters
+    ----------
+    shapes : ndarray, shape (k, 3)
+        (offset, bias, time).
+    costs : ndarray, shape (k,)
+        Minus twice the log likelihood, 0 for the best.
+
     """
-    weight = np.exp(-0.5 * costs) * np.where(trials[:, 1] == 0, 1.0, 1.0 / len(TIME_GRID))
+    # Each sd of a process is on the grid once per correlation time.
+    multiplicity = np.where(shapes[:, 1] == 0, 1.0, 1.0 / len(TIME_GRID))
+    weight = np.exp(-0.5 * costs) * multiplicity
     weight /= weight.sum()
-    offset, bias = np.sqrt(weight @ trials[:, :2] ** 2)
-    moving = weight * trials[:, 1] ** 2
-    if moving.sum() <= 0:
+    offset, bias = np.sqrt(weight @ shapes[:, :2] ** 2)
+    of_process = weight * shapes[:, 1] ** 2
+    if of_process.sum() <= 0:
         return NoiseShape(float(offset), 0.0, TYPICAL_TIME)
-    time = np.exp(moving @ np.log(trials[:, 2]) / moving.sum())
+    time = np.exp(of_process @ np.log(shapes[:, 2]) / of_process.sum())
     return NoiseShape(float(offset), float(bias), float(time))
 
 
 CORRELATION_TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0, FLICKER_MARK)
 """Correlation times that are tried, s, and flicker; that of the natural process first."""
 BIAS_LOG_SD = 0.8
-"""
-Prior sd of the logarithm of a bias process's sd over the natural one; much larger drifts are hardly
-a bias process.
-"""
+"""Prior sd of the logarithm of the sd of a bias process, over that of the natural process."""
 OFFSET_PRICE = 10.0
 """
-Price of offsets of windows: they are no noise of a sensor, and flicker scatters means of windows
-beyond a wander of 15 s as they do.
+Minus twice the log prior of offsets of windows: no sensor has such noise, and flicker noise has the
+same effect on the means beyond a wander of 15 s.
 """
 OFFSET_SHARES = (0.0, 0.25, 0.5, 1.0)
 """Shares of the offsets without a larger bias process that are tried with one."""
 POLISH_FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4)
-"""Factors of a standard deviation that refine it."""
+"""Factors by which a standard deviation is refined."""
 SD_RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
 """
-Standard deviations that are tried, in units of the typical noise of a window mean; between steps of
-two the likelihoods of other times lie.
+Standard deviations that are tried, in units of the typical noise of a window mean; steps of a
+factor of two would be coarser than the differences between correlation times.
 """
 
 
@@ -230,9 +255,9 @@ class BiasProcessSearch:
     ----------
     likelihood : NoiseLikelihood
     least : float
-        Least standard deviation of the bias process.
+        Least standard deviation of the bias process, SI.
     usual : float
-        The one up to which a larger one is as likely; the least one where that is larger.
+        Standard deviation up to which all are equally likely, SI; at least `least`.
 
     """
 
@@ -242,13 +267,14 @@ class BiasProcessSearch:
         self.usual = max(least, usual) / likelihood.typical
 
     def best(self, used: Sequence[int]) -> tuple[NoiseShape, float]:
-        """Return (shape, loss) of the best noise given the parameters `used`."""
+        """Return (shape, loss with the price) of the best noise given the parameters `used`."""
 
         def loss(shape: NoiseShape) -> float:
+            """Return the loss of a shape with its price."""
             return self.likelihood.loss(shape, used) + self.price(shape.offset, shape.bias)
 
-        # Offsets with the least bias process; then, for each correlation time, a bias process
-        # with no offsets and with shares of these.
+        # First offsets with the least bias process; then, for each correlation time, the best bias
+        # process without offsets, with shares of the first offsets.
         first_time = CORRELATION_TIMES[0]
         offset = _descend(lambda x: loss(NoiseShape(x, self.least, first_time)), SD_RATIOS)
         shapes = [NoiseShape(offset, self.least, first_time)]
@@ -263,10 +289,9 @@ class BiasProcessSearch:
 
     def price(self, offset: float, bias: float) -> float:
         """
-        Return minus twice the log prior of offsets and of the sd of a bias.
+        Return minus twice the log prior of the sds of offsets and of a bias process.
 
-        The prior of offsets is relative to none, and that of the sd of a bias is relative to the
-        usual one.
+        It is relative to no offsets and to the usual sd of the process.
         """
         price = OFFSET_PRICE * (offset > 0)
         if self.least:
@@ -275,23 +300,25 @@ class BiasProcessSearch:
 
     def of_middle_axis(self, shape: NoiseShape, used: Sequence[int]) -> float:
         """
-        Return the median over the axes of the likeliest sd of the bias process of each.
+        Return the median over the axes of the likeliest sd of the bias process of each axis, SI.
 
-        With `shape` for the other axes.
+        Offsets and correlation time are those of `shape`, and the other axes have its noise.
         """
-        likeliest = []
+        sds = []
         for axis in range(3):
-            own = self.likelihood.of_axis(axis, shape)
-            offset = shape.offset * self.likelihood.typical / own.typical
-            ratio = _descend(lambda x: own.loss(NoiseShape(offset, x, shape.time), used), SD_RATIOS)
-            likeliest.append(own.typical * ratio)
-        return float(np.median(likeliest))
+            of_axis = self.likelihood.of_axis(axis, shape)
+            offset = shape.offset * self.likelihood.typical / of_axis.typical
+            ratio = _descend(
+                lambda x: of_axis.loss(NoiseShape(offset, x, shape.time), used), SD_RATIOS
+            )
+            sds.append(of_axis.typical * ratio)
+        return float(np.median(sds))
 
     def polished(self, shape: NoiseShape, used: Sequence[int]) -> dict[str, Any]:
         """
-        Return the fields of `NoiseModel` that concern offsets.
+        Return the fields of `NoiseModel` that concern offsets, by a shape with refined sds.
 
-        The standard deviations of a shape are refined.
+        First the sd of the offsets is refined, then that of the bias process.
         """
         _, bias, time = shape
         offset = _polish(
@@ -309,13 +336,14 @@ class BiasProcessSearch:
 
 
 def _nearest_ratio(ratio: float) -> float:
-    """Return the tried ratio that is nearest, so that shapes are met again."""
-    return min(SD_RATIOS, key=lambda known: abs(known - ratio))
+    """Return the nearest of the `SD_RATIOS`: the likelihood keeps the losses of known shapes."""
+    return min(SD_RATIOS, key=lambda tried: abs(tried - ratio))
 
 
 def _descend(loss: Callable[[float], float], grid: Iterable[float]) -> float:
-    """Return the grid value of least loss, going up until the loss has risen twice."""
-    values, losses = [], []
+    """Return the value of a rising grid with the least loss, up to two rises of the loss."""
+    values = []
+    losses = []
     for value in grid:
         values.append(value)
         losses.append(loss(value))

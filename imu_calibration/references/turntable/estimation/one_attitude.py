@@ -1,4 +1,4 @@
-"""Whether all specific forces of a recording have one direction, and what is not known then."""
+"""Recordings of which all specific forces have one direction, and the parameters to hold then."""
 
 from collections.abc import Iterable
 
@@ -29,28 +29,27 @@ def one_attitude(accumulators: Iterable[Accumulator], model: SensorModel) -> boo
     model : SensorModel
 
     """
-    part = model.columns_of('accelerometer', Role.LINEAR)
-    moment = np.zeros((3, 3))
+    of_force = model.columns_of('accelerometer', Role.LINEAR)
+    moment = np.zeros((3, 3))  # sum of f f'
     for accumulator in accumulators:
         for row in accumulator.rows:
             if 'accelerometer' in row.sensors:
-                force = row.sensors['accelerometer'].mean[part]
+                force = row.sensors['accelerometer'].mean[of_force]
                 moment += row.count * np.outer(force, force)
         for (sensor, _), factor in accumulator.within.items():
             if sensor == 'accelerometer':
-                moment += factor[:, part].T @ factor[:, part]
-    sizes = np.linalg.eigvalsh(moment)
-    return bool(sizes[-1] > 0 and sizes[-2] < ONE_ATTITUDE**2 * sizes[-1])
+                moment += factor[:, of_force].T @ factor[:, of_force]
+    eigenvalues = np.linalg.eigvalsh(moment)
+    return bool(eigenvalues[-1] > 0 and eigenvalues[-2] < ONE_ATTITUDE**2 * eigenvalues[-1])
 
 
 def not_separable(accumulator: Accumulator, model: SensorModel) -> np.ndarray:
     """
-    Return a mask of the parameters that a single attitude does not separate.
+    Return a mask of the parameters that windows of a single attitude do not separate, (n_params,).
 
-    Its windows do not separate them from bias and common arm. The mask has shape (n_params,).
-
-    The product of the matrix and constant gravity is a bias, and its product with the accelerations
-    at a lever arm is an arm of each axis.
+    With more attitudes it is empty. They are not separable from bias and common arm: the product of
+    the matrix and constant gravity is a bias, and its product with the accelerations at a lever arm
+    is an arm of each axis.
     """
     mask = np.zeros(len(model.param_names), bool)
     if one_attitude([accumulator], model):

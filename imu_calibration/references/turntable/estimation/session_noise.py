@@ -1,4 +1,9 @@
-"""Noise of the rows of a session, at rest and in the slow and fast parts of moving windows."""
+"""
+Noise of the rows of a session, at rest and in the slow and fast parts of moving windows.
+
+The slow part of the centred rows of a kind of window are the means of short pieces, the fast part
+the deviations of the samples from these.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +24,12 @@ from imu_calibration.references.turntable.window_statistics import WindowStatist
 
 MIN_VARIANCE_RATIO = 2.0
 """
-The parts have separate weights above this ratio of their residual variances, fast over slow; below
-it all samples count alike.
+Residual variance of the fast part over that of the slow part above which they have separate
+weights; below it all samples have the same weight.
 """
 CAUTIOUS_SDS = 2.0
 """
-The residual variance of the slow part is raised by this many of its standard deviations, in
-comparison and use.
+Standard deviations by which the residual variance of a slow part with a separate weight is raised.
 """
 SURE_SDS = 4.0
 """Standard deviations by which a slow part must exceed that of white noise to show structure."""
@@ -34,7 +38,7 @@ DESIGN_EIGENVALUE_SHARE = 1e-6
 Directions of a scaled design with less than this share of the largest eigenvalue do not count.
 """
 RESIDUAL_EIGENVALUE_SHARE = 1e-9
-"""The same for the least residual."""
+"""As `DESIGN_EIGENVALUE_SHARE`, for the residual of the best fit."""
 WEIGHTLESS = 1e6
 """Factor on a variance that makes the weight negligible."""
 
@@ -42,9 +46,9 @@ WEIGHTLESS = 1e6
 @dataclass(frozen=True, eq=False)
 class BandMisfit:
     """
-    Residual variance per row of the centred rows of one kind of window.
+    Residual variance per row of the centred rows of one kind of window, and of their parts.
 
-    Equal in all parts for white noise.
+    For white noise the three variances are equal.
     """
 
     overall: np.ndarray
@@ -55,19 +59,21 @@ class BandMisfit:
     none.
     """
     fast: np.ndarray
-    """Of the other rows, shape (3,)."""
+    """Of the fast part, shape (3,)."""
     apart: np.ndarray
-    """Whether slow and fast part have separate weights, shape (3,)."""
+    """Mask of the axes of which slow and fast part have separate weights, shape (3,)."""
     dof_slow: float = 0.0
     """Degrees of freedom of the slow part."""
 
     def slow_over_fast(self, inflation: np.ndarray) -> float:
         """
-        Return the least plausible ratio of slow over fast residual, 1 at most for white noise.
+        Return the residual variance of the slow part over the largest one by chance.
 
-        It is the ratio of the variances, of the axis with the largest one. A residual with
-        structure is correlated in time, so that its slow part exceeds that of white noise; louder
-        white noise raises both parts alike.
+        That is the residual variance of the fast part, raised by `SURE_SDS` standard deviations for
+        the few degrees of freedom of the slow part. The ratio is that of the axis with the largest
+        one, at most 1 for white noise. A residual with structure is correlated in time, so that its
+        slow part exceeds that of white noise; louder white noise raises both parts by the same
+        factor.
 
         Parameters
         ----------
@@ -96,13 +102,13 @@ class BandMisfit:
         return MovingFactors(factor, np.where(self.apart, slow_factor, factor))
 
     def without_fast(self) -> 'BandMisfit':
-        """Return the same with a variance of the fast part so large that its weight is zero."""
+        """Return the misfit with a variance of the fast part so large that its weight is zero."""
         return replace(self, fast=np.where(self.apart, WEIGHTLESS * self.fast, self.fast))
 
     @property
     def noise(self) -> np.ndarray:
         """
-        Return the variance that replaces the one of white noise in the absence of rest, shape (3,).
+        Variance of white noise for a session without rest, shape (3,).
         """
         return np.where(self.apart, self.slow, self.overall)
 

@@ -16,13 +16,14 @@ EXCLUDED_MEAN_SD_FACTOR = 1e3
 
 
 class WindowMeans:
-    """Windows in order of time, of which the means are rows of their own."""
+    """Windows in order of time, each with a row of least squares for its mean."""
 
     windows: Sequence[WindowStatistics]
+    """The windows, k of them."""
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Sensors with rows: those with readings."""
+        """Sensors with readings."""
         return tuple(self.windows[0].sensors) if self.windows else SENSORS
 
     @cached_property
@@ -69,8 +70,8 @@ class WindowMeans:
         """
         Return the variance of the means, very large for excluded windows, shape (k, 3).
 
-        Relative to the bias in the middle of each window, or of the noise within windows and of the
-        reference only.
+        With `beside_bias` it is the variance relative to the bias in the middle of each window,
+        otherwise only that of the noise within windows and of the reference.
         """
         of_windows = noise.variance_beside_bias if beside_bias else noise.mean_variance
         variance = of_windows(self.kind, self.count, self.duration, keys=self.keys)
@@ -84,9 +85,10 @@ class WindowMeans:
         self, equations: np.ndarray, noise: NoiseModel, products: np.ndarray | None = None
     ) -> Rows:
         """
-        Return equations of the means, shape (k, 3, q), with their errors.
+        Return equations of the means, shape (k, 3, q), with their errors by a noise model.
 
-        Offsets of the windows are a part of the errors.
+        Offsets of the windows are a part of the errors. `products` are those of further rows
+        (`Rows.products`).
         """
         return Rows(
             equations=equations,
@@ -100,7 +102,7 @@ class WindowMeans:
         )
 
     def without_offsets(self, rows: Rows, noise: NoiseModel) -> Rows:
-        """Return the rows with errors by the noise within windows and the known processes alone."""
+        """Return the rows with errors by noise within windows and known bias processes only."""
         variance = self.mean_variance(noise, beside_bias=False)
         return replace(rows, variance=variance, processes=noise.known, session_variance=0.0)
 
@@ -109,7 +111,8 @@ def predict_session_offsets(rows: Rows) -> np.ndarray:
     """
     Return the offset of each recording, shape (n_sessions, n_axes).
 
-    The weighted mean of the residuals of its rows, drawn towards zero by their noise.
+    With the whitened ones u and residuals r of the rows of a recording, and the variance s^2 of
+    the offsets, it is the best linear prediction ``u'r / (u'u + 1 / s^2)``.
     """
     ones = np.ones_like(rows.equations[:, :, -1])
     columns = np.stack([ones, rows.equations[:, :, -1]], axis=2)

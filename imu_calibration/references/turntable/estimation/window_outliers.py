@@ -1,4 +1,4 @@
-"""Windows whose means deviate from the other windows of their kind."""
+"""Outliers among the means of windows of the same kind."""
 
 from dataclasses import dataclass
 
@@ -20,8 +20,8 @@ MIN_WINDOW_FREEDOM = 9.0
 """Residual degrees of freedom of the other windows of the kind that the test requires."""
 OUTLIER_CANDIDATES = 8
 """Windows of each kind under test per round, in order of their residual."""
-LEAST_SEEN = 0.05
-"""A window whose error keeps less than this share in the residuals is not tested."""
+LEAST_VISIBLE = 0.05
+"""Least share of the error of a window in the residuals, from which the window is tested."""
 WindowKey = tuple[int, float]
 """Recording, and middle of the window in s."""
 
@@ -30,14 +30,13 @@ def outlier_windows(
     system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
 ) -> dict[str, frozenset[WindowKey]]:
     """
-    Return sensor -> keys of the outlying windows, without those that the noise excludes already.
+    Return sensor -> keys of the outlying windows, except windows that the noise excludes already.
 
-    Mean-shift F test, one kind of window per round (the one with the least probable outlier),
-    because with a bias process one outlier makes its neighbours look inconsistent.
-
-    A separate offset for one window must improve the fit of the other windows significantly (F test
-    with Bonferroni correction). The noise may be overestimated because of that window; the factor
-    is common to all windows and cancels in the ratio.
+    Mean-shift F test: a separate offset for one window must improve the fit of the windows of its
+    kind significantly (with Bonferroni correction). The noise may be overestimated because of that
+    window; the factor is common to all windows and cancels in the ratio. A call returns outliers of
+    one kind of window, the one with the least probable outlier, because with a bias process one
+    outlier makes its neighbours inconsistent.
 
     Parameters
     ----------
@@ -48,32 +47,32 @@ def outlier_windows(
         Sensor -> NoiseModel of the estimate.
 
     """
-    found = {}
+    outliers_of = {}
     for sensor in system.sensors:
         fit = _MeanFit.of(system, sensor, values, noises[sensor])
         excluded = np.array([key in noises[sensor].left_out for key in system.keys])
         of_kinds = []
         for kind in np.unique(system.kind):
             of_kinds.append(_outliers_of_kind(system.kind == kind, excluded, fit))
-        # The kind with the least probable outlier.
-        most = min(of_kinds, key=lambda outliers: outliers.least_p_value)
-        found[sensor] = frozenset(system.keys[window] for window in most.numbers)
-    return found
+        least_probable = min(of_kinds, key=lambda outliers: outliers.least_p_value)
+        outliers_of[sensor] = frozenset(system.keys[window] for window in least_probable.numbers)
+    return outliers_of
 
 
 def _outliers_of_kind(of_kind: np.ndarray, excluded: np.ndarray, fit: '_MeanFit') -> Outliers:
     """Return the outliers among the windows of a kind (mask) that are not `excluded` (mask)."""
-    count = int(of_kind.sum())
-    kept = np.flatnonzero(of_kind & ~excluded)
-    n_allowed = max(1, int(MAX_WINDOW_OUTLIERS * count)) - (count - len(kept))
+    n_windows = int(of_kind.sum())
+    included = np.flatnonzero(of_kind & ~excluded)
+    n_excluded = n_windows - len(included)
+    n_allowed = max(1, int(MAX_WINDOW_OUTLIERS * n_windows)) - n_excluded
     if n_allowed <= 0:
         return Outliers(1.0, ())
 
     # The windows with the largest residuals are tested.
-    squares = (fit.residual[kept] ** 2).sum(axis=1)
-    tested = kept[np.argsort(-squares, kind='stable')][:OUTLIER_CANDIDATES]
-    p_values = {int(window): fit.p_value(window, kept) for window in tested}
-    return find_outliers(p_values, n_tests=len(kept), most=n_allowed)
+    squares = (fit.residual[included] ** 2).sum(axis=1)
+    tested = included[np.argsort(-squares, kind='stable')][:OUTLIER_CANDIDATES]
+    p_values = {int(window): fit.p_value(window, included) for window in tested}
+    return find_outliers(p_values, n_tests=len(included), most=n_allowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +86,13 @@ class _MeanFit:
     covariance: np.ndarray
     """Of the parameters, from the means, the centred rows and the prior, shape (q, q)."""
     whitening: Whitening
+    """Whitening of the means."""
 
     @classmethod
     def of(
         cls, system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel
     ) -> '_MeanFit':
+        """Return the means of a sensor, linearised at the values."""
         rows = system.linearised(sensor, values, noise)
         whitening = rows.whitening()
         white = whitening(rows.equations)
@@ -101,28 +102,28 @@ class _MeanFit:
 
     def p_value(self, window: int, of_kind: np.ndarray) -> float:
         """
-        Return the p-value of a separate offset b for one window.
+        Return the p-value of a separate offset b of the mean of one window.
 
         With the whitened column h of the offset, the design A and the covariance C of the
         parameters, of each axis::
 
-            s = h' h - h' A C A' h            share of h that the parameters do not take up
+            s = h' h - h' A C A' h            part of h that the parameters do not imitate
             b = h' r / s
             r -> r - (h - A C A' h) b
 
-        The test concerns the improvement of the windows `of_kind`.
+        The test concerns the residuals of the windows with the numbers `of_kind`.
         """
         column = np.zeros(self.residual.shape + (1,))
         column[window] = 1.0
         column = self.whitening(column)[:, :, 0]
-        along = np.einsum('kap,ka->ap', self.design, column)
+        gradient = np.einsum('kap,ka->ap', self.design, column)
         squares = (column**2).sum(axis=0)
-        visible = squares - np.einsum('ap,pq,aq->a', along, self.covariance, along)
-        if np.any(visible < LEAST_SEEN * squares):
+        visible = squares - np.einsum('ap,pq,aq->a', gradient, self.covariance, gradient)
+        if np.any(visible < LEAST_VISIBLE * squares):
             return 1.0
         offset = (column * self.residual).sum(axis=0) / visible
-        taken_up = np.einsum('kap,pq,aq->ka', self.design, self.covariance, along)
-        improved = self.residual - (column - taken_up) * offset
+        imitated = np.einsum('kap,pq,aq->ka', self.design, self.covariance, gradient)
+        improved = self.residual - (column - imitated) * offset
 
         # F test of three offsets with the residual degrees of freedom of these windows.
         design = self.design[of_kind]
