@@ -1,10 +1,14 @@
-"""Fit of noise processes to an Allan curve by moments, with intervals of inverted score tests."""
+"""
+Fit of noise processes to an Allan curve by moments, with intervals of inverted score tests.
 
-from collections.abc import Sequence
+The expected Allan variances are ``design @ coefficients``: a column of the design is the curve of a
+process with the coefficient 1, and a coefficient is the square of a figure.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dtrtri
@@ -20,7 +24,7 @@ from imu_calibration.allan.processes import (
 from imu_calibration.allan.trends import KeptShare, Parts
 
 MAX_WEIGHT_ROUNDS = 25
-"""Rounds of weights and coefficients at most."""
+"""Largest number of alternating computations of weights and coefficients."""
 FLOOR = 1e-6
 """Least share of the upper limit of each process in the weights, so that they are finite."""
 RIDGE = 0.02
@@ -29,10 +33,10 @@ Added to the correlations, which are good to a hundredth: neighbouring scales ar
 """
 SHORTEST_TIME = 4.0
 """Shortest correlation time of a bias, s."""
-TIME_RATIO, TIME_RATIO_OF_WEIGHTS = 1.1, 1.3
-"""
-Correlation times are tried on a grid of the first ratio, weights are made on one of the second.
-"""
+TIME_RATIO = 1.1
+"""Ratio of neighbouring correlation times that are tried."""
+TIME_RATIO_OF_WEIGHTS = 1.3
+"""Ratio of neighbouring correlation times for which weights are computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,20 +90,19 @@ class Moments:
     @cached_property
     def times(self) -> np.ndarray:
         """
-        Correlation times that are tried, s, always from the same grid.
+        Correlation times that are tried, s: powers of `TIME_RATIO`, shape (n_times,).
 
-        Shorter ones belong to filters, not to a bias.
+        Shorter times than `SHORTEST_TIME` belong to filters, not to a bias.
         """
         longest = max(4 * self.scales.tau[self.used][-1], 2 * SHORTEST_TIME)
-        first, last = (round(np.log(t) / np.log(TIME_RATIO)) for t in (SHORTEST_TIME, longest))
+        first = round(np.log(SHORTEST_TIME) / np.log(TIME_RATIO))
+        last = round(np.log(longest) / np.log(TIME_RATIO))
         return TIME_RATIO ** np.arange(first, last + 1.0)
 
     @cached_property
     def wander(self) -> np.ndarray:
         """
-        Expectations of Gauss-Markov processes of unit variance with these times.
-
-        Shape (n_used, n_times).
+        Allan variances of Gauss-Markov processes of unit variance and `times`, (n_used, n_times).
         """
         return self.design(tuple(gauss_markov(time) for time in self.times))
 
@@ -114,13 +117,15 @@ class Moments:
         """
         Return the products of `ScaleCovariance.tensor` at the scales used.
 
-        For weights a nearby correlation time will do.
+        The correlation time is rounded, because the weights depend little on it.
         """
-        rounded = tuple(
-            gauss_markov(_rounded(process.time)) if process.time else process
-            for process in processes
-        )
-        return self.scales.tensor(rounded)[:, :, self.used][:, :, :, self.used]
+        rounded = []
+        for process in processes:
+            if process.time:
+                power = round(np.log(process.time) / np.log(TIME_RATIO_OF_WEIGHTS))
+                process = gauss_markov(TIME_RATIO_OF_WEIGHTS**power)
+            rounded.append(process)
+        return self.scales.tensor(tuple(rounded))[:, :, self.used][:, :, :, self.used]
 
     @property
     def target(self) -> np.ndarray:
@@ -129,15 +134,16 @@ class Moments:
 
     def covariance(self, design: np.ndarray, tensor: np.ndarray, values: np.ndarray) -> np.ndarray:
         """
-        Return the covariance of the variances used for coefficients `values`.
+        Return the covariance of the variances used, shape (n_used, n_used).
 
-        Sampling error and variation between parts.
+        It is the sampling error for the coefficients `values`, and the variation of the level of
+        the curve between parts, which is common to all scales.
         """
-        chance = np.einsum('p,q,pqij->ij', values, values, tensor)
+        sampling = np.einsum('p,q,pqij->ij', values, values, tensor)
         if not self.scatter:
-            return chance
-        level = self.scatter * np.sqrt(self.parts.share())[self.used] * (design @ values)
-        return chance + np.outer(level, level)
+            return sampling
+        level_sd = self.scatter * np.sqrt(self.parts.share())[self.used] * (design @ values)
+        return sampling + np.outer(level_sd, level_sd)
 
 
 def fit_processes(
@@ -148,7 +154,9 @@ def fit_processes(
     start: np.ndarray | None = None,
 ) -> MomentFit:
     """
-    Fit the coefficients of given processes.
+    Fit the coefficients of given processes: weighted least squares without negative values.
+
+    The weights depend on the coefficients; both are computed alternately until they converge.
 
     Parameters
     ----------
@@ -157,7 +165,7 @@ def fit_processes(
     fixed : dict, optional
         Index of a process -> coefficient that is not fitted.
     start : ndarray, shape (n_processes,), optional
-        Coefficients that the first weights are made with.
+        Coefficients for the first weights.
 
     """
     from scipy.optimize import nnls  # here, because its import is slow
@@ -165,10 +173,13 @@ def fit_processes(
     design = moments.design(processes)
     tensor = moments.tensor(processes)
     target = moments.target
-    free = np.array([k for k in range(len(processes)) if k not in (fixed or {})], int)
+    fixed = fixed or {}
+    free = np.array([k for k in range(len(processes)) if k not in fixed], int)
     values = _first_guess(design, target, moments) if start is None else np.array(start, float)
-    for k, value in (fixed or {}).items():
+    of_fixed = np.zeros(len(target))
+    for k, value in fixed.items():
         values[k] = value
+        of_fixed = of_fixed + design[:, k] * value
     floor = FLOOR * np.min(target[:, None] / design, axis=0)
     for _ in range(MAX_WEIGHT_ROUNDS):
         covariance = moments.covariance(design, tensor, np.maximum(values, floor))
@@ -176,15 +187,8 @@ def fit_processes(
         new = values.copy()
         if len(free):
             columns = whitener(design[:, free])
-            rest = whitener(
-                target
-                - sum(
-                    (design[:, k] * value for k, value in (fixed or {}).items()),
-                    np.zeros(len(target)),
-                )
-            )
             size = np.linalg.norm(columns, axis=0)
-            new[free] = nnls(columns / size, rest)[0] / size
+            new[free] = nnls(columns / size, whitener(target - of_fixed))[0] / size
         done = np.all(np.abs(new - values) <= 1e-7 * np.maximum(new, values))
         values = new
         if done:
@@ -195,13 +199,17 @@ def fit_processes(
 
 
 class Whitener:
-    """Turns vectors into ones of unit covariance."""
+    """
+    Whitening of vectors with a covariance, by the Cholesky factor L of their correlations.
+
+    The whitened vector is ``L^-1 (vector / sd)``; `RIDGE` is added to the correlations.
+    """
 
     def __init__(self, covariance: np.ndarray):
         self._sd = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(self._sd, self._sd)
         self._factor = _cholesky(correlation + RIDGE * np.eye(len(correlation)))
-        # Well conditioned with the ridge; a solve of this size waits for threads.
+        # The inverse is accurate because of the ridge; a solve of this size waits for threads.
         self._inverse = dtrtri(self._factor, lower=1)[0]
 
     @property
@@ -210,36 +218,27 @@ class Whitener:
         return float(2 * np.log(np.diag(self._factor)).sum() + 2 * np.log(self._sd).sum())
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return vectors (or the columns of a matrix) of unit covariance."""
+        """Return a whitened vector, or whitened columns of a matrix."""
         scaled = rows / (self._sd if rows.ndim == 1 else self._sd[:, None])
         return self._inverse @ scaled
 
     def weights(self, whitened: np.ndarray) -> np.ndarray:
-        """Return the weights of the original vector that give the product with a whitened one."""
+        """Return w with ``w @ vector = whitened @ self(vector)`` for every vector."""
         return self._inverse.T @ whitened / self._sd
 
 
-def _cholesky(matrix):
-    """
-    Return the factor of a correlation matrix with approximation errors in its smallest eigenvalues.
-    """
+def _cholesky(matrix: np.ndarray) -> np.ndarray:
+    """Return the Cholesky factor of correlations, of which approximations may be indefinite."""
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
-        return np.linalg.cholesky(
-            matrix + (RIDGE - np.linalg.eigvalsh(matrix)[0]) * np.eye(len(matrix))
-        )
+        missing = RIDGE - np.linalg.eigvalsh(matrix)[0]
+        return np.linalg.cholesky(matrix + missing * np.eye(len(matrix)))
 
 
-def _rounded(time):
-    return TIME_RATIO_OF_WEIGHTS ** round(np.log(time) / np.log(TIME_RATIO_OF_WEIGHTS))
-
-
-def _first_guess(design, target, moments):
+def _first_guess(design: np.ndarray, target: np.ndarray, moments: Moments) -> np.ndarray:
     """
-    Return coefficients that follow the curve on a logarithmic scale.
-
-    They follow it more closely at short averaging times.
+    Return coefficients by least squares of relative errors, with the weights 1 / tau.
     """
     from scipy.optimize import nnls
 
@@ -255,77 +254,92 @@ def fit_with_time(
     Fit given processes, and as the last one a Gauss-Markov process of unknown correlation time.
 
     With fixed weights the best time minimises the weighted sum of squares; the weights are updated
-    until the time converges.
+    until a time occurs again. `fixed` is that of `fit_processes`.
     """
     whitener = Whitener(np.diag((moments.target**2 * moments.scales.tau[moments.used])))
     fit = None
-    seen = set()
+    tried = set()
     while True:
         best = _best_time(moments, processes, whitener, fixed or {})
-        if fit is not None and best in seen:
+        if fit is not None and best in tried:
             return fit
-        seen.add(best)
+        tried.add(best)
         model = (*processes, gauss_markov(moments.times[best]))
         fit = fit_processes(moments, model, fixed, start=None if fit is None else fit.coefficients)
         whitener = Whitener(fit.covariance)
 
 
-def _best_time(moments, processes, whitener, fixed):
+def _best_time(
+    moments: Moments,
+    processes: tuple[NoiseProcess, ...],
+    whitener: Whitener,
+    fixed: dict[int, float],
+) -> int:
     """
-    Return the index of the time with the smallest sum of squares at given weights.
+    Return the index of the correlation time with the least sum of squares at given weights.
 
-    No coefficient is negative.
+    The processes and a Gauss-Markov process of each of the `Moments.times` are fitted without
+    negative coefficients: the best fit is the least one over all subsets of the free processes of
+    which no coefficient is negative.
     """
-    last = len(processes)
-    known = whitener(moments.design(processes))
+    last = len(processes)  # index of the Gauss-Markov process
+    columns = whitener(moments.design(processes))
     wander = whitener(moments.wander)
-    times = moments.times
-    target = whitener(moments.target) - sum(
-        (known[:, k] * value for k, value in fixed.items() if k < last), np.zeros(len(known))
-    )
-    rest = (
-        target[:, None] - wander * fixed[last]
-        if last in fixed
-        else np.repeat(target[:, None], len(times), axis=1)
-    )
+    of_fixed = np.zeros(len(columns))
+    for k, value in fixed.items():
+        if k < last:
+            of_fixed = of_fixed + columns[:, k] * value
+    target = whitener(moments.target) - of_fixed
+
+    # A target for each time, less a Gauss-Markov process with a fixed coefficient.
+    wander_is_fixed = last in fixed
+    targets = np.repeat(target[:, None], len(moments.times), axis=1)
+    if wander_is_fixed:
+        targets = target[:, None] - wander * fixed[last]
     free = [k for k in range(last) if k not in fixed]
-    best = np.full(len(times), np.inf)
-    for count in range(len(free) + 1):
-        for chosen in combinations(free, count):
-            best = np.minimum(best, _costs(known[:, list(chosen)], wander, rest, last in fixed))
-    return int(np.argmin(best))
+    squares = np.full(len(moments.times), np.inf)
+    for n_chosen in range(len(free) + 1):
+        for chosen in combinations(free, n_chosen):
+            of_subset = _squares_of_times(
+                columns[:, list(chosen)], wander, targets, wander_is_fixed
+            )
+            squares = np.minimum(squares, of_subset)
+    return int(np.argmin(squares))
 
 
-def _costs(known, wander, rest, held):
+def _squares_of_times(
+    columns: np.ndarray, wander: np.ndarray, targets: np.ndarray, wander_is_fixed: bool
+) -> np.ndarray:
     """
-    Return the sums of squares with these columns and one of `wander` each.
+    Return the residual sum of squares for each correlation time, shape (n_times,).
 
-    Infinite where a coefficient would be negative.
+    All `columns` and one column of `wander` are fitted to the column of `targets` of the same time;
+    with `wander_is_fixed` the columns only. Infinite where a coefficient of a column is negative.
     """
-    basis, triangle = np.linalg.qr(known)
-    own, beside = (values - basis @ (basis.T @ values) for values in (wander, rest))
-    amount = (
-        np.zeros(wander.shape[1])
-        if held
-        else np.maximum(np.einsum('it,it->t', own, beside) / np.einsum('it,it->t', own, own), 0.0)
-    )
-    cost = np.einsum('it,it->t', beside - amount * own, beside - amount * own)
-    values = (
-        np.linalg.solve(triangle, basis.T @ (rest - amount * wander))
-        if known.shape[1]
-        else np.zeros((1, 1))
-    )
-    return np.where((values >= 0).all(axis=0), cost, np.inf)
+    # Parts orthogonal to the columns give the coefficient of the wander.
+    basis, triangle = np.linalg.qr(columns)
+    free_wander = wander - basis @ (basis.T @ wander)
+    free_targets = targets - basis @ (basis.T @ targets)
+    amount = np.zeros(wander.shape[1])
+    if not wander_is_fixed:
+        product = np.einsum('it,it->t', free_wander, free_targets)
+        amount = np.maximum(product / np.einsum('it,it->t', free_wander, free_wander), 0.0)
+    residual = free_targets - amount * free_wander
+    squares = np.einsum('it,it->t', residual, residual)
+    if not columns.shape[1]:
+        return squares
+    values = np.linalg.solve(triangle, basis.T @ (targets - amount * wander))
+    return np.where((values >= 0).all(axis=0), squares, np.inf)
 
 
 TAIL = 0.025
-"""Probability beyond each end."""
+"""Probability beyond each end of an interval."""
 MAX_LOG_RATIO = 20.0
-"""Largest logarithm of an end over the estimate."""
+"""Largest logarithm of an end of an interval over the estimate."""
 LOG_TIME_STEP = 0.02
 """Step of the derivative by the logarithm of a correlation time."""
 INTERVAL_ACCURACY_SDS = 0.02
-"""Accuracy of the ends, in standard deviations."""
+"""Accuracy of the ends of an interval, in standard deviations."""
 
 
 def coefficient_interval(
@@ -337,7 +351,7 @@ def coefficient_interval(
     excess: float = 1.0,
 ) -> tuple[float, float]:
     """
-    Return the interval of the coefficient of a process: from 0 where the curve does without it.
+    Return the interval of the coefficient of a process, from 0 if the curve does not require it.
 
     Parameters
     ----------
@@ -345,25 +359,28 @@ def coefficient_interval(
     fits : sequence of MomentFit
         Fits of the models that have the process, the best first.
     weights : sequence of float
-        How likely each of them is; the tails are averaged.
+        Likelihood of each of them, with which the tails are averaged.
     name : str
         Name of the process.
     excess : float
         Factor on all covariances, for a curve whose misfit exceeds the sampling error.
 
     """
-    first = fits[0]
-    index = fits[0].names.index(name)
-    members = [_ScoreOfCoefficient(moments, fit, excess, fit.names.index(name)) for fit in fits]
-    tails = partial(_averaged, members, np.asarray(weights, float) / np.sum(weights))
-    limit = float(np.min(moments.target / moments.design((first.processes[index],))[:, 0]))
-    middle = max(first.coefficients[index], 1e-3 * limit)
-    step = min(members[0].relative_sd(), 1.5)
+    best = fits[0]
+    index = best.names.index(name)
+    scores = [_ScoreOfCoefficient(moments, fit, excess, fit.names.index(name)) for fit in fits]
+    averaged = _AveragedScore(scores, np.asarray(weights, float) / np.sum(weights))
+
+    # From the estimate in steps of its relative sd, or from a thousandth of the largest value that
+    # the curve allows.
+    limit = float(np.min(moments.target / moments.design((best.processes[index],))[:, 0]))
+    middle = max(best.coefficients[index], 1e-3 * limit)
+    step = min(scores[0].relative_sd(), 1.5)
     lower = 0.0
-    alone = not np.any(np.delete(first.coefficients, index))
-    if first.coefficients[index] > 0 and (alone or tails(0.0)[0] < TAIL):
-        lower = _crossing(lambda value: tails(value)[0] - TAIL, middle, -step)
-    return lower, _crossing(lambda value: tails(value)[1] - TAIL, middle, step)
+    is_only_process = not np.any(np.delete(best.coefficients, index))
+    if best.coefficients[index] > 0 and (is_only_process or averaged.tails(0.0)[0] < TAIL):
+        lower = _crossing(lambda value: averaged.tails(value)[0] - TAIL, middle, -step)
+    return lower, _crossing(lambda value: averaged.tails(value)[1] - TAIL, middle, step)
 
 
 def score_at_zero(moments: Moments, fit: MomentFit) -> float:
@@ -375,100 +392,121 @@ def time_interval(
     moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0
 ) -> tuple[float, float]:
     """
-    Return the interval of the time of models whose last process is Gauss-Markov, s.
+    Return the interval of the correlation time of models with a Gauss-Markov process last, s.
 
-    Infinite where a random walk fits as well.
+    Its upper end is infinite where a random walk fits as well. The arguments are those of
+    `coefficient_interval`.
     """
     times = moments.times
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
-    members = [_ScoreOfTime(moments, fit, excess) for fit in fits]
-    tails = partial(_averaged, members, np.asarray(weights, float) / np.sum(weights))
-    upper = _first(times[best + 1 :], lambda time: tails(time)[1] < TAIL)
-    lower = _first(times[:best][::-1], lambda time: tails(time)[0] < TAIL)
+    scores = [_ScoreOfTime(moments, fit, excess) for fit in fits]
+    averaged = _AveragedScore(scores, np.asarray(weights, float) / np.sum(weights))
+    upper = _first_rejected(times[best + 1 :], lambda time: averaged.tails(time)[1] < TAIL)
+    lower = _first_rejected(times[:best][::-1], lambda time: averaged.tails(time)[0] < TAIL)
     return 0.0 if lower is None else lower, np.inf if upper is None else upper
 
 
-def _first(values, refused):
-    """Return the first of the values that is refused, None without; from one that is, all are."""
+def _first_rejected(values: np.ndarray, rejected: Callable[[float], bool]) -> float | None:
+    """
+    Return the first of the values that is rejected, None if none is.
+
+    All values after a rejected one are rejected too: a growing step brackets the first, then
+    bisection.
+    """
     if not len(values):
         return None
-    near = -1
-    far = 0
+    accepted = -1  # index of the last value that is known to be accepted
+    trial = 0
     last = len(values) - 1
-    while not refused(values[far]):
-        if far == last:
+    while not rejected(values[trial]):
+        if trial == last:
             return None
-        near = far
-        far = min(2 * far + 1, last)
-    while far - near > 1:
-        middle = (near + far) // 2
-        near, far = (near, middle) if refused(values[middle]) else (middle, far)
-    return float(values[far])
+        accepted = trial
+        trial = min(2 * trial + 1, last)
+    while trial - accepted > 1:
+        middle = (accepted + trial) // 2
+        if rejected(values[middle]):
+            trial = middle
+        else:
+            accepted = middle
+    return float(values[trial])
 
 
-def _averaged(members, weights, value):
-    """
-    Return the `tails` of several models at `value`, averaged with weights of sum 1, shape (2,).
-    """
-    return weights @ [member.tails(value) for member in members]
+@dataclass(frozen=True, eq=False)
+class _Fixed:
+    """A fit with one parameter fixed at a trial value."""
+
+    fit: MomentFit
+    direction: np.ndarray
+    """Derivative of the expected variances by the fixed parameter, shape (n_used,)."""
+    free_directions: list[np.ndarray]
+    """Derivatives by the parameters that are fitted, each of shape (n_used,)."""
 
 
 class _Score:
     """
-    Where the misfit in the direction of one parameter lies in its distribution.
+    Score test of one parameter: its misfit at a trial value, with all other parameters fitted.
 
-    The parameter is at a value that is tried.
+    Parameters
+    ----------
+    moments : Moments
+    fit : MomentFit
+        With the parameter fitted.
+    excess : float
+        Factor on all covariances.
+
     """
 
-    def __init__(self, moments, fit, excess):
+    def __init__(self, moments: Moments, fit: MomentFit, excess: float):
         self.moments = moments
         self.fit = fit
         self._excess = excess
-        self._tails = {}
+        # Trial value -> its tails, which several steps of a search need.
+        self._tails: dict[float, tuple[float, float]] = {}
 
-    def at(self, value: float) -> tuple[Any, np.ndarray, list[np.ndarray]]:
-        """Return the fit with the parameter fixed, its direction, and those of the free ones."""
+    def at(self, value: float) -> _Fixed:
+        """Return the fit with the parameter fixed at a value."""
         raise NotImplementedError
 
-    def tails(self, value):
-        """
-        Return the probabilities of a larger and of a smaller misfit than observed.
-
-        If `value` is true.
-        """
+    def tails(self, value: float) -> tuple[float, float]:
+        """Return the probabilities of a larger and of a smaller score if `value` is true."""
         if value not in self._tails:
-            fit, direction, others = self.at(value)
-            self._tails[value] = _tails(self.moments, fit, direction, others, self._excess)
+            self._tails[value] = _tails(self.moments, self.at(value), self._excess)
         return self._tails[value]
 
 
+@dataclass(frozen=True, eq=False)
+class _AveragedScore:
+    """Score tests of the same parameter in several models."""
+
+    scores: Sequence[_Score]
+    weights: np.ndarray
+    """Weight of each model, of sum 1."""
+
+    def tails(self, value: float) -> np.ndarray:
+        """Return the average of the `_Score.tails` of the models, shape (2,)."""
+        return self.weights @ [score.tails(value) for score in self.scores]
+
+
 class _ScoreOfCoefficient(_Score):
-    def __init__(self, moments, fit, excess, index):
+    """Score test of the coefficient of the process with the number `index`."""
+
+    def __init__(self, moments: Moments, fit: MomentFit, excess: float, index: int):
         super().__init__(moments, fit, excess)
         self.index = index
 
-    def relative_sd(self):
-        """
-        Return the standard deviation of the coefficient by its information, as a share of it.
-
-        Large where there is none.
-        """
+    def relative_sd(self) -> float:
+        """Return the sd of the coefficient by its information, over it; infinite for 0."""
         if not self.fit.coefficients[self.index] > 0:
             return np.inf
         whiten = Whitener(self._excess * self.fit.covariance)
-        own, others = self._directions(self.fit)
-        return 1.0 / (
-            np.linalg.norm(_beside(whiten(own), [whiten(other) for other in others]))
-            * self.fit.coefficients[self.index]
-        )
+        at_fit = self._with_directions(self.fit)
+        free = [whiten(direction) for direction in at_fit.free_directions]
+        information_root = np.linalg.norm(_orthogonal_part(whiten(at_fit.direction), free))
+        return 1.0 / (information_root * self.fit.coefficients[self.index])
 
-    def at(self, value):
-        """
-        Return the fit with the coefficient fixed, and the directions of the parameters.
-
-        The values are the fit, the coefficient's own direction, and the directions of the other
-        parameters.
-        """
+    def at(self, value: float) -> _Fixed:
+        """Return the fit with the coefficient fixed at a value."""
         processes = self.fit.processes
         if processes[-1].time and (value > 0 or self.index != len(processes) - 1):
             fit = fit_with_time(self.moments, processes[:-1], {self.index: value})
@@ -476,76 +514,71 @@ class _ScoreOfCoefficient(_Score):
             fit = fit_processes(
                 self.moments, processes, {self.index: value}, start=self.fit.coefficients
             )
-        return fit, *self._directions(fit)
+        return self._with_directions(fit)
 
-    def _directions(self, fit):
+    def _with_directions(self, fit: MomentFit) -> _Fixed:
+        """Return a fit with the derivatives by its parameters that are not at the bound 0."""
         design = self.moments.design(fit.processes)
-        others = []
+        free_directions = []
         for k in range(len(fit.processes)):
             if k != self.index and fit.coefficients[k] > 0:
-                others.append(design[:, k])
+                free_directions.append(design[:, k])
         if fit.processes[-1].time and fit.coefficients[-1] > 0:
-            others.append(_by_time(self.moments, fit.processes[-1].time))
-        return design[:, self.index], others
+            free_directions.append(_by_log_time(self.moments, fit.processes[-1].time))
+        return _Fixed(fit, design[:, self.index], free_directions)
 
 
 class _ScoreOfTime(_Score):
-    def at(self, value):
-        """
-        Return the fit with the time fixed, and the directions of the parameters.
+    """Score test of the logarithm of the correlation time of the last process."""
 
-        The values are the fit, the direction of a longer time, and the directions of the
-        coefficients.
-        """
+    def at(self, value: float) -> _Fixed:
+        """Return the fit with the correlation time fixed at a value, s."""
         processes = (*self.fit.processes[:-1], gauss_markov(value))
         fit = fit_processes(self.moments, processes, None, start=self.fit.coefficients)
         design = self.moments.design(processes)
-        return (
-            fit,
-            _by_time(self.moments, value),
-            [design[:, k] for k in range(len(processes)) if fit.coefficients[k] > 0],
-        )
+        free_directions = [design[:, k] for k in range(len(processes)) if fit.coefficients[k] > 0]
+        return _Fixed(fit, _by_log_time(self.moments, value), free_directions)
 
 
-def _by_time(moments, time):
+def _by_log_time(moments: Moments, time: float) -> np.ndarray:
     """
-    Return the derivative of the Gauss-Markov curve by the logarithm of its time.
-
-    By a central difference.
+    Return the derivative of the Gauss-Markov curve by the logarithm of its time, shape (n_used,).
     """
-    late, early = (
-        moments.design((gauss_markov(time * factor),))[:, 0]
-        for factor in (1 + LOG_TIME_STEP, 1 - LOG_TIME_STEP)
-    )
+    late = moments.design((gauss_markov(time * (1 + LOG_TIME_STEP)),))[:, 0]
+    early = moments.design((gauss_markov(time * (1 - LOG_TIME_STEP)),))[:, 0]
     return (late - early) / (2 * LOG_TIME_STEP)
 
 
-def _tails(moments, fit, direction, others, excess):
+def _tails(moments: Moments, fixed: _Fixed, excess: float) -> tuple[float, float]:
     """
-    Return (probability above, probability below) of an efficient score.
+    Return (probability above, probability below) of the efficient score of a fixed parameter.
 
-    It is the efficient score of `direction` given `others`.
+    With the whitened direction d of the parameter, less its projection on the free directions, and
+    the whitened residual r, the score ``d r / |d|`` has the variance 1. Its skewness is that of a
+    weighted sum of variances, and its distribution is Pearson III.
     """
+    fit = fixed.fit
     covariance = excess * fit.covariance
     whiten = Whitener(covariance)
-    own = _beside(whiten(direction), [whiten(other) for other in others])
+    free = [whiten(direction) for direction in fixed.free_directions]
+    direction = _orthogonal_part(whiten(fixed.direction), free)
     expected = moments.design(fit.processes) @ fit.coefficients
-    size = np.linalg.norm(own)
-    score = float(own @ whiten(moments.target - expected) / size)
-    weights = whiten.weights(own / size)
-    third_moment = _third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target))
-    return pearson_tails(score, float(third_moment))
+    size = np.linalg.norm(direction)
+    score = float(direction @ whiten(moments.target - expected) / size)
+    weights = whiten.weights(direction / size)
+    skewness = _third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target))
+    return pearson_tails(score, skewness)
 
 
-def _beside(own, others):
-    """Return the part of a vector orthogonal to the other directions."""
-    if not others:
-        return own
-    basis = np.linalg.qr(np.column_stack(others))[0]
-    return own - basis @ (basis.T @ own)
+def _orthogonal_part(vector: np.ndarray, directions: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the part of a vector orthogonal to some directions."""
+    if not directions:
+        return vector
+    basis = np.linalg.qr(np.column_stack(directions))[0]
+    return vector - basis @ (basis.T @ vector)
 
 
-def _third_moment(weights, covariance, expected):
+def _third_moment(weights: np.ndarray, covariance: np.ndarray, expected: np.ndarray) -> float:
     """
     Return the third central moment of a weighted sum of Allan variances.
 
@@ -565,17 +598,17 @@ def pearson_tails(score: float, skewness: float) -> tuple[float, float]:
         return float(ndtr(-score)), float(ndtr(score))
     shape = 4.0 / skewness**2
     at = shape + score * np.sqrt(shape) * np.sign(skewness)
-    above, below = (
-        (float(gammaincc(shape, at)), float(gammainc(shape, at))) if at > 0 else (1.0, 0.0)
-    )
+    above = float(gammaincc(shape, at)) if at > 0 else 1.0
+    below = float(gammainc(shape, at)) if at > 0 else 0.0
     return (above, below) if skewness > 0 else (below, above)
 
 
-def _crossing(function, start, step):
+def _crossing(function: Callable[[float], float], start: float, step: float) -> float:
     """
-    Return where a positive function becomes negative.
+    Return the argument at which a function that is positive at `start` becomes negative.
 
-    From `start` on by growing steps of the logarithm.
+    The logarithm of the argument grows by steps, the first of 2 `step`, which are then bisected.
+    Without a crossing it is 0 or infinite, by the sign of `step`.
     """
     from scipy.optimize import brentq  # here, because its import is slow
 
@@ -584,11 +617,10 @@ def _crossing(function, start, step):
     near = np.log(start)
     far = np.log(start) + 2.0 * step
     while function(np.exp(far)) > 0:
-        near, far = far, far + 1.6 * (far - near)
+        length = far - near
+        near = far
+        far = far + 1.6 * length
         if abs(far - np.log(start)) > MAX_LOG_RATIO:
             return np.inf if step > 0 else 0.0
-    return float(
-        np.exp(
-            brentq(lambda x: function(np.exp(x)), near, far, xtol=INTERVAL_ACCURACY_SDS * abs(step))
-        )
-    )
+    accuracy = INTERVAL_ACCURACY_SDS * abs(step)
+    return float(np.exp(brentq(lambda x: function(np.exp(x)), near, far, xtol=accuracy)))
