@@ -1,5 +1,10 @@
-"""Noise terms of one axis, and the forms of models that are compared."""
+"""
+Noise figures of one axis.
 
+A form is the set of slow processes in a model, in addition to white noise and perhaps quantisation.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,23 +33,25 @@ FORMS = (
     (FLICKER.name, RANDOM_WALK.name),
     (RANDOM_WALK.name, GAUSS_MARKOV),
 )
-"""Slow parts that are tried, a Gauss-Markov process last."""
+"""Forms that are tried, with a Gauss-Markov process last."""
 PROCESSES = {process.name: process for process in (QUANTISATION, WHITE, FLICKER, RANDOM_WALK)}
 MAX_COST_EXCESS = 6.0
-"""Forms whose cost is within this of the least are possible as well."""
-PRICE, PRICE_OF_TIME = 2.0, 7.0
-"""Cost of a coefficient, and of a correlation time, for which many are tried."""
+"""Largest cost above the least one of a form that is possible as well."""
+PRICE = 2.0
+"""Cost of a coefficient."""
+PRICE_OF_TIME = 7.0
+"""Cost of a correlation time, because many are tried."""
 TIME_STEP = 8
 """
 Stride over the correlation times; each is tested for a clearly higher likelihood than the time of
 best fit.
 """
 MIN_FORM_WEIGHT = 0.05
-"""Forms less likely than this, against the best, are excluded from intervals."""
+"""Least likelihood of a form in an interval, over that of the best form."""
 MIN_COMPARED_MEANS = 6.0
 """
-Forms are compared at averaging times of which the longest part holds so many: with fewer,
-logarithms are far from Gaussian.
+Least number of means in the longest part at the averaging times at which forms are compared: with
+fewer, the logarithms of variances are not Gaussian.
 """
 QUANTISATION_P_VALUE = 1e-3
 """Probability below which quantisation is included."""
@@ -67,63 +74,69 @@ class Choice:
     @property
     def rivals(self) -> tuple[MomentFit, ...]:
         """
-        Other forms that explain the curve nearly as well, except supersets of a form named before.
+        Other forms that explain the curve nearly as well, without generalisations of better ones.
         """
-        found: list[MomentFit] = []
+        rivals: list[MomentFit] = []
         for fit in self.fits:
-            if fit.cost - self.best.cost <= MAX_COST_EXCESS and not any(
-                _is_part(known.form, fit.form) for known in (self.best, *found)
-            ):
-                found.append(fit)
-        return tuple(found)
+            if fit.cost - self.best.cost > MAX_COST_EXCESS:
+                continue
+            better = (self.best, *rivals)
+            if not any(_is_special_case(known.form, fit.form) for known in better):
+                rivals.append(fit)
+        return tuple(rivals)
 
     def having(self, name: str) -> tuple[list[MomentFit], list[float]]:
         """
-        Return the fits with a process, the best first, and the likelihood of each relative to it.
+        Return (fits with a process, the best first; likelihood of each over that of the best).
 
-        Negligible ones are omitted.
+        Fits of a likelihood up to `MIN_FORM_WEIGHT` are omitted.
         """
-        found = [fit for fit in self.fits if name in fit.names]
-        weights = [1.0, *(float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found[1:])]
-        return [fit for fit, weight in zip(found, weights) if weight > MIN_FORM_WEIGHT], [
-            w for w in weights if w > MIN_FORM_WEIGHT
-        ]
+        with_process = [fit for fit in self.fits if name in fit.names]
+        best = with_process[0]
+        fits = [best]
+        weights = [1.0]
+        for fit in with_process[1:]:
+            weight = float(np.exp(-0.5 * (fit.cost - best.cost)))
+            if weight > MIN_FORM_WEIGHT:
+                fits.append(fit)
+                weights.append(weight)
+        return fits, weights
 
     def widened(self, name: str) -> 'Choice':
-        """Return a choice of one: the best form with a further process."""
+        """Return a Choice with one fit: the best form with a further process."""
         fast = tuple(known for known in self.best.names if known == QUANTISATION.name)
         fit = fit_names(self.moments, (*fast, WHITE.name, name, *self.best.form))
         return Choice((replace(fit, cost=self.best.cost),), self.moments)
 
     def close(self, name: str) -> MomentFit | None:
         """
-        Return the best form with a process among those that explain the curve nearly as well.
+        Return the best form with a process that explains the curve nearly as well, or None.
 
-        Or None.
+        It may cost a correlation time more than `rivals`.
         """
-        near = []
         for fit in self.fits:
             if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME:
-                near.append(fit)
-        return near[0] if near else None
+                return fit
+        return None
 
 
-def _is_part(form, wider):
+def _is_special_case(form: tuple[str, ...], wider: tuple[str, ...]) -> bool:
     """
-    Return whether a form is a special case of another one.
+    Return whether a form is a special case of a wider one.
 
-    A random walk is a Gauss-Markov process that never forgets.
+    A random walk is a Gauss-Markov process with an infinite correlation time.
     """
-    return all(
-        name in wider or (name == RANDOM_WALK.name and GAUSS_MARKOV in wider) for name in form
-    )
+    for name in form:
+        if name not in wider and not (name == RANDOM_WALK.name and GAUSS_MARKOV in wider):
+            return False
+    return True
 
 
 def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
     """
-    Fit every form, with quantisation where the curve shows it.
+    Fit every form, with quantisation if it is significant with the best form.
 
-    `excess`: factor on all covariances of an unexplained curve.
+    `excess` is a factor on all covariances, for a curve that no form explains.
     """
     fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
@@ -132,81 +145,85 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
     return Choice(fits, moments)
 
 
-def _all_forms(moments, fast, excess):
+def _all_forms(moments: Moments, fast: tuple[str, ...], excess: float) -> tuple[MomentFit, ...]:
+    """Return the fits of all forms, with some `fast` processes, in order of their cost."""
     n_scales = int(moments.used.sum())
     fits = []
     for form in FORMS:
         if len(fast) + 2 * len(form) + 3 <= n_scales:
             fits.append(fit_form(moments, form, fast, excess=excess))
-    return tuple(sorted(fits, key=lambda found: found.cost))
+    return tuple(sorted(fits, key=lambda fit: fit.cost))
 
 
 def fit_form(
     moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0
 ) -> MomentFit:
     """
-    Fit white noise, `fast` processes and the slow ones of a form; squares are divided by `excess`.
+    Fit white noise, `fast` processes and the slow processes of a form, and return it with its cost.
+
+    The cost is that of `log_cost` and the prices of its parameters.
     """
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
-    fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
-    return replace(
-        fit,
-        cost=log_cost(moments, fit, excess)
-        + PRICE * len(names)
-        + PRICE_OF_TIME * (GAUSS_MARKOV in form),
-    )
+    if GAUSS_MARKOV in form:
+        fit = _at_likelier_time(moments, fit)
+    cost = log_cost(moments, fit, excess)
+    price_of_time = PRICE_OF_TIME * (GAUSS_MARKOV in form)
+    return replace(fit, cost=cost + PRICE * len(names) + price_of_time)
 
 
-def _likeliest(moments, fit):
+def _at_likelier_time(moments: Moments, fit: MomentFit) -> MomentFit:
     """
-    Return the fit with another correlation time where one is plainly likelier.
+    Return the fit with another correlation time if one is clearly likelier, else the fit itself.
 
-    The weights of a long time can keep it long.
+    The fit minimises weighted squares, and with the weights of a long time a long time fits best.
     """
-
-    def at(time):
-        found = fit_processes(moments, (*fit.processes[:-1], gauss_markov(time)))
-        return log_cost(moments, found), found
-
-    costs = [at(time)[0] for time in moments.times[::TIME_STEP]]
+    # Every `TIME_STEP`-th time, then all times about the best of these.
+    costs = []
+    for time in moments.times[::TIME_STEP]:
+        costs.append(log_cost(moments, _with_time(moments, fit, time)))
     best = int(np.argmin(costs))
     if costs[best] > log_cost(moments, fit) - MAX_COST_EXCESS:
         return fit
     near = slice(max((best - 1) * TIME_STEP, 0), (best + 1) * TIME_STEP)
-    return min((at(time) for time in moments.times[near]), key=lambda found: found[0])[1]
+    fits = [_with_time(moments, fit, time) for time in moments.times[near]]
+    return min(fits, key=lambda trial: log_cost(moments, trial))
+
+
+def _with_time(moments: Moments, fit: MomentFit, time: float) -> MomentFit:
+    """Return a fit of the processes of another one, with the correlation time of the last fixed."""
+    return fit_processes(moments, (*fit.processes[:-1], gauss_markov(time)))
 
 
 def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
     """Fit the processes of these names; a Gauss-Markov process is the last."""
     processes = tuple(PROCESSES[name] for name in names if name != GAUSS_MARKOV)
-    return (
-        fit_with_time(moments, processes)
-        if GAUSS_MARKOV in names
-        else fit_processes(moments, processes)
-    )
+    if GAUSS_MARKOV in names:
+        return fit_with_time(moments, processes)
+    return fit_processes(moments, processes)
 
 
 def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
     """
     Return minus twice the log likelihood of the logarithms of the variances except for a constant.
 
-    With `excess` times their covariance.
-
-    Infinite for a fit that expects no variance at some averaging time.
+    A variance with the expectation f and n degrees of freedom is ``f chi^2_n / n``, of which the
+    logarithm has the mean ``ln f + digamma(n / 2) - ln(n / 2)`` and the variance ``trigamma(n /
+    2)``. Its correlations are those of the variances; squares are divided by `excess`. The cost is
+    infinite for a fit that expects no variance at some averaging time.
     """
-    some = moments.scales.tau[moments.used] * MIN_COMPARED_MEANS <= moments.scales.longest
-    expected = (moments.design(fit.processes) @ fit.coefficients)[some]
-    covariance = fit.covariance[np.ix_(some, some)]
+    compared = moments.scales.tau[moments.used] * MIN_COMPARED_MEANS <= moments.scales.longest
+    expected = (moments.design(fit.processes) @ fit.coefficients)[compared]
+    covariance = fit.covariance[np.ix_(compared, compared)]
     if not (np.all(expected > 0) and np.all(np.isfinite(covariance))):
         return np.inf
     freedom = 2 * expected**2 / np.diag(covariance)
+    # Standard deviation of a logarithm over the relative one of its variance.
     spread = np.sqrt(polygamma(1, freedom / 2) * freedom / 2)
     whiten = Whitener(covariance / np.outer(expected, expected) * np.outer(spread, spread))
-    rest = whiten(
-        np.log(moments.target[some] / expected) - digamma(freedom / 2) + np.log(freedom / 2)
-    )
-    cost = float(rest @ rest) / excess + whiten.log_determinant
+    log_ratio = np.log(moments.target[compared] / expected)
+    residual = whiten(log_ratio - digamma(freedom / 2) + np.log(freedom / 2))
+    cost = float(residual @ residual) / excess + whiten.log_determinant
     return cost if np.isfinite(cost) else np.inf
 
 
@@ -223,23 +240,31 @@ Upper over lower end of the 95 % interval up to which a figure counts as determi
 either side.
 """
 MISFIT_P_VALUE = 1e-3
-"""Probability of a misfit below which the shortest averaging times are left out."""
+"""Probability of a misfit below which the shortest averaging times are excluded."""
 LEAST_SCALES = 8
 """Least number of averaging times in the fit."""
-LONGEST_LEFT_OUT = 2.0
-"""s; a model that fails beyond is wrong for another reason than a filter in the sensor."""
+LONGEST_EXCLUDED = 2.0
+"""
+Longest averaging time that may be excluded, s: a misfit beyond is not that of a filter in the
+sensor.
+"""
 WHITE_SHARE = 0.5
 """
 Least share of white noise in the shortest variance for which shorter averaging times of an
 unexplained curve are excluded.
 """
 FILTER_TIME_RATIO = 8.0
-"""Where a filter shows, averaging times up to so many of the longest that shows it are left out."""
+"""
+Averaging times up to this many times the shortest one without a misfit by a filter are excluded.
+"""
 TIME_KEY = 'correlation_time'
-PEAK, PEAK_HEIGHT = 0.371, 0.525
-"""Where the Allan variance of a sine peaks, in periods, and how high, in squared amplitudes."""
+"""Key of the correlation time among the terms."""
+PEAK_PERIODS = 0.371
+"""Averaging time at which the Allan variance of a sine has its maximum, in periods."""
+PEAK_HEIGHT = 0.525
+"""This maximum, in squared amplitudes."""
 RICHEST = tuple((QUANTISATION.name, WHITE.name, *form) for form in FORMS[-2:])
-"""Models that explain a curve if any does."""
+"""Processes of the models that contain all others."""
 
 
 @dataclass(frozen=True)
@@ -251,7 +276,7 @@ class Term:
     value: float | None
     """The figure; None when it is held."""
     interval: tuple[float, float]
-    """95 %; begins at 0 when the curve does without the process."""
+    """95 % interval; it begins at 0 if the curve does not require the process."""
     status: str
     """'determined', 'weak' or 'held'."""
     reason: str = ''
@@ -265,11 +290,11 @@ class AxisNoise:
     terms: dict[str, Term]
     """Name of the process -> its figure; 'correlation_time' in addition to 'gauss_markov'."""
     form: tuple[str, ...] = ()
-    """Names of the processes that make the slow part; empty: none shows."""
+    """Names of the slow processes; empty without a slow part in the curve."""
     others: tuple[tuple[str, ...], ...] = ()
     """Other forms that explain the curve as well."""
     alternatives: dict[str, Term] = field(default_factory=dict)
-    """Figures of processes that occur only in these forms."""
+    """Figures of processes that occur in the other forms only."""
     shortest: float = 0.0
     """
     Shortest averaging time that was fitted, s; longer than the period where the sensor filters its
@@ -279,8 +304,8 @@ class AxisNoise:
     """Factor on all covariances because the misfit exceeds the sampling error, at least 1."""
     oscillation: tuple[float, float] | None = None
     """
-    Frequency (Hz) and amplitude: of the sine with the largest hump that no model explains; from a
-    recording, of its line.
+    Frequency (Hz) and amplitude of the sine with the largest unexplained hump; of a recording,
+    those of the line near this frequency.
     """
     scatter: float = 0.0
     """Standard deviation of the level of the variances from rest to rest, over the level."""
@@ -293,13 +318,18 @@ def identify_axis(moments: Moments) -> AxisNoise:
     moments, excess = _fit_range(moments)
     moments = replace(moments, scatter=scatter_of(moments))
     choice = choose_form(moments, excess)
-    best, rivals = choice.best, choice.rivals
+    best = choice.best
+    rivals = choice.rivals
+
+    # Figures of the best form; upper limits of flicker and random walk without them.
     fast = tuple(name for name in (QUANTISATION.name,) if name in best.names)
     terms: dict[str, Term] = {}
     for name in (*fast, WHITE.name, *best.form):
         terms |= _figures(choice, name, excess)
     for name in {FLICKER.name, RANDOM_WALK.name} - set(best.form):
-        terms |= {name: _held(_figures(choice.widened(name), name, excess)[name])}
+        terms[name] = _held(_figures(choice.widened(name), name, excess)[name])
+
+    # Figures of the processes in other forms.
     alternatives: dict[str, Term] = {}
     for other in (*rivals, *filter(None, [choice.close(GAUSS_MARKOV)])):
         for name in set(other.form) - set(best.form) - set(alternatives):
@@ -322,7 +352,7 @@ def with_wider_white_noise(axis: AxisNoise, factor: float) -> AxisNoise:
     Return the noise of an axis whose white noise may be too high by a factor, at least 1.
 
     The lower end of its interval is divided by the factor, because outliers or repeated readings
-    raise the variances at every averaging time alike.
+    raise the variances at every averaging time by the same factor.
     """
     white = axis.terms[WHITE.name]
     if factor <= 1.0 or white.value is None:
@@ -335,37 +365,36 @@ def with_wider_white_noise(axis: AxisNoise, factor: float) -> AxisNoise:
 
 def scatter_of(moments: Moments) -> float:
     """
-    Return the excess variation of the level of the variances between parts.
+    Return the relative standard deviation of the level of the variances between parts.
 
-    The sampling error is that of a model with every slope.
+    It is in excess of the sampling error by a model with every slope (`Parts.scatter`).
     """
     fit = fit_names(moments, RICHEST[0])
     expected = moments.design(fit.processes) @ fit.coefficients
     return moments.parts.scatter(moments.used, np.diag(fit.covariance) / expected**2)
 
 
-def _hump(moments, fit):
+def _hump(moments: Moments, fit: MomentFit) -> tuple[float, float] | None:
     """
-    Return frequency and amplitude of the sine that makes the largest excess.
+    Return (frequency in Hz, amplitude) of the sine with the most significant excess over a fit.
 
-    Its Allan variance is a^2 sin^4(x) / x^2, x = pi f tau.
+    A sine of amplitude a and frequency f has the Allan variance ``a^2 sin^4(x) / x^2``, ``x = pi f
+    tau``, which is largest at ``f tau = PEAK_PERIODS``. None without a positive excess.
     """
-    beyond = moments.target - moments.design(fit.processes) @ fit.coefficients
-    highest = int(np.argmax(beyond / np.sqrt(np.diag(fit.covariance))))
-    if beyond[highest] <= 0:
+    excess = moments.target - moments.design(fit.processes) @ fit.coefficients
+    highest = int(np.argmax(excess / np.sqrt(np.diag(fit.covariance))))
+    if excess[highest] <= 0:
         return None
-    return float(PEAK / moments.scales.tau[moments.used][highest]), float(
-        np.sqrt(beyond[highest] / PEAK_HEIGHT)
-    )
+    frequency = PEAK_PERIODS / moments.scales.tau[moments.used][highest]
+    return float(frequency), float(np.sqrt(excess[highest] / PEAK_HEIGHT))
 
 
 def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the prediction for every averaging time of a recording.
+    Return (Allan variance, degrees of freedom of a measured one) for every averaging time.
 
-    The variance, and the degrees of freedom of a measured one.
-
-    The level of the noise differs there from part to part as it did where it was identified.
+    `moments` are those of any recording. The level of its noise is assumed to differ from part to
+    part as in the recording from which the noise of the axis was identified.
     """
     every = replace(moments, used=np.ones_like(moments.used))
     fit = axis.fit
@@ -377,15 +406,13 @@ def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray
     return expected, 2.0 / (spread * axis.excess / expected**2 + level)
 
 
-def _fit_range(moments):
+def _fit_range(moments: Moments) -> tuple[Moments, float]:
     """
     Return the moments without filtered averaging times, and the remaining misfit.
 
-    The averaging times at which the sensor filters its noise are removed.
-
-    The shortest ones are excluded until one of the richest models explains the others. Where none
-    does (vibration), those are kept that are explained best, as long as their shortest still shows
-    white noise, else all.
+    The shortest averaging times are excluded until one of the richest models explains all longer
+    ones. If none does (vibration), the range with the least misfit is kept, among ranges of which
+    the shortest averaging time shows white noise; all averaging times if there is no such range.
 
     Returns
     -------
@@ -396,74 +423,74 @@ def _fit_range(moments):
 
     """
     most = min(
-        int(np.sum(moments.scales.tau <= LONGEST_LEFT_OUT)), int(moments.used.sum()) - LEAST_SCALES
+        int(np.sum(moments.scales.tau <= LONGEST_EXCLUDED)), int(moments.used.sum()) - LEAST_SCALES
     )
-    least, kept = np.inf, moments
-    for count in range(max(most, 0) + 1):
-        trial = without_finest(moments, count)
+    least_misfit = np.inf  # per degree of freedom
+    best_range = moments
+    for n_excluded in range(max(most, 0) + 1):
+        trial = without_finest(moments, n_excluded)
         freedom = int(trial.used.sum()) - len(RICHEST[0])
-        fit = min((fit_names(trial, names) for names in RICHEST), key=lambda found: found.misfit)
+        fit = min((fit_names(trial, names) for names in RICHEST), key=lambda fit: fit.misfit)
         if chdtrc(freedom, fit.misfit) > MISFIT_P_VALUE:
-            return _with_margin(trial, count, most), 1.0
-        seen = (
-            fit.coefficient(WHITE.name) * trial.design((WHITE,))[0, 0]
-            > WHITE_SHARE * trial.target[0]
-        )
-        if not count or (seen and fit.misfit / freedom < least):
-            least = fit.misfit / freedom
-            kept = trial
-    return kept, max(float(least), 1.0)
+            return _with_margin(trial, n_excluded, most), 1.0
+        white_variance = fit.coefficient(WHITE.name) * trial.design((WHITE,))[0, 0]
+        shows_white = white_variance > WHITE_SHARE * trial.target[0]
+        if not n_excluded or (shows_white and fit.misfit / freedom < least_misfit):
+            least_misfit = fit.misfit / freedom
+            best_range = trial
+    return best_range, max(float(least_misfit), 1.0)
 
 
-def _with_margin(moments, count, most):
+def _with_margin(moments: Moments, n_excluded: int, most: int) -> Moments:
     """
-    Return the moments without the scales at which a detected filter still bends the curve.
+    Return the moments without the scales at which a filter of the sensor still bends the curve.
 
-    By 1 - 3/2 (its time) / tau.
+    `n_excluded` scales show a misfit; at most `most` are excluded. At tau the filter lowers the
+    curve by 3/2 (its time) / tau.
     """
+    if not n_excluded:
+        return moments
     tau = moments.scales.tau
-    return (
-        without_finest(moments, min(int(np.sum(tau < FILTER_TIME_RATIO * tau[count])), most))
-        if count
-        else moments
-    )
+    n_bent = int(np.sum(tau < FILTER_TIME_RATIO * tau[n_excluded]))
+    return without_finest(moments, min(n_bent, most))
 
 
-def _figures(choice, name, excess):
+def _figures(choice: Choice, name: str, excess: float) -> dict[str, Term]:
     """
     Return the terms of one process: its figure, and the correlation time of a Gauss-Markov process.
     """
     fits, weights = choice.having(name)
-    index = fits[0].names.index(name)
+    best = fits[0]
+    index = best.names.index(name)
     interval = coefficient_interval(choice.moments, fits, weights, name=name, excess=excess)
-    found = {name: _term(name, np.sqrt(fits[0].coefficients[index]), np.sqrt(interval))}
+    terms = {name: _term(name, np.sqrt(best.coefficients[index]), np.sqrt(interval))}
     if name == GAUSS_MARKOV:
-        found[TIME_KEY] = _term(
-            TIME_KEY,
-            fits[0].processes[index].time,
-            time_interval(choice.moments, fits, weights, excess=excess),
-        )
-    return found
+        interval_of_time = time_interval(choice.moments, fits, weights, excess=excess)
+        terms[TIME_KEY] = _term(TIME_KEY, best.processes[index].time, interval_of_time)
+    return terms
 
 
-def _term(name, value, interval):
+def _term(name: str, value: float, interval: Sequence[float]) -> Term:
+    """Return the term of a figure, determined if the ratio of the ends of its interval is small."""
     lower, upper = (float(end) for end in interval)
     if not value > 0:
         return Term(name, None, (0.0, upper), HELD, 'not seen')
-    if lower > 0 and upper / lower <= DETERMINED_RATIO:
+    if not lower > 0:
+        return Term(name, float(value), (lower, upper), WEAK, 'may be none')
+    if upper / lower <= DETERMINED_RATIO:
         return Term(name, float(value), (lower, upper), DETERMINED)
-    return Term(
-        name, float(value), (lower, upper), WEAK, 'too short' if lower > 0 else 'may be none'
-    )
+    return Term(name, float(value), (lower, upper), WEAK, 'too short')
 
 
-def _held(term):
-    return replace(
-        term, value=None, status=HELD, interval=(0.0, term.interval[1]), reason='not seen'
-    )
+def _held(term: Term) -> Term:
+    """Return the term of a process that is not in the best form: its upper limit only."""
+    interval = (0.0, term.interval[1])
+    return replace(term, value=None, status=HELD, interval=interval, reason='not seen')
 
 
-def _doubted(terms, best, rivals):
+def _doubted(
+    terms: dict[str, Term], best: MomentFit, rivals: tuple[MomentFit, ...]
+) -> dict[str, Term]:
     """Return the terms; a term is weak when another form without it explains the curve as well."""
     doubted = {}
     for name, term in terms.items():
