@@ -1,9 +1,10 @@
 """
 The noise figures of an IMU, and the parameters of filters from them.
 
-Discrete noise, and Gauss-Markov processes for the slow part.
+Filters get a white noise and a random walk, or Gauss-Markov processes for the slow part.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,12 +26,13 @@ from imu_calibration.estimation.sensor_noise import BiasProcess
 
 HORIZON = 100.0
 """
-s; for a filter with white noise and a random walk only: the walk has the same Allan variance at
-this averaging time.
+Averaging time at which the random walk for a filter has the Allan variance of all slow processes,
+s.
 """
 MIN_WALK_REST = 3.0 * HORIZON
 """
-Rest from which a random walk is exported, s: it holds two differences of means over the horizon.
+Least rest for the export of a random walk, s: it contains two differences of means over the
+horizon.
 """
 SLOW_PROCESSES = (FLICKER.name, RANDOM_WALK.name, GAUSS_MARKOV)
 
@@ -43,32 +45,28 @@ class AxisFigures(AxisNoise):
     """Trends that were subtracted before the noise was estimated."""
     record_for: dict[str, float | None] = field(default_factory=dict)
     """
-    Name of a figure that is not determined -> seconds of rest that would do, None: more than two
-    days of it.
+    Name of a figure that is not determined -> rest that would determine it, s; None: more than two
+    days.
     """
     sample_sd: float = 0.0
-    """Standard deviation of single samples as measured."""
+    """Measured standard deviation of single samples."""
     deviation: tuple[float, ...] = ()
     """Allan deviations at the averaging times of the document."""
 
     def processes(self) -> list[tuple[NoiseProcess, float]]:
         """Return the processes of the model with their coefficients (squares of the figures)."""
-        found = []
+        processes = []
         for name in (QUANTISATION.name, WHITE.name, *self.form):
             term = self.terms.get(name)
-            if term is not None and term.value is not None:
-                time = self.terms[TIME_KEY] if name == GAUSS_MARKOV else None
-                found.append(
-                    (
-                        (
-                            PROCESSES[name]
-                            if time is None
-                            else gauss_markov(time.value or time.interval[0])
-                        ),
-                        term.value**2,
-                    )
-                )
-        return found
+            if term is None or term.value is None:
+                continue
+            if name == GAUSS_MARKOV:
+                time = self.terms[TIME_KEY]
+                process = gauss_markov(time.value or time.interval[0])
+            else:
+                process = PROCESSES[name]
+            processes.append((process, term.value**2))
+        return processes
 
     @property
     def white(self) -> float:
@@ -81,34 +79,28 @@ class AxisFigures(AxisNoise):
         term = self.terms[WHITE.name]
         if term.value is not None and term.interval[0] > 0:
             return term.value
-        return (
-            term.interval[1]
-            if np.isfinite(term.interval[1])
-            else self.sample_sd * float(np.sqrt(self.shortest))
-        )
+        if np.isfinite(term.interval[1]):
+            return term.interval[1]
+        return self.sample_sd * float(np.sqrt(self.shortest))
 
     def walk(self, horizon: float = HORIZON) -> tuple[float, str]:
         """
-        Return the density of the random walk that replaces the slow part, and its basis.
+        Return (density of the random walk that replaces the slow part, `Densities.basis`).
 
-        The walk with the total Allan variance of the slow processes at the horizon; without a slow
-        part in the curve, the largest walk that the curve allows.
+        The walk has the total Allan variance of the slow processes at the horizon, s; without a
+        slow part in the curve, it is the largest walk that the curve allows.
         """
-        slow = [
-            (process, coefficient)
-            for process, coefficient in self.processes()
-            if process.name in SLOW_PROCESSES
-        ]
-        if not slow:
+        names = []
+        variance = 0.0
+        for process, coefficient in self.processes():
+            if process.name in SLOW_PROCESSES:
+                names.append(process.name)
+                variance += coefficient * float(allan_variance(process, np.array([horizon]))[0])
+        if not names:
             return self.terms[RANDOM_WALK.name].interval[1], 'bound'
-        variance = sum(
-            coefficient * float(allan_variance(process, np.array([horizon]))[0])
-            for process, coefficient in slow
-        )
+        # K^2 tau / 3 is the Allan variance of a random walk of density K.
         density = float(np.sqrt(3.0 * variance / horizon))
-        return density, (
-            'walk' if [process.name for process, _ in slow] == [RANDOM_WALK.name] else 'equivalent'
-        )
+        return density, 'walk' if names == [RANDOM_WALK.name] else 'equivalent'
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +110,7 @@ class NoiseFigures:
     accelerometer: tuple[AxisFigures, ...]
     """x, y, z; empty where the sensor was absent or could not be used."""
     gyroscope: tuple[AxisFigures, ...]
-    """The same."""
+    """x, y, z; empty where the sensor was absent or could not be used."""
     rate: float
     """Sampling rate of the recording, Hz."""
     frame_id: str = ''
@@ -154,10 +146,11 @@ class NoiseFigures:
         """
         Return the two noise parameters of most filters for a sensor.
 
-        Its worst axis with a finite figure.
+        Each is that of its worst axis; axes without a finite walk do not count if another has one.
         """
         walks = [axis.walk(horizon) for axis in self.sensor(sensor)]
-        walk, basis = max([found for found in walks if np.isfinite(found[0])] or walks)
+        finite = [(walk, basis) for walk, basis in walks if np.isfinite(walk)]
+        walk, basis = max(finite or walks)
         return Densities(float(max(axis.white for axis in self.sensor(sensor))), float(walk), basis)
 
 
@@ -171,8 +164,8 @@ class Densities:
     """Per second and root hertz."""
     basis: str
     """
-    'walk' (found), 'equivalent' (replaces other slow noise) or 'bound' (none was seen: at most so
-    much).
+    'walk' (a walk was found), 'equivalent' (it replaces other slow noise) or 'bound' (no slow
+    noise: upper limit).
     """
 
     def sample_sd(self, rate: float) -> float:
@@ -181,33 +174,30 @@ class Densities:
 
     def step_sd(self, rate: float) -> float:
         """
-        Return the standard deviation of the step of the bias between samples.
-
-        It is the step from one sample to the next at a rate (Hz).
+        Return the standard deviation of the change of the bias between samples at a rate (Hz).
         """
         return self.walk / float(np.sqrt(rate))
 
 
 PROCESS_TIME_RATIO = 4.0
-"""Of neighbouring times: the density ripples by a hundredth."""
+"""Ratio of neighbouring correlation times: the density ripples by a hundredth."""
 PROCESS_TIMES = PROCESS_TIME_RATIO ** np.arange(1, 8)
-"""s: from the length of windows to four times that of sessions of an hour."""
+"""Times, s, from the length of windows to four times that of sessions of an hour."""
 
 
 def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
     """
     Return sensor -> its bias processes, from the mean of the axes' variances.
 
-    Empty for a sensor without slow noise.
-
-    Figures that are held do not enter: a bound is no measurement.
+    Empty for a sensor without slow noise. Upper limits of processes that were not found do not
+    count.
     """
     return {sensor: _processes(figures.sensor(sensor)) for sensor in figures.sensors}
 
 
-def _processes(axes):
+def _processes(axes: Sequence[AxisFigures]) -> tuple[BiasProcess, ...]:
     """
-    Return the bias processes whose variances are the means of those of the axes.
+    Return the bias processes with the mean variances of the axes.
 
     Flicker noise has the two-sided power density B^2 / (2 pi f). It is a sum of exponential
     correlations with the variance B^2 ln(ratio) / pi, one for each time of a geometric series with
@@ -227,6 +217,8 @@ def _processes(axes):
     share = 1.0 / len(axes)
     flicker *= share
     walk *= share
+
+    # Correlation time -> variance.
     variances = {time: flicker * np.log(PROCESS_TIME_RATIO) / np.pi for time in PROCESS_TIMES}
     variances[PROCESS_TIMES[-1]] += walk * PROCESS_TIMES[-1] / 2.0
     for time, variance in correlated.items():
