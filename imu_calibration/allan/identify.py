@@ -1,5 +1,6 @@
-"""Identification of the noise figures from a recording at rest: the public functions."""
+"""Identification of the noise figures from a recording at rest."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 
@@ -11,6 +12,7 @@ from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.moment_fit import Moments, Whitener
 from imu_calibration.allan.moved_at_rest import tilt_at_rest
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, ScaleCovariance
+from imu_calibration.allan.reading_faults import ReadingFaults
 from imu_calibration.allan.still_parts import LEFT_OUT, StillPart, Survey, still_parts, survey
 from imu_calibration.allan.terms import (
     LEAST_SCALES,
@@ -27,24 +29,23 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import LARGEST_STEP, BlockSource
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import DETERMINED
-from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
+from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, Chunks
 
 CYCLES = 64
 """
-Cycles of the hump's frequency in a segment: a resonance of quality below 16 is wider than the
-neighbouring ordinates of the test.
+Cycles of the hump's frequency in a segment, at most: a resonance of quality below 16 is wider than
+the neighbouring ordinates of the test.
 """
 FEWEST_CYCLES = 16
 """Cycles in the longest rest, at least: with fewer, slow noise and a line are not separable."""
 PER_CYCLE = 16
 """Block means per cycle: twice the hump's frequency, the highest under test, has eight."""
-LINE_HALF_BINS, LINE_NEIGHBOUR_BINS = 2, 9
-"""
-Half width of a line under a Hann window, and distance of the farthest neighbouring ordinates, in
-bins.
-"""
+LINE_HALF_BINS = 2
+"""Half width of a line under a Hann window, bins."""
+LINE_NEIGHBOUR_BINS = 9
+"""Distance of the farthest ordinates around a line, bins."""
 HANN_INDEPENDENT_SHARE = 2 / 3
-"""Share of independent ordinates under a Hann window, whose noise bandwidth is 1.5 bins."""
+"""Share of independent ordinates under a Hann window: its noise bandwidth is 1.5 bins."""
 LINE_P_VALUE = 1e-4
 """
 Significance level over all frequencies under test: six axes of 100 recordings without a line give
@@ -56,7 +57,8 @@ class ToneSearch:
     """
     Search for a line near the frequency of a hump in one axis, block by block.
 
-    The search covers half to twice the frequency of the hump, at constant memory.
+    Segments of block means are transformed, and their periodograms are added, at constant memory.
+    The search covers half to twice the frequency of the hump.
 
     Parameters
     ----------
@@ -72,16 +74,18 @@ class ToneSearch:
     """
 
     def __init__(self, frequency: float, period: float, column: int, *, longest: float):
-        self._frequency, self._column = frequency, column
+        self._frequency = frequency
+        self._column = column
+        # Samples of a block, and its length, s.
         self._block = max(int(1 / (PER_CYCLE * frequency * period)), 1)
         self._step = self._block * period
-        self._size = (
-            int(min(CYCLES / frequency, longest) / self._step)
-            if longest * frequency >= FEWEST_CYCLES
-            else 0
-        )
+        # Blocks of a segment; 0 if all rests are too short for a search.
+        self._size = 0
+        if longest * frequency >= FEWEST_CYCLES:
+            self._size = int(min(CYCLES / frequency, longest) / self._step)
+        # Sum of the periodograms of complete segments, their number, and samples of the next one.
         self._power = np.zeros(self._size // 2 + 1)
-        self._count = 0
+        self._n_segments = 0
         self._samples = np.zeros(0)
 
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
@@ -90,22 +94,16 @@ class ToneSearch:
 
         if not self._size or not present.any():
             return
-        self._samples = np.concatenate(
-            [
-                self._samples,
-                np.where(present, values[:, self._column], values[present, self._column].mean()),
-            ]
-        )
+        mean = values[present, self._column].mean()
+        new = np.where(present, values[:, self._column], mean)
+        self._samples = np.concatenate([self._samples, new])
         length = self._block * self._size
         while len(self._samples) >= length:
-            segment, self._samples = (
-                self._samples[:length].reshape(self._size, self._block).mean(axis=1),
-                self._samples[length:],
-            )
-            self._power += periodogram(
-                segment, window='hann', detrend='linear', scaling='spectrum'
-            )[1]
-            self._count += 1
+            segment = self._samples[:length].reshape(self._size, self._block).mean(axis=1)
+            self._samples = self._samples[length:]
+            _, power = periodogram(segment, window='hann', detrend='linear', scaling='spectrum')
+            self._power += power
+            self._n_segments += 1
 
     def end_stretch(self) -> None:
         """Discard the incomplete segment: the next sample belongs to another rest."""
@@ -113,59 +111,53 @@ class ToneSearch:
 
     def line(self) -> tuple[float, float] | None:
         """
-        Return (frequency in Hz, amplitude) of the most significant line.
+        Return (frequency in Hz, amplitude) of the most significant line, None without one.
 
-        None without a significant one.
+        F test of an ordinate against the mean of the ordinates around it, times the number of
+        frequencies.
         """
         bins = np.arange(LINE_NEIGHBOUR_BINS, len(self._power) - LINE_NEIGHBOUR_BINS)
         hertz = 1 / (max(self._size, 1) * self._step)
         bins = bins[(bins * hertz >= 0.5 * self._frequency) & (bins * hertz <= 2 * self._frequency)]
-        if not self._count or not len(bins):
+        if not self._n_segments or not len(bins):
             return None
-        offsets = np.r_[
-            -LINE_NEIGHBOUR_BINS:-LINE_HALF_BINS, LINE_HALF_BINS + 1 : LINE_NEIGHBOUR_BINS + 1
-        ]
+        below = np.arange(-LINE_NEIGHBOUR_BINS, -LINE_HALF_BINS)
+        above = np.arange(LINE_HALF_BINS + 1, LINE_NEIGHBOUR_BINS + 1)
+        offsets = np.concatenate([below, above])
         around = self._power[bins[:, None] + offsets].mean(axis=1)
         ratio = self._power[bins] / around
         best = int(np.argmax(ratio))
-        if (
-            not f_sf(
-                ratio[best],
-                2 * self._count,
-                2 * self._count * len(offsets) * HANN_INDEPENDENT_SHARE,
-            )
-            * len(bins)
-            < LINE_P_VALUE
-        ):
+        # An ordinate has two degrees of freedom in each segment.
+        freedom = 2 * self._n_segments
+        freedom_around = 2 * self._n_segments * len(offsets) * HANN_INDEPENDENT_SHARE
+        if not f_sf(ratio[best], freedom, freedom_around) * len(bins) < LINE_P_VALUE:
             return None
+
+        # The line is spread over its lobe; means over blocks lower its amplitude by a sinc.
         lobe = np.arange(bins[best] - LINE_HALF_BINS, bins[best] + LINE_HALF_BINS + 1)
         power = self._power[lobe]
-        place = float(power @ lobe / power.sum()) * hertz
-        square = (
-            max(power.sum() - len(lobe) * around[best], 0.0)
-            / self._count
-            * 2
-            * HANN_INDEPENDENT_SHARE
-        )
-        return place, float(np.sqrt(square) / np.sinc(place * self._step))
+        frequency = float(power @ lobe / power.sum()) * hertz
+        power_of_line = max(power.sum() - len(lobe) * around[best], 0.0) / self._n_segments
+        squared_amplitude = power_of_line * 2 * HANN_INDEPENDENT_SHARE
+        return frequency, float(np.sqrt(squared_amplitude) / np.sinc(frequency * self._step))
 
 
 LENGTHS = 60.0 * np.array(
     [10, 15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 720, 1080, 1440, 2160, 2880], float
 )
-"""Recordings that are thought of, s: from ten minutes to two days."""
+"""Possible lengths of a recording, s: from ten minutes to two days."""
 RELATIVE_SD = 0.24
 """
 Standard deviation of a coefficient over the coefficient at which the 95 % interval of its root has
 a ratio of 1.6.
 """
 SCALES_FROM = 0.1
-"""s; shorter averaging times determine the white noise only, at any length of recording."""
+"""Shortest averaging time of the prediction, s: shorter ones determine the white noise only."""
 
 
 class RecordingTimes:
     """
-    Predicts relative standard deviations of coefficients.
+    Predicts relative standard deviations of coefficients from one recording at rest.
 
     Parameters
     ----------
@@ -176,6 +168,7 @@ class RecordingTimes:
 
     def __init__(self, period: float):
         self._period = period
+        # Length of a recording, s -> covariance of its Allan variances, which is slow to compute.
         self._scales: dict[float, ScaleCovariance] = {}
 
     def needed(
@@ -200,22 +193,20 @@ class RecordingTimes:
         index: int,
     ) -> float:
         """
-        Return the standard deviation of a coefficient over the coefficient.
-
-        From one recording at rest of this length.
+        Return the standard deviation of coefficient `index` over it, from a recording of `seconds`.
         """
         moments = self._moments(seconds)
         design = moments.design(processes)
         tensor = moments.tensor(processes)
-        columns = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))(
-            design * coefficients
-        )
+        whiten = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))
+        columns = whiten(design * coefficients)  # of relative changes of the coefficients
         information = columns.T @ columns
         size = np.sqrt(np.diag(information))
         inverse = np.linalg.pinv(information / np.outer(size, size), rcond=1e-12, hermitian=True)
         return float(np.sqrt(inverse[index, index]) / size[index])
 
-    def _moments(self, seconds):
+    def _moments(self, seconds: float) -> Moments:
+        """Return moments of a recording of this length, with scales and without variances."""
         if seconds not in self._scales:
             n = int(seconds / self._period)
             factors = averaging_factors(n, per_octave=1)
@@ -255,11 +246,11 @@ class RestingRecord:
     sample_sd: np.ndarray
     """Standard deviation of single samples within a quarter of a second, shape (6,)."""
     survey: Survey
-    """The first reading."""
+    """Result of the first pass."""
     reader: RestReader
     """Reads the parts at rest again."""
     unusable: dict[str, str] = field(default_factory=dict)
-    """Sensor with readings whose noise cannot be identified -> why."""
+    """Sensor with readings but without identifiable noise -> reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,15 +264,17 @@ class NoiseIdentification:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Sensors whose noise is identified."""
-        return tuple(
-            sensor for sensor, part in SENSOR_COLUMNS.items() if self.axes[part.start] is not None
-        )
+        """Sensors with identified noise."""
+        identified = []
+        for sensor, columns in SENSOR_COLUMNS.items():
+            if self.axes[columns.start] is not None:
+                identified.append(sensor)
+        return tuple(identified)
 
 
 def identify_noise(source: BlockSource, nominal: RawReadings | None = None) -> NoiseIdentification:
     """
-    Identify the noise of an IMU from a recording that holds rest.
+    Identify the noise of an IMU from a recording that contains rest.
 
     Parameters
     ----------
@@ -297,26 +290,25 @@ def identify_noise(source: BlockSource, nominal: RawReadings | None = None) -> N
 
     """
     record = read_rest(source, nominal)
-    axes = [
-        None if moments is None else identify_axis(moments)
-        for moments in reported('identifying the noise', record.moments, len(record.moments))
-    ]
+    axes: list[AxisNoise | None] = []
+    for moments in reported('identifying the noise', record.moments, len(record.moments)):
+        axes.append(None if moments is None else identify_axis(moments))
+
+    # A hump of a curve is an oscillation only with a line in the spectrum.
     longest = max(part.seconds for part in record.parts)
-    searches = {
-        k: ToneSearch(axis.oscillation[0], record.curve.period, k, longest=longest)
-        for k, axis in enumerate(axes)
-        if axis is not None and axis.oscillation
-    }
+    searches: dict[int, ToneSearch] = {}
+    for k, axis in enumerate(axes):
+        if axis is not None and axis.oscillation:
+            frequency, _ = axis.oscillation
+            searches[k] = ToneSearch(frequency, record.curve.period, k, longest=longest)
     if searches:
         record.reader.read(*searches.values())
-    with_lines: list[AxisNoise | None] = []
     for k, axis in enumerate(axes):
-        line = searches[k].line() if k in searches else None
         if axis is not None:
+            line = searches[k].line() if k in searches else None
             axis = with_wider_white_noise(axis, record.curve.faults.factor(k))
-            axis = replace(axis, oscillation=line)
-        with_lines.append(axis)
-    return NoiseIdentification(record, tuple(with_lines))
+            axes[k] = replace(axis, oscillation=line)
+    return NoiseIdentification(record, tuple(axes))
 
 
 def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> RestingRecord:
@@ -325,45 +317,45 @@ def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> Restin
 
     Arguments as for `identify_noise`.
     """
-    # First pass: pieces of the recording without motion.
-    found = survey(source, nominal)
-    if found.period > LARGEST_STEP:
+    # First pass: parts of the recording without motion, of each epoch of the clock.
+    surveyed = survey(source, nominal)
+    if surveyed.period > LARGEST_STEP:
         raise InputError(
             f'the IMU must be read at least once in {LARGEST_STEP:g} s, the median step is'
-            f' {found.period:g} s; record at its full rate',
+            f' {surveyed.period:g} s; record at its full rate',
             code='rate_too_low',
         )
     parts = []
     left_out = dict.fromkeys(LEFT_OUT, 0.0)
-    for chunks in found.epochs:
-        still, left = still_parts(chunks, found.period, found.resolution)
-        parts.append(still)
+    for chunks in surveyed.epochs:
+        parts_of_epoch, seconds_left_out = still_parts(chunks, surveyed.period, surveyed.resolution)
+        parts.append(parts_of_epoch)
         for reason in LEFT_OUT:
-            left_out[reason] += left[reason]
-    flat = tuple(chain.from_iterable(parts))
-    seconds = sum(part.seconds for part in flat)
-    if seconds < MIN_CURVE_SAMPLES * found.period or not found.period:
+            left_out[reason] += seconds_left_out[reason]
+    all_parts = tuple(chain.from_iterable(parts))
+    seconds = sum(part.seconds for part in all_parts)
+    if seconds < MIN_CURVE_SAMPLES * surveyed.period or not surveyed.period:
         raise InputError(
             f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for'
             f' {seconds:.1f} s; record with the IMU lying still on something heavy, for an hour if'
             ' you can',
             code='rest_too_short',
         )
-    _require_no_tilt(found, parts)
+    _require_no_tilt(surveyed, parts)
 
     # Trends, which are no noise, are subtracted in the second pass.
-    clock = _Clock(found.epochs)
-    search = TrendSearch(_blocks(found, parts, clock))
-    skipped_sensors = {*found.absent, *found.unusable}
+    clock = _Clock(surveyed.epochs)
+    search = TrendSearch(_blocks(surveyed, parts, clock))
+    skipped_sensors = {*surveyed.absent, *surveyed.unusable}
     skipped = _axes_of(skipped_sensors)
     trends = tuple(() if axis in skipped else search.find(axis) for axis in range(6))
-    detrending = Detrending(trends, search.reference, clock.temperature(found))
-    reader = RestReader(source, parts, found.period, detrending, clock.time, nominal)
+    detrending = Detrending(trends, search.reference, clock.temperature(surveyed))
+    reader = RestReader(source, parts, surveyed.period, detrending, clock.time, nominal)
     curve = reader.curve()
 
     # Moments of the Allan variances of the axes with readings that scatter.
-    unusable = found.unusable | _without_scatter(curve, skipped_sensors)
-    skipped = _axes_of({*found.absent, *unusable})
+    unusable = surveyed.unusable | _without_scatter(curve, skipped_sensors)
+    skipped = _axes_of({*surveyed.absent, *unusable})
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
     moments: list[Moments | None] = []
     for axis, variance in enumerate(curve.variance.T):
@@ -376,20 +368,24 @@ def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> Restin
         curve=curve,
         moments=tuple(moments),
         trends=trends,
-        parts=flat,
+        parts=all_parts,
         left_out=left_out,
-        sample_sd=_sample_sd(found, parts),
-        survey=found,
+        sample_sd=_sample_sd(surveyed, parts),
+        survey=surveyed,
         reader=reader,
         unusable=unusable,
     )
 
 
-def _require_no_tilt(found, parts):
-    """Refuse a rest in which gravity turns slowly and the rates explain it."""
-    if found.absent or found.unusable:
+def _require_no_tilt(surveyed: Survey, parts: list[list[StillPart]]) -> None:
+    """
+    Refuse a rest in which gravity turns slowly and the rates explain it.
+
+    `parts` are those of each epoch of the clock.
+    """
+    if surveyed.absent or surveyed.unusable:
         return
-    for chunks, of_epoch in zip(found.epochs, parts, strict=True):
+    for chunks, of_epoch in zip(surveyed.epochs, parts, strict=True):
         for part in of_epoch:
             tilt = tilt_at_rest(chunks.time[part.chunks], chunks.mean[part.chunks])
             if tilt:
@@ -402,7 +398,7 @@ def _require_no_tilt(found, parts):
                 )
 
 
-def _axes_of(sensors):
+def _axes_of(sensors: Iterable[str]) -> set[int]:
     """Return the axes of some sensors, 0 to 5."""
     axes = set()
     for sensor in sensors:
@@ -411,12 +407,12 @@ def _axes_of(sensors):
     return axes
 
 
-def _without_scatter(curve, skipped):
+def _without_scatter(curve: AllanCurve, skipped: set[str]) -> dict[str, str]:
     """
-    Return the sensor with an axis of constant readings -> why its noise cannot be identified.
+    Return sensor with an axis of constant readings -> why its noise cannot be identified.
 
-    The quantisation of these readings hides the noise. Refused where no other sensor remains;
-    `skipped` are the sensors that are absent or unusable.
+    The quantisation of these readings hides the noise. `skipped` are the sensors that are absent or
+    unusable; an error is raised if no other sensor remains.
     """
     reasons = {}
     for sensor, part in SENSOR_COLUMNS.items():
@@ -438,7 +434,7 @@ def _without_scatter(curve, skipped):
 
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
-    """Return what is written to noise.yaml: the figures of all axes and the excluded parts."""
+    """Return the content of noise.yaml: the figures of all axes and the excluded parts."""
     record = result.record
     times = RecordingTimes(result.record.curve.period)
     axes_of_sensor: dict[str, list[AxisFigures]] = {sensor: [] for sensor in SENSORS}
@@ -479,9 +475,9 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
     )
 
 
-def _fault_entries(faults, sensors):
+def _fault_entries(faults: ReadingFaults, sensors: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return the doubtful readings of the sensors for noise.yaml: sensor or axis -> figures."""
-    entries = {}
+    entries: dict[str, dict[str, float]] = {}
     for k, sensor in enumerate(SENSORS):
         if sensor not in sensors:
             continue
@@ -497,21 +493,17 @@ def _fault_entries(faults, sensors):
     return entries
 
 
-def _record_for(axis, times):
+def _record_for(axis: AxisNoise, times: RecordingTimes) -> dict[str, float | None]:
     """
-    Return the required recording time of each figure that is not determined.
+    Return figure that is not determined -> recording time that determines it, s.
 
-    A bound counts with its upper limit.
+    A figure with an upper limit only has the size of this limit. None if no time is long enough.
     """
-    found = {}
+    needed = {}
     for name, term in axis.terms.items():
-        asked = name in (WHITE.name, RANDOM_WALK.name, *axis.form)
-        if (
-            term.status == DETERMINED
-            or not asked
-            or name not in PROCESSES
-            or not np.isfinite(term.interval[1])
-        ):
+        # White noise, a walk for filters, and the processes of the form, except correlation times.
+        wanted = name in (WHITE.name, RANDOM_WALK.name, *axis.form) and name in PROCESSES
+        if not wanted or term.status == DETERMINED or not np.isfinite(term.interval[1]):
             continue
         processes = list(axis.fit.processes)
         coefficients = list(axis.fit.coefficients)
@@ -520,76 +512,74 @@ def _record_for(axis, times):
             coefficients.insert(0, 0.0)
         index = [process.name for process in processes].index(name)
         coefficients[index] = (term.value or term.interval[1]) ** 2
-        some = [j for j in range(len(processes)) if coefficients[j] > 0]
-        found[name] = times.needed(
-            tuple(processes[j] for j in some),
-            np.array([coefficients[j] for j in some]),
-            some.index(index),
+        positive = [j for j in range(len(processes)) if coefficients[j] > 0]
+        needed[name] = times.needed(
+            tuple(processes[j] for j in positive),
+            np.array([coefficients[j] for j in positive]),
+            positive.index(index),
         )
-    return found
+    return needed
 
 
 class _Clock:
     """Time since the beginning of the recording, across new settings of the clock."""
 
-    def __init__(self, epochs):
+    def __init__(self, epochs: Sequence[Chunks]):
+        # First stamp of each epoch, ns, and its time since the beginning, s.
         self._first = [chunks.first_ns for chunks in epochs]
         lengths = [float(chunks.time[-1]) + EPOCH_GAP if len(chunks) else 0.0 for chunks in epochs]
         self._offset = np.concatenate([[0.0], np.cumsum(lengths)])
 
-    def time(self, epoch, stamp_ns):
+    def time(self, epoch: int, stamp_ns: np.ndarray) -> np.ndarray:
         """Return seconds since the beginning for stamps of an epoch."""
         return (stamp_ns - self._first[epoch]) * 1e-9 + self._offset[epoch]
 
-    def temperature(self, found):
+    def temperature(self, surveyed: Survey) -> tuple[np.ndarray, np.ndarray] | None:
         """
         Return (time, degrees Celsius) of the thinned temperatures, or None.
 
         They belong to the first epoch of the clock.
         """
-        if found.temperature is None:
+        if surveyed.temperature is None:
             return None
-        stamp_ns, values = found.temperature
+        stamp_ns, values = surveyed.temperature
         order = np.argsort(stamp_ns, kind='stable')
         return self.time(0, stamp_ns[order]), values[order]
 
 
-def _blocks(found, parts, clock):
-    """Return the means of equal numbers of chunks within the parts."""
-    total = sum(part.chunks.stop - part.chunks.start for part in chain.from_iterable(parts))
-    size = max(int(np.ceil(total / MAX_TREND_BLOCKS)), 1)
-    time = []
-    mean = []
-    number = []
+def _blocks(surveyed: Survey, parts: list[list[StillPart]], clock: _Clock) -> Blocks:
+    """Return the means of equal numbers of chunks within the parts, about `MAX_TREND_BLOCKS`."""
+    n_chunks = sum(part.chunks.stop - part.chunks.start for part in chain.from_iterable(parts))
+    size = max(int(np.ceil(n_chunks / MAX_TREND_BLOCKS)), 1)
+    times = []
+    means = []
+    numbers = []  # of the part of each block
     seconds = 0.0
-    for epoch, (chunks, of_epoch) in enumerate(zip(found.epochs, parts)):
+    for epoch, (chunks, of_epoch) in enumerate(zip(surveyed.epochs, parts)):
         for part in of_epoch:
-            inside = part.chunks
-            count = (inside.stop - inside.start) // size
-            take = slice(inside.start, inside.start + count * size)
-            time.append(
-                clock.time(
-                    epoch,
-                    chunks.first_ns + chunks.time[take].reshape(count, size).mean(axis=1) * 1e9,
-                )
-            )
-            mean.append(chunks.mean[take].reshape(count, size, 6).mean(axis=1))
-            number.append(np.full(count, len(number)))
+            first = part.chunks.start
+            n_blocks = (part.chunks.stop - first) // size
+            used = slice(first, first + n_blocks * size)
+            middle = chunks.time[used].reshape(n_blocks, size).mean(axis=1)
+            times.append(clock.time(epoch, chunks.first_ns + middle * 1e9))
+            means.append(chunks.mean[used].reshape(n_blocks, size, 6).mean(axis=1))
+            numbers.append(np.full(n_blocks, len(numbers)))
             seconds = size * float(np.median(chunks.duration))
-    time = np.concatenate(time)
-    warmth = clock.temperature(found)
+    time = np.concatenate(times)
+    temperature = clock.temperature(surveyed)
     return Blocks(
         time,
-        np.concatenate(mean),
-        np.concatenate(number),
+        np.concatenate(means),
+        np.concatenate(numbers),
         seconds,
-        None if warmth is None else np.interp(time, *warmth),
+        None if temperature is None else np.interp(time, *temperature),
     )
 
 
-def _sample_sd(found, parts):
+def _sample_sd(surveyed: Survey, parts: list[list[StillPart]]) -> np.ndarray:
+    """Return the standard deviation of samples within chunks, without bias, shape (6,)."""
     variances = []
-    for chunks, of_epoch in zip(found.epochs, parts):
+    for chunks, of_epoch in zip(surveyed.epochs, parts):
         variances += [chunks.sd[part.chunks] ** 2 for part in of_epoch]
-    size = found.epochs[0].size
+    size = surveyed.epochs[0].size
     return np.sqrt(np.concatenate(variances).mean(axis=0) * size / (size - 1))

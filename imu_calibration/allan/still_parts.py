@@ -1,7 +1,7 @@
 """
-The first pass over a recording (short means, period, temperature, faults), and the parts at rest.
+The first pass over a recording (short means, period, temperature, faults), and its parts at rest.
 
-From which its noise is estimated.
+A chunk is a short mean over a fixed number of samples, with their scatter.
 """
 
 from collections import Counter
@@ -12,7 +12,7 @@ import numpy as np
 
 from imu_calibration.allan.outliers import RestOutliers, without_outliers
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import SampleBlock, runs_of
+from imu_calibration.core.samples import SampleBlock, TemperatureSamples, runs_of
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import shrunk_mask
 from imu_calibration.preprocessing.scan import (
@@ -26,20 +26,20 @@ from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 OUTLIER = 8.0
 """
-Scatter and steps count as motion beyond so many of their usual (robust) deviations from the median.
+Robust standard deviations from the median beyond which a scatter or a step is motion.
 """
 LEAST_GROWTH = 1.25
-"""A scatter within this factor of the median is no motion, however regular it is otherwise."""
+"""Least factor on the median of a scatter that is motion, even if all others are equal."""
 FROZEN = 0.05
-"""Share of chunks without any scatter from which on an output is coarse."""
+"""Share of chunks without any scatter, from which an output is coarse."""
 SETTLING = 1.0
-"""Kept out on both sides of motion, s."""
+"""Time before and after motion that is excluded, s."""
 MIN_STILL_SECONDS = 2.0
 """Shortest part, s."""
 STEP_WIDTHS = (1, 4, 16, 64)
-"""Means of so many chunks are compared: a small step shows only against long ones."""
+"""Numbers of chunks per mean for the search of steps: small steps need long means."""
 PERIOD_MEDIAN_CHUNKS = 41
-"""Chunks among which a period is the usual one."""
+"""Chunks of the running median of the sampling period."""
 SAME_PERIOD = 0.02
 """Relative change of the sampling period that ends a part."""
 MOST_MISSING = 0.2
@@ -55,11 +55,11 @@ class StillPart:
     """A stretch at rest."""
 
     first_ns: int
-    """First stamp that belongs to it."""
+    """First stamp of the part."""
     end_ns: int
-    """First stamp that does not."""
+    """First stamp after the part."""
     chunks: slice
-    """Its chunks."""
+    """Chunks of the part."""
 
     @property
     def seconds(self) -> float:
@@ -69,8 +69,8 @@ class StillPart:
 
 LEFT_OUT = ('motion', 'short_rests', 'other_sampling_rate', 'frozen_output')
 """
-Reasons for which seconds are not used: motion and the time around it, pieces too short, another
-sampling rate, one reading again and again.
+Reasons for which time is not used: motion and the time around it, rests that are too short, another
+sampling rate, a repeated reading.
 """
 
 
@@ -78,7 +78,7 @@ def still_parts(
     chunks: Chunks, period: float, resolution: np.ndarray
 ) -> tuple[list[StillPart], dict[str, float]]:
     """
-    Return the parts at rest, and the seconds that were left out for each reason of `LEFT_OUT`.
+    Return (parts at rest, reason of `LEFT_OUT` -> seconds that are not used).
 
     Parameters
     ----------
@@ -92,32 +92,33 @@ def still_parts(
     """
     frozen = np.logical_or(*frozen_chunks(chunks, resolution).values())
     seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0
-    same = _at_the_usual_rate(chunks, period)
-    # frozen chunks have no scatter: with them nothing else would be as quiet as the quietest tenth
+    usual_rate = _at_the_usual_rate(chunks, period)
+    # Rest is relative to the quietest tenth of the chunks, which frozen chunks would all be.
     live = chunks.select(~frozen)
     still = np.zeros(len(chunks), bool)
-    still[~frozen] = _usual(live, still_chunks(live) & same[~frozen])
+    still[~frozen] = _without_unusual(live, still_chunks(live) & usual_rate[~frozen])
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
     inner = shrunk_mask(still, margin)
-    parts, short = [], 0.0
+    parts = []
+    seconds_short = 0.0
     for first, last in runs_of(inner, np.diff(chunks.time) > BRIDGE):
         part = _part(chunks, first, last)
         if part.seconds >= MIN_STILL_SECONDS:
             parts.append(part)
         else:
-            short += part.seconds
-    lost = {
-        'motion': float(np.sum(~inner & same & ~frozen)) * seconds,
-        'short_rests': short,
-        'other_sampling_rate': float(np.sum(~same & ~frozen)) * seconds,
+            seconds_short += part.seconds
+    seconds_left_out = {
+        'motion': float(np.sum(~inner & usual_rate & ~frozen)) * seconds,
+        'short_rests': seconds_short,
+        'other_sampling_rate': float(np.sum(~usual_rate & ~frozen)) * seconds,
         'frozen_output': float(np.sum(frozen)) * seconds,
     }
-    return parts, lost
+    return parts, seconds_left_out
 
 
-def _at_the_usual_rate(chunks, period):
+def _at_the_usual_rate(chunks: Chunks, period: float) -> np.ndarray:
     """
-    Return the chunks around which most have the usual period.
+    Return a mask of the chunks around which most have the usual period, shape (n_chunks,).
 
     A chunk with a lost sample is longer, its neighbours are not. Where outliers were dropped from
     most chunks, the median step between stamps is still the period.
@@ -134,8 +135,8 @@ def _at_the_usual_rate(chunks, period):
     return usual_mean | (usual_step & (np.abs(excess) <= MOST_MISSING))
 
 
-def _usual(chunks, still):
-    """Return the chunks at rest without outliers in scatter or step."""
+def _without_unusual(chunks: Chunks, still: np.ndarray) -> np.ndarray:
+    """Return the chunks at rest (mask) without chunks of unusual scatter or at a step."""
     if not still.any():
         return still
     scatter = np.log(np.maximum(chunks.sd, _least_scatter(chunks.sd[still])))
@@ -145,58 +146,72 @@ def _usual(chunks, still):
         usual &= column - middle <= max(OUTLIER * width, np.log(LEAST_GROWTH))
     still = still & usual
     for width in STEP_WIDTHS:
-        still = still & ~_stepping(chunks.mean, still, width)
+        still = still & ~_at_step(chunks.mean, still, width)
     return still
 
 
-def _least_scatter(sd):
+def _least_scatter(sd: np.ndarray) -> np.ndarray:
     """
-    Return the least meaningful scatter of each column.
+    Return the least meaningful scatter of each column, shape (6,).
 
-    The quantisation steps where a coarse converter often repeats a value.
+    For a coarse converter, which often repeats a value, it is the 90 % quantile of the scatter of
+    the chunks `sd`, otherwise zero.
     """
     frozen = (sd == 0).mean(axis=0) > FROZEN
     return np.where(frozen, np.maximum(np.quantile(sd, 0.9, axis=0), 1e-300), 1e-300)
 
 
-def _stepping(mean, still, width):
+def _at_step(mean: np.ndarray, still: np.ndarray, width: int) -> np.ndarray:
     """
-    Return the chunks at which the means before and after differ unusually.
+    Return a mask of the chunks at a step of the means, shape (n_chunks,).
 
-    The means of `width` chunks before and after differ by more than they usually do.
+    At a step the means of `width` chunks before and after, all at rest, differ by more than
+    `OUTLIER` times the usual difference, and by more than at all chunks nearby.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (n_chunks, 6)
+    still : ndarray of bool, shape (n_chunks,)
+        Mask of the chunks at rest.
+    width : int
+
     """
     from scipy.ndimage import maximum_filter1d  # here, because its import is slow
 
-    sums, count = (
-        np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
-        for values in (np.where(still[:, None], mean - mean[0], 0.0), still[:, None].astype(float))
-    )
-    whole = (count[width:] - count[:-width])[:, 0] == width
+    # Cumulative sums of the means at rest and of their number, from 0 on.
+    at_rest = np.where(still[:, None], mean - mean[0], 0.0)
+    sums = np.cumsum(np.concatenate([np.zeros((1, at_rest.shape[1])), at_rest]), axis=0)
+    n_still = np.cumsum(np.concatenate([np.zeros(1), still.astype(float)]))
+    all_still = n_still[width:] - n_still[:-width] == width
     means = (sums[width:] - sums[:-width]) / width
-    step = np.abs(means[width:] - means[:-width])
-    rests = whole[width:] & whole[:-width]
-    found = np.zeros(len(still), bool)
-    if rests.sum() < 4 * width:
-        return found
-    for column in step.T:
-        size = np.where(rests, column, 0.0)
-        usual = 1.4826 * np.median(column[rests])
-        peaks = (
-            (size > OUTLIER * usual) & (size == maximum_filter1d(size, 2 * width + 1)) & (usual > 0)
-        )
+
+    # Row k compares the chunks k to k + width - 1 with the next `width` chunks.
+    difference = np.abs(means[width:] - means[:-width])
+    comparable = all_still[width:] & all_still[:-width]
+    at_step = np.zeros(len(still), bool)
+    if comparable.sum() < 4 * width:
+        return at_step
+    margin = max(width // 8, 1)
+    for column in difference.T:
+        size = np.where(comparable, column, 0.0)
+        usual = 1.4826 * np.median(column[comparable])
+        if not usual > 0:
+            continue
+        peaks = size > OUTLIER * usual
+        peaks &= size == maximum_filter1d(size, 2 * width + 1)
         for peak in np.flatnonzero(peaks):
-            margin = max(width // 8, 1)
-            found[peak + width - margin : peak + width + margin] = True
-    return found
+            at_step[peak + width - margin : peak + width + margin] = True
+    return at_step
 
 
-def _centre(values):
-    """Return the median and the robust standard deviation."""
+def _centre(values: np.ndarray) -> tuple[float, float]:
+    """Return (median, robust standard deviation)."""
     middle = np.median(values)
     return middle, 1.4826 * np.median(np.abs(values - middle))
 
 
-def _part(chunks, first, last):
+def _part(chunks: Chunks, first: int, last: int) -> StillPart:
+    """Return the part of the chunks `first` to `last` - 1."""
     begin = chunks.time[first] - 0.5 * chunks.duration[first]
     end = chunks.time[last - 1] + 0.5 * chunks.duration[last - 1]
     return StillPart(
@@ -207,12 +222,12 @@ def _part(chunks, first, last):
 
 
 MAX_STILL_CHUNKS = 1_000_000
-"""Chunks, nearly three days."""
+"""Largest number of chunks: nearly three days."""
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Summary of a recording."""
+    """Result of the first pass over a recording."""
 
     epochs: list[Chunks]
     """Chunks of each epoch of the clock."""
@@ -231,12 +246,12 @@ class Survey:
     absent: tuple[str, ...] = ()
     """Sensors without readings."""
     unusable: dict[str, str] = field(default_factory=dict)
-    """Sensor with readings that cannot be used -> why, where the other one can be used."""
+    """Sensor with unusable readings -> reason, if the other sensor is usable."""
 
 
 def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) -> Survey:
     """
-    Read a recording once.
+    Read a recording once: its chunks, period, temperature and faults.
 
     Raises
     ------
@@ -257,16 +272,12 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
             series.setdefault(epoch, ChunkSeries(CHUNK_SECONDS, MAX_STILL_CHUNKS)).push(
                 imu.stamp_ns, columns
             )
-        for _, warmth in cleaned.temperature:
-            temperature.push(warmth)
+        for _, samples in cleaned.temperature:
+            temperature.push(samples)
     dropped = Counter(cleaner.lost)
-    dropped.update(
-        {
-            reason: count
-            for reason, count in preflight.streams['imu'].dropped.items()
-            if reason != 'clock reset'
-        }
-    )
+    for reason, count in preflight.streams['imu'].dropped.items():
+        if reason != 'clock reset':
+            dropped[reason] += count
     if outliers.replaced:
         dropped['outlier'] = outliers.replaced
     epochs = [item.chunks() for _, item in sorted(series.items())]
@@ -283,46 +294,48 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
     )
 
 
-def _period(epochs):
+def _period(epochs: list[Chunks]) -> float:
     """
-    Return the period of most chunks.
+    Return the period of most chunks, s; 0 without chunks.
 
-    The mean of those near the median, since stamps may be rounded to milliseconds. Near the median
-    step between stamps, where such chunks exist: dropped outliers lengthen the others.
+    It is the mean over the chunks with about the usual period, since stamps may be rounded to
+    milliseconds. The usual period is the median step between stamps if enough chunks have it,
+    because dropped outliers lengthen the other chunks; otherwise the median over the chunks.
     """
-    steps = (
-        np.concatenate([chunks.duration / chunks.size for chunks in epochs])
-        if epochs
-        else np.zeros(0)
-    )
+    if not epochs:
+        return 0.0
+    steps = np.concatenate([chunks.duration / chunks.size for chunks in epochs])
     if not len(steps):
         return 0.0
     middle = np.median(steps)
     usual_step = np.median(np.concatenate([chunks.step for chunks in epochs]))
     if np.mean(np.abs(steps / usual_step - 1.0) < SAME_PERIOD) > USUAL_STEP_SHARE:
         middle = usual_step
-    # Without rounding errors in the file.
+    # Nine digits, without rounding errors in the document.
     return float(f'{np.mean(steps[np.abs(steps / middle - 1.0) < SAME_PERIOD]):.9g}')
 
 
 class _Thinned:
-    """Temperatures not closer than a chunk."""
+    """Temperatures with at least the length of a chunk between them."""
 
-    def __init__(self):
-        self._stamps = []
-        self._values = []
+    def __init__(self) -> None:
+        # Kept stamps, ns, and temperatures of each call; the last kept stamp.
+        self._stamps: list[np.ndarray] = []
+        self._values: list[np.ndarray] = []
         self._last = -np.inf
 
-    def push(self, samples):
-        keep = []
+    def push(self, samples: TemperatureSamples) -> None:
+        """Add the next temperatures."""
+        kept = []
         for k, stamp in enumerate(samples.stamp_ns):
             if abs(float(stamp) - self._last) >= CHUNK_SECONDS * 1e9:
-                keep.append(k)
+                kept.append(k)
                 self._last = float(stamp)
-        self._stamps.append(samples.stamp_ns[keep])
-        self._values.append(samples.temperature_c[keep])
+        self._stamps.append(samples.stamp_ns[kept])
+        self._values.append(samples.temperature_c[kept])
 
-    def result(self):
+    def result(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return (stamps in ns, degrees Celsius) of all kept temperatures, None without any."""
         if not self._stamps or not sum(map(len, self._stamps)):
             return None
         return np.concatenate(self._stamps), np.concatenate(self._values)

@@ -1,8 +1,8 @@
 """
-Trends in the readings at rest, and noise that differs between rests.
+Trends in the readings at rest, and the level of the noise in different rests.
 
-The trends are due to temperature, settling after turn-on and steady drift. The noise is not the
-same at every rest.
+The trends are due to temperature, settling after turn-on and steady drift. They are subtracted
+before the Allan variances are computed.
 """
 
 from dataclasses import dataclass, field
@@ -18,15 +18,16 @@ from imu_calibration.allan.processes import (
 )
 
 MAX_TREND_BLOCKS = 200
+"""Approximate number of blocks of a recording."""
 MIN_TREND_SDS = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
 """
-A trend counts from this many standard deviations on: 1 in 1000, also with the shapes of turn-on
-that are tried.
+Least standard deviations of a trend: chance exceeds them in 1 of 1000 recordings, with all shapes
+of turn-on.
 """
 MIN_WARMTH_RANGE = 0.1
 """Range of the temperature, K, above which a trend with it is tested."""
 MIN_SPARE_BLOCKS = 12
-"""Trends are tested only with this many more blocks than constants."""
+"""Least number of blocks in excess of the number of parts for a test of trends."""
 SETTLING_SHARES = (1 / 40, 1 / 20, 1 / 10, 1 / 5)
 """Time constants of turn-on that are tried, as shares of the recording."""
 WALK_VARIANCE_RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e5, 37)])
@@ -38,14 +39,14 @@ TEMPERATURE_TREND, TURN_ON_TREND, RAMP_TREND = 'temperature', 'turn_on', 'ramp'
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Means of equal stretches at rest."""
+    """Means over n equal stretches at rest."""
 
     time: np.ndarray
     """Middle, s since the beginning of the recording, shape (n,)."""
     mean: np.ndarray
     """Readings, shape (n, 6)."""
     part: np.ndarray
-    """Part that each belongs to, shape (n,)."""
+    """Number of the part of each block, shape (n,)."""
     seconds: float
     """Length of a block."""
     temperature_c: np.ndarray | None = None
@@ -69,12 +70,12 @@ class AxisTrend:
         self, time: np.ndarray, temperature_c: np.ndarray | None, reference: 'TrendReference'
     ) -> np.ndarray:
         """Return the trend at instants (s since the beginning), shape (n,)."""
-        return self.value * _shape_of(self.name, self.time)(time, temperature_c, reference)
+        return self.value * _shape(self.name, self.time, time, temperature_c, reference)
 
 
 @dataclass(frozen=True)
 class TrendReference:
-    """Where the trends are zero, or begin."""
+    """Times and temperature at which trends are zero or begin."""
 
     begin: float = 0.0
     """Beginning of the recording, s."""
@@ -84,16 +85,26 @@ class TrendReference:
     """Mean temperature."""
 
 
-def _shape_of(name, constant=0.0):
-    """Return the regressor of a trend as a function of (time, temperature, reference)."""
-    return {
-        TEMPERATURE_TREND: lambda time, warmth, reference: warmth - reference.temperature_c,
-        TURN_ON_TREND: lambda time, warmth, reference: np.exp(-(time - reference.begin) / constant),
-        RAMP_TREND: lambda time, warmth, reference: time - reference.middle,
-    }[name]
+def _shape(
+    name: str,
+    time_constant: float,
+    time: np.ndarray,
+    temperature_c: np.ndarray | None,
+    reference: TrendReference,
+) -> np.ndarray:
+    """
+    Return the regressor of a trend at times, shape (n,).
+
+    Temperature: T - T_ref; turn-on: exp(-(t - begin) / time constant); ramp: t - middle.
+    """
+    if name == TEMPERATURE_TREND:
+        return temperature_c - reference.temperature_c
+    if name == TURN_ON_TREND:
+        return np.exp(-(time - reference.begin) / time_constant)
+    return time - reference.middle
 
 
-def _log_determinants(triangles):
+def _log_determinants(triangles: np.ndarray) -> np.ndarray:
     """
     Return the logarithms of the determinants of ``T.T @ T``, for triangular T of shape (k, n, n).
     """
@@ -102,7 +113,11 @@ def _log_determinants(triangles):
 
 class TrendSearch:
     """
-    Finds trends in the means of blocks.
+    Finds trends in the means of n blocks by generalised least squares.
+
+    The model of an axis is a constant for each part, trends, white noise and a random walk. The
+    ratio of both variances is the likeliest one of `WALK_VARIANCE_RATIOS` (restricted maximum
+    likelihood). A trend is a pair (name, time constant in s).
 
     Parameters
     ----------
@@ -112,26 +127,28 @@ class TrendSearch:
 
     def __init__(self, blocks: Blocks):
         self.blocks = blocks
+        # 1 in the blocks of each part, shape (n, n_parts).
         self._constants = (blocks.part[:, None] == np.unique(blocks.part)[None, :]).astype(float)
-        warmth = blocks.temperature_c
+        temperature_c = blocks.temperature_c
         begin = float(blocks.time[0] - blocks.seconds / 2)
         self.reference = TrendReference(
-            begin, float(blocks.time.mean()), 0.0 if warmth is None else float(warmth.mean())
+            begin,
+            float(blocks.time.mean()),
+            0.0 if temperature_c is None else float(temperature_c.mean()),
         )
-        lag = blocks.time[:, None] - blocks.time[None, :]
-        self._walk = mean_covariance(RANDOM_WALK, lag, blocks.seconds)
-        self._lag = lag
-        centred = (
-            self._walk
-            - self._walk.mean(axis=0)
-            - self._walk.mean(axis=1)[:, None]
-            + self._walk.mean()
-        )
-        self._scale = float(np.trace(centred)) / len(lag)
-        # Unit white noise and, for each ratio, the change of a random walk since the first block.
-        change = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
+        # Time between blocks, s, shape (n, n).
+        self._lag = blocks.time[:, None] - blocks.time[None, :]
+
+        # Covariance of the blocks by a random walk, and its mean variance about the mean block.
+        walk = mean_covariance(RANDOM_WALK, self._lag, blocks.seconds)
+        centred = walk - walk.mean(axis=0) - walk.mean(axis=1)[:, None] + walk.mean()
+        scale = float(np.trace(centred)) / len(walk)
+
+        # Unit white noise and, for each ratio, the change of a random walk since the first block:
+        # inverse factors, shape (n_ratios, n, n), and logarithms of the determinants.
+        change = walk - walk[:1] - walk[:, :1] + walk[0, 0]
         factors = np.linalg.cholesky(
-            np.eye(len(lag)) + WALK_VARIANCE_RATIOS[:, None, None] / self._scale * change
+            np.eye(len(walk)) + WALK_VARIANCE_RATIOS[:, None, None] / scale * change
         )
         self._inverses = np.linalg.inv(factors)
         self._logs = _log_determinants(factors)
@@ -143,47 +160,44 @@ class TrendSearch:
 
     def find(self, axis: int) -> tuple[AxisTrend, ...]:
         """
-        Return the trends of an axis (0 to 5), the temperature first.
+        Return the significant trends of an axis (0 to 5), the temperature first.
 
-        None of one that never changes.
+        An axis that never changes has none.
         """
         if not self.usable or not np.any(np.ptp(self.blocks.mean[:, axis])):
             return ()
         chosen: list[tuple[str, float]] = []
-        warmth = self.blocks.temperature_c
+        temperature_c = self.blocks.temperature_c
+        if temperature_c is not None and np.ptp(temperature_c) > MIN_WARMTH_RANGE:
+            by_temperature = self._most_significant(axis, chosen, [TEMPERATURE_TREND])
+            if by_temperature is not None:
+                chosen.append(by_temperature)
         while True:
-            asked = (
-                [TEMPERATURE_TREND]
-                if not chosen and warmth is not None and np.ptp(warmth) > MIN_WARMTH_RANGE
-                else []
-            )
-            found = self._clearest(axis, chosen, asked) or self._clearest(
-                axis, chosen, [TURN_ON_TREND, RAMP_TREND]
-            )
-            if found is None:
+            trend = self._most_significant(axis, chosen, [TURN_ON_TREND, RAMP_TREND])
+            if trend is None:
                 break
-            chosen.append(found)
+            chosen.append(trend)
         if not chosen:
             return ()
-        values, sd, _ = self.regress(axis, chosen)
-        return tuple(
-            AxisTrend(name, float(v), float(s), constant)
-            for (name, constant), v, s in zip(chosen, values, sd)
-        )
+        values, sds, _ = self.regress(axis, chosen)
+        trends = []
+        for (name, time_constant), value, sd in zip(chosen, values, sds):
+            trends.append(AxisTrend(name, float(value), float(sd), time_constant))
+        return tuple(trends)
 
-    def _clearest(self, axis, chosen, names):
+    def _most_significant(
+        self, axis: int, chosen: list[tuple[str, float]], names: list[str]
+    ) -> tuple[str, float] | None:
         """
-        Return the (name, time constant) of the most significant coefficient, or None.
-
-        The significance is given the coefficients that are already selected.
+        Return the most significant trend of some names in addition to the chosen trends, or None.
         """
         # Settling after turn-on is tried with several time constants.
         span = np.ptp(self.blocks.time) + self.blocks.seconds
         settling_times = [share * span for share in SETTLING_SHARES]
-        taken = {name for name, _ in chosen}
+        chosen_names = {name for name, _ in chosen}
         trials = []
         for name in names:
-            if name in taken:
+            if name in chosen_names:
                 continue
             for time_constant in settling_times if name == TURN_ON_TREND else [0.0]:
                 trials.append((name, time_constant))
@@ -199,28 +213,28 @@ class TrendSearch:
         return None if scores[best] < MIN_TREND_SDS[name] else trials[best]
 
     def columns(self, trends: list[tuple[str, float]]) -> np.ndarray:
-        """Return the regressors of (name, time constant), shape (n_blocks, n_trends)."""
-        shapes = [
-            _shape_of(*trend)(self.blocks.time, self.blocks.temperature_c, self.reference)
-            for trend in trends
-        ]
-        return np.column_stack([self._constants, *shapes])[:, self._constants.shape[1] :]
+        """Return the regressors of trends, shape (n, n_trends)."""
+        blocks = self.blocks
+        regressors = np.zeros((len(blocks.time), len(trends)))
+        for k, (name, time_constant) in enumerate(trends):
+            regressors[:, k] = _shape(
+                name, time_constant, blocks.time, blocks.temperature_c, self.reference
+            )
+        return regressors
 
     def regress(
         self, axis: int, trends: list[tuple[str, float]]
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """
-        Return coefficients, their standard deviations, and the index of a ratio.
-
-        The index is that of the likeliest ratio of `WALK_VARIANCE_RATIOS`.
+        Return (coefficients of the trends, their sds, index of the likeliest variance ratio).
         """
         design = np.column_stack([self._constants, self.columns(trends)])
         target = self.blocks.mean[:, axis]
         size = np.linalg.norm(design, axis=0)
         basis, triangle = np.linalg.qr(self._inverses @ (design / size))
-        rest = self._inverses @ target
-        along = np.einsum('rnk,rn->rk', basis, rest)
-        total = np.sum(rest**2, axis=1)
+        white = self._inverses @ target
+        along = np.einsum('rnk,rn->rk', basis, white)
+        total = np.sum(white**2, axis=1)
         freedom = len(target) - design.shape[1]
         # The residual of an axis with constant readings is a rounding error.
         squares = np.maximum(
@@ -233,46 +247,64 @@ class TrendSearch:
         return values[-len(trends) :], sd[-len(trends) :], best
 
     def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
-        """Return the share of the Allan variance that remains after subtraction of these trends."""
+        """
+        Return the share of the Allan variance that remains after subtraction of these trends.
+
+        The fitted trends are a linear function of the readings y, and contain a part of the noise:
+        with the design A and the whitening W of the fit, ``(1 - A (W A)^+ W) y`` remains.
+        """
         if not trends:
             return KeptShare()
-        shapes = [(trend.name, trend.time) for trend in trends]
-        inverse = self._inverses[self.regress(axis, shapes)[2]]
-        design = np.column_stack([self._constants, self.columns(shapes)])
-        whitened = inverse @ design
-        taken = np.eye(len(design)) - design @ np.linalg.pinv(whitened) @ inverse
+        pairs = [(trend.name, trend.time) for trend in trends]
+        _, _, ratio = self.regress(axis, pairs)
+        inverse = self._inverses[ratio]
+        design = np.column_stack([self._constants, self.columns(pairs)])
+        remaining = np.eye(len(design)) - design @ np.linalg.pinv(inverse @ design) @ inverse
+        # Blocks per mean, two per octave.
         counts = np.unique(
             np.rint(2.0 ** np.arange(0, np.log2(max(len(design) / 2, 1)) + 0.01, 0.5)).astype(int)
         )
-        shares = {
-            process.name: self._shares(process, counts, taken)
-            for process in (WHITE, FLICKER, RANDOM_WALK)
-        }
+        shares = {}
+        for process in (WHITE, FLICKER, RANDOM_WALK):
+            shares[process.name] = self._shares(process, counts, remaining)
         return KeptShare(counts * self.blocks.seconds, shares)
 
-    def _shares(self, process, counts, taken):
+    def _shares(
+        self, process: NoiseProcess, counts: np.ndarray, remaining: np.ndarray
+    ) -> np.ndarray:
+        """
+        Return the remaining share of the Allan variance of a process, shape (n_counts,).
+
+        With the second differences D at each of `counts` blocks per mean, the covariance C of the
+        process and the matrix R = `remaining`::
+
+            share = tr(D R C R' D') / tr(D C D')
+
+        """
         covariance = mean_covariance(process, self._lag, self.blocks.seconds)
         shares = np.ones(len(counts))
         for k, count in enumerate(counts):
             difference = self._differences(count)
             if len(difference):
-                left = difference @ taken
-                shares[k] = np.einsum('ij,jk,ik->', left, covariance, left) / np.einsum(
-                    'ij,jk,ik->', difference, covariance, difference
-                )
+                detrended = difference @ remaining
+                after = np.einsum('ij,jk,ik->', detrended, covariance, detrended)
+                before = np.einsum('ij,jk,ik->', difference, covariance, difference)
+                shares[k] = after / before
         return np.clip(shares, 0.02, 1.0)
 
-    def _differences(self, count):
-        """Return the second differences at `count` blocks per mean as rows, within parts only."""
+    def _differences(self, count: int) -> np.ndarray:
+        """
+        Return the matrix of differences of neighbouring means of `count` blocks, within parts.
+
+        Its shape is (n_differences, n).
+        """
         n = len(self.blocks.time)
-        starts = [
-            k
-            for k in range(n - 2 * count + 1)
-            if self.blocks.part[k] == self.blocks.part[k + 2 * count - 1]
-        ]
+        part = self.blocks.part
+        starts = [k for k in range(n - 2 * count + 1) if part[k] == part[k + 2 * count - 1]]
         rows = np.zeros((len(starts), n))
         for row, k in zip(rows, starts):
-            row[k : k + count], row[k + count : k + 2 * count] = -1.0 / count, 1.0 / count
+            row[k : k + count] = -1.0 / count
+            row[k + count : k + 2 * count] = 1.0 / count
         return rows
 
 
@@ -282,11 +314,11 @@ class KeptShare:
 
     tau: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Averaging times, s; empty without trends."""
-    shares: dict = field(default_factory=dict)
+    shares: dict[str, np.ndarray] = field(default_factory=dict)
     """Name of the process -> shares at `tau`."""
 
     def of(self, process: NoiseProcess, tau: np.ndarray) -> np.ndarray:
-        """Return the shares at averaging times."""
+        """Return the shares of a process at averaging times; of Gauss-Markov those of flicker."""
         if not len(self.tau):
             return np.ones(len(tau))
         shares = self.shares.get(process.name, self.shares[FLICKER.name])
@@ -300,30 +332,28 @@ class Parts:
     variance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """Shape (n_parts, n_scales); anything where a part has no term."""
     terms: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    """Second differences that each is the mean of, shape (n_parts, n_scales)."""
+    """Number of second differences of each variance, shape (n_parts, n_scales)."""
 
     def share(self) -> np.ndarray:
         """
-        Return the variance of the mean of all parts over that of a part.
+        Return the variance of the mean over all parts, over that of a part, shape (n_scales,).
 
-        If only their levels differ, shape (n_scales,).
+        It is that of parts of which only the levels differ, with the numbers of terms as weights.
         """
         return (self.terms**2).sum(axis=0) / self.terms.sum(axis=0) ** 2
 
     def scatter(self, used: np.ndarray, chance: np.ndarray) -> float:
         """
-        Return the relative standard deviation of the variances' level between parts.
+        Return the relative standard deviation of the level of the variances between parts.
 
-        It is the standard deviation between parts of the level of the variances, over the level, in
-        excess of sampling error.
-
-        The moment estimate of DerSimonian and Laird (Controlled Clinical Trials 7:177, 1986) with
-        the numbers of terms for weights, averaged over the averaging times, weighted by precision.
+        It is in excess of the sampling error. The moment estimate of DerSimonian and Laird
+        (Controlled Clinical Trials 7:177, 1986) with the numbers of terms for weights, averaged
+        over the averaging times, weighted by precision.
 
         Parameters
         ----------
         used : ndarray of bool, shape (n_scales,)
-            Which averaging times count.
+            Averaging times that count.
         chance : ndarray, shape (n_used,)
             Sampling variance of the mean of all parts over the square of its expectation.
 
