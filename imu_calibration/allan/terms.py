@@ -470,7 +470,7 @@ def _figures(choice: Choice, name: str, excess: float) -> dict[str, Term]:
     return terms
 
 
-def _term(name: str, value: float, interval: Sequence[float]) -> Term:
+def _term(name: str, value: float, interval: Sequence[float] | np.ndarray) -> Term:
     """Return the term of a figure, determined if the ratio of the ends of its interval is small."""
     lower, upper = (float(end) for end in interval)
     if not value > 0:

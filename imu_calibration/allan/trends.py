@@ -98,6 +98,7 @@ def _shape(
     Temperature: T - T_ref; turn-on: exp(-(t - begin) / time constant); ramp: t - middle.
     """
     if name == TEMPERATURE_TREND:
+        assert temperature_c is not None, 'a trend with the temperature was found with one'
         return temperature_c - reference.temperature_c
     if name == TURN_ON_TREND:
         return np.exp(-(time - reference.begin) / time_constant)
