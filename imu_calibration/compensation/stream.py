@@ -73,16 +73,23 @@ class CompensationStream:
             )
         self._vibration = BandVariance() if model.uses('vibration') else None
         self.count = 0
+        """Number of samples."""
         self.flagged = 0
+        """Number of samples that cannot be trusted (`Corrected.flagged`)."""
         self.frame_id = ''
+        """Frame of the last block."""
         self.slope = RateSlope(
             partial(derivative_for, calibration, transfer=transfer),
             bias=calibration.of('gyroscope', Role.OFFSET),
         )
         self._uncertainty = Uncertainty(calibration, transfer)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
-        self._fastest, self._temperatures = 0.0, []
+        self._largest_rate = 0.0
+        """Largest measured rate, rad/s."""
+        self._temperature_range: list[float] = []
+        """Lowest and highest temperature, degrees Celsius; empty without one."""
         self._last: dict[str, Any] = {}
+        """Arguments of `Uncertainty.at` at the last complete sample."""
         self.measured = dict.fromkeys(SENSORS, False)
         """Sensor -> whether a finite reading of it was received."""
 
@@ -100,7 +107,7 @@ class CompensationStream:
             self.slope.settle(line or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01)))
 
         # Inputs besides the readings: temperature, derivative of the rate, vibration.
-        temperature, branch = self._warmth_at(imu.stamp_ns)
+        temperature, branch = self._temperature_at(imu.stamp_ns)
         has_force = np.isfinite(imu.force_s).all(axis=1)
         has_rate = np.isfinite(imu.rate_s).all(axis=1)
         self.measured['accelerometer'] |= bool(has_force.any())
@@ -132,7 +139,7 @@ class CompensationStream:
         self.frame_id = imu.frame_id
         self.flagged += int(corrected.flagged.sum())
         squares = (imu.rate_s[has_rate] ** 2).sum(axis=1)
-        self._fastest = max(self._fastest, float(np.sqrt(squares.max(initial=0.0))))
+        self._largest_rate = max(self._largest_rate, float(np.sqrt(squares.max(initial=0.0))))
         usable = np.flatnonzero(has_force & has_rate)
         if len(usable):
             k = usable[-1]
@@ -150,9 +157,11 @@ class CompensationStream:
             }
         return corrected
 
-    def _vibration_of(self, force_s, finite):
+    def _vibration_of(self, force_s: np.ndarray, finite: np.ndarray) -> np.ndarray | None:
         """
-        Return the variance of vibration at the finite samples of a block; None if it is not needed.
+        Return the variance of vibration at the samples of a block, (m/s^2)^2, shape (n, 3).
+
+        At a sample that is not `finite` it is that before the block; None if it is not needed.
         """
         if self._vibration is None:
             return None
@@ -160,24 +169,22 @@ class CompensationStream:
         vibration[finite] = self._vibration.of(self.slope.period or 0.0, force_s[finite])
         return vibration
 
-    def _warmth_at(self, stamp_ns):
-        """
-        Return (temperatures, thermal branches) at stamps; None if they are absent or not needed.
-        """
-        if self.temperature is None or not len(self.temperature):
+    def _temperature_at(self, stamp_ns: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Return (temperatures, thermal branches) at stamps; None where absent or not needed."""
+        temperature = self.temperature
+        if temperature is None or not len(temperature):
             return None, None
-        origin = self.temperature.stamp_ns[0]
-        at = (stamp_ns - origin) * 1e-9
-        known = (self.temperature.stamp_ns - origin) * 1e-9
-        values = np.interp(at, known, self.temperature.temperature_c)
+        origin = temperature.stamp_ns[0]
+        time = (stamp_ns - origin) * 1e-9
+        measured_time = (temperature.stamp_ns - origin) * 1e-9
+        values = np.interp(time, measured_time, temperature.temperature_c)
         if len(values):
-            self._temperatures += [float(values.min()), float(values.max())]
-            self._temperatures = [min(self._temperatures), max(self._temperatures)]
-        return values, (
-            None
-            if self.temperature.branch is None
-            else np.interp(at, known, self.temperature.branch)
-        )
+            reached = [*self._temperature_range, float(values.min()), float(values.max())]
+            self._temperature_range = [min(reached), max(reached)]
+        branch = None
+        if temperature.branch is not None:
+            branch = np.interp(time, measured_time, temperature.branch)
+        return values, branch
 
     def propagate(
         self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None
@@ -193,24 +200,21 @@ class CompensationStream:
 
         """
         self._uncertainty.use(self.slope.derivative, self.slope.period)
-        force, rate = (
-            c if c is not None and is_known(c) else noise
-            for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise)
-        )
-        return self._uncertainty.at(**self._last, slope_error=self.slope.error()).covariances(
-            force, rate
-        )
+        force_noise, rate_noise = self._uncertainty.noise
+        if force_cov is None or not is_known(force_cov):
+            force_cov = force_noise
+        if rate_cov is None or not is_known(rate_cov):
+            rate_cov = rate_noise
+        sensitivity = self._uncertainty.at(**self._last, slope_error=self.slope.error())
+        return sensitivity.covariances(force_cov, rate_cov)
 
     def warnings(self) -> list[str]:
         """
         Return lines on samples outside the conditions of the calibration, or without correction.
         """
-        lines = outside_conditions(self.calibration, self._fastest, self._temperatures)
-        if (
-            self.frame_id
-            and self.calibration.frame_id
-            and self.frame_id != self.calibration.frame_id
-        ):
+        lines = outside_conditions(self.calibration, self._largest_rate, self._temperature_range)
+        names_both_frames = self.frame_id and self.calibration.frame_id
+        if names_both_frames and self.frame_id != self.calibration.frame_id:
             lines.append(
                 f"the messages carry frame_id '{self.frame_id}', the calibration is for"
                 f" '{self.calibration.frame_id}': make sure that it is the same sensor"
@@ -234,9 +238,8 @@ def derivative_for(
     arm = float(np.max(np.linalg.norm(arms_of(calibration), axis=1)))
     if transfer is not None:
         arm = max(arm, float(np.linalg.norm(transfer.arm_t)))
-    (force_sd, _), (rate_sd, _) = (
-        calibration.noise(sensor, period) for sensor in ('accelerometer', 'gyroscope')
-    )
+    force_sd, _ = calibration.noise('accelerometer', period)
+    rate_sd, _ = calibration.noise('gyroscope', period)
     return choose_derivative(period, float(rate_sd.max()), arm, force_sd=float(force_sd.min()))
 
 
@@ -291,13 +294,9 @@ def requested_transfer(
 
 
 def late_ns(calibration: FittedErrors, wanted: bool = True) -> int:
-    """
-    Return the correction of stamps, ns, positive backwards.
-
-    The time_offset of the calibration if `wanted`, otherwise 0.
-    """
-    late = calibration.of('reference', Role.DELAY) if wanted else None
-    return 0 if late is None else round(float(late) * 1e9)
+    """Return the delay to subtract from stamps, ns: the time_offset if `wanted`, otherwise 0."""
+    delay = calibration.of('reference', Role.DELAY) if wanted else None
+    return 0 if delay is None else round(float(delay) * 1e9)
 
 
 Vectors = Sequence[Sequence[float]] | np.ndarray
@@ -350,13 +349,13 @@ def compensate_readings(
     """
     if isinstance(samples, ImuSamples):
         return compensate_samples(calibration, samples, temperature_c)
-    found = compensate_samples(
+    corrected = compensate_samples(
         calibration, _as_samples(calibration, samples, rate_s, time), temperature_c
     )
-    return found.force_s, found.rate_s
+    return corrected.force_s, corrected.rate_s
 
 
-def _as_samples(calibration, force_s, rate_s, time):
+def _as_samples(calibration: FittedErrors, force_s: Vectors, rate_s: Any, time: Any) -> ImuSamples:
     """Return arrays as ImuSamples; times may be missing if no arm needs angular acceleration."""
     if time is None:
         if np.any(arms_of(calibration)):
@@ -369,7 +368,10 @@ def _as_samples(calibration, force_s, rate_s, time):
     return SampleBlock.from_arrays(time, force_s, rate_s).imu
 
 
-def _as_temperatures(temperature_c, stamp_ns):
+def _as_temperatures(
+    temperature_c: Temperatures | None, stamp_ns: np.ndarray
+) -> TemperatureSamples | None:
+    """Return a temperature, or one for each stamp, as TemperatureSamples."""
     if temperature_c is None or isinstance(temperature_c, TemperatureSamples):
         return temperature_c
     return TemperatureSamples(
@@ -400,22 +402,31 @@ class SampleCompensation:
         self.calibration = calibration
         self.transfer = transfer
         self.with_parameters = with_parameters
-        self.counts = Counter()
+        self.counts: Counter[str] = Counter()
+        """Reason -> number of samples that are not corrected, or with a fault."""
         self.corrected = 0
+        """Number of corrected samples."""
         self.fastest_squared = 0.0
+        """Largest squared rate since a user has set it to zero, (rad/s)^2."""
         model = invertible(calibration.model)
         self.needs_temperature = model.needs_temperature
         self.warming = None if self.needs_temperature else 0.0
+        """Temperature above the calibration's reference temperature, K; None before the first."""
         self.branch = ThermalBranch()
         self.vibration = BandVariance()
         self._shakes = model.uses('vibration')
+        """Whether the correction uses the vibration."""
         self.at_zero = {
             sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS
         }
+        """Sensor -> reading at zero input, SI."""
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
+        """Readings from which (force, rate) are saturated, SI."""
         self.needs_slope = uses_slope(calibration, transfer)
-        # The stamps determine the noise of a sample.
-        self._follows = self.needs_slope or self._shakes or calibration.knows_density
+        """Whether the correction uses the derivative of the rate."""
+        # With known densities the sampling period determines the noise of a sample.
+        self._needs_stamps = self.needs_slope or self._shakes or calibration.knows_density
+        """Whether the stamps are followed."""
         self.slope = RateSlope(
             partial(derivative_for, calibration, transfer=transfer),
             self._take_derivative,
@@ -430,15 +441,19 @@ class SampleCompensation:
             0.0,
             NO_SLOPE,
         )
+        """Arguments of `Uncertainty.at` at the last sample: force, rate, slope, and conditions."""
         self.revision = 0
         """Number of updates of the covariances."""
-        self._n_changes = self._restarts = 0
+        self._n_changes = 0
+        """`RateSlope.n_changes` at the last update of the covariances by the derivative."""
+        self._restarts = 0
+        """`RateSlope.restarts` at that update."""
         self._uncertainty = Uncertainty(calibration, transfer)
         self.refresh()
 
     def set_temperature(self, temperature_c: float) -> None:
         """Set the temperature near the sensor, degrees Celsius."""
-        if temperature_c - temperature_c != 0.0:
+        if temperature_c - temperature_c != 0.0:  # not finite
             return
         self.branch.push(temperature_c)
         if self.needs_temperature:
@@ -452,12 +467,15 @@ class SampleCompensation:
 
         `counts` has the reason.
         """
-        total = wx + wy + wz + fx + fy + fz
         warming = self.warming
-        if total - total != 0.0 or warming is None:
-            self.counts['no temperature yet' if warming is None else 'not finite'] += 1
+        if warming is None:
+            self.counts['no temperature yet'] += 1
             return None
-        slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
+        total = wx + wy + wz + fx + fy + fz
+        if total - total != 0.0:
+            self.counts['not finite'] += 1
+            return None
+        slope = self.slope.push(stamp_ns, wx, wy, wz) if self._needs_stamps else NO_SLOPE
         vibration = (
             self.vibration.push(self.slope.period or 0.0, (fx, fy, fz))
             if self._shakes
@@ -467,7 +485,7 @@ class SampleCompensation:
             fx, fy, fz, wx, wy, wz, *slope, warming, self.branch.now, *vibration
         )
         squared = vx * vx + vy * vy + vz * vz
-        if squared != squared:
+        if squared != squared:  # NaN
             self.counts['outside the invertible range'] += 1
             return None
         self.last = (
@@ -489,12 +507,14 @@ class SampleCompensation:
         self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the covariances of corrected (force, rate), each (3, 3).
+        Return the covariances of corrected (force, rate), each (3, 3), at their last update.
 
-        They are the covariances at the sample of their last update.
+        Parameters
+        ----------
+        force_cov, rate_cov : ndarray or None
+            Covariances of the readings, shape (3, 3); zero or invalid: the noise of the calibration
+            is used; None: the sensor is absent.
 
-        Covariances of the readings, (3, 3), may be zero or invalid: the noise of the calibration is
-        used; or None: not measured.
         """
         of_force, of_rate = self._uncertainty.noise
         force = _stated_covariance(force_cov, of_force)
@@ -514,13 +534,15 @@ class SampleCompensation:
 
     def _follow_slope(self) -> None:
         """Update the covariances while the derivative is not yet that of a full window."""
-        # The rest of the covariances is slow to compute, and changes with the motion only.
-        if not self._n_changes or self.slope.restarts != self._restarts:
+        # The gains are slow to compute, and change with the motion only.
+        is_first = not self._n_changes
+        if is_first or self.slope.restarts != self._restarts:
             self.refresh()
         else:
             self._sensitivity = self._sensitivity.with_slope_error(self.slope.error())
             self.revision += 1
-        self._n_changes, self._restarts = self.slope.n_changes, self.slope.restarts
+        self._n_changes = self.slope.n_changes
+        self._restarts = self.slope.restarts
 
     def prepare(self, before: 'SampleCompensation') -> None:
         """
@@ -548,16 +570,17 @@ class SampleCompensation:
         self.branch, self.vibration = before.branch, before.vibration
         self.slope.follow(before.slope)
 
-    def _take_derivative(self):
+    def _take_derivative(self) -> None:
+        """Update the covariances for another derivative or sampling period."""
         self._uncertainty.use(self.slope.derivative, self.slope.period)
         self.refresh()
 
 
 def _stated_covariance(covariance: np.ndarray | None, noise: np.ndarray) -> np.ndarray:
     """
-    Return the covariance of a reading, zero where it is not measured.
+    Return the covariance of a reading, shape (3, 3).
 
-    That of the `noise` where the message states none.
+    The stated one if it is valid, else that of the `noise`; zero for None, an absent sensor.
     """
     if covariance is None:
         return np.zeros((3, 3))
