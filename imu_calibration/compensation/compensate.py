@@ -148,7 +148,8 @@ class Transfer:
         )
 
     @cached_property
-    def _quaternion_st(self):
+    def _quaternion_st(self) -> tuple[float, ...]:
+        """Rotation from the target frame to the sensor frame, (x, y, z, w)."""
         from scipy.spatial.transform import Rotation  # here, because its import is slow
 
         return tuple(Rotation.from_matrix(self.mat_ts.T).as_quat().tolist())
@@ -161,6 +162,7 @@ class Transfer:
         """
         px, py, pz, pw = quaternion
         qx, qy, qz, qw = self._quaternion_st
+        # The product p q of quaternions.
         return (
             pw * qx + px * qw + py * qz - pz * qy,
             pw * qy - px * qz + py * qw + pz * qx,
@@ -187,9 +189,8 @@ def invertible(model: SensorModel) -> SensorModel:
 def invertible_values(calibration: FittedErrors) -> tuple[SensorModel, np.ndarray]:
     """Return (model, values) of the part of a calibration that compensation applies."""
     model = invertible(calibration.model)
-    values = np.concatenate(
-        [calibration.values[calibration.model.slices[e.key]] for e in model.effects]
-    )
+    slices = calibration.model.slices
+    values = np.concatenate([calibration.values[slices[effect.key]] for effect in model.effects])
     return model, values
 
 
@@ -237,23 +238,40 @@ def compensated_samples(
             code='temperature_missing',
         )
     with np.errstate(over='ignore', invalid='ignore'):
-        true_force, true_rate, left = _invert(
+        force, rate, last_step = _invert(
             model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch, vibration)
         )
-    beyond = left > CONVERGED
-    true_force[beyond] = true_rate[beyond] = np.nan
+    is_diverged = last_step > CONVERGED
+    force[is_diverged] = np.nan
+    rate[is_diverged] = np.nan
     marks = saturation_marks(calibration, force_s, rate_s)
-    flagged = marks.any(axis=1) | beyond
-    if transfer is None:
-        return Corrected(true_force, true_rate, flagged, marks)
-    return Corrected(*at_target(transfer, true_force, true_rate, alpha_s=alpha_s), flagged, marks)
+    flagged = marks.any(axis=1) | is_diverged
+    if transfer is not None:
+        force, rate = at_target(transfer, force, rate, alpha_s=alpha_s)
+    return Corrected(force, rate, flagged, marks)
 
 
-def _invert(model, values, force_s, rate_s, alpha_s, beside):
-    inverse = {s: np.linalg.inv(model.value(s, Role.LINEAR, values)) for s in SENSORS}
-    bias = {s: model.value(s, Role.OFFSET, values) for s in SENSORS}
+def _invert(
+    model: SensorModel,
+    values: np.ndarray,
+    force_s: np.ndarray,
+    rate_s: np.ndarray,
+    alpha_s: np.ndarray,
+    conditions: tuple[np.ndarray | None, ...],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Return true force, true rate, and the size of the last fixed-point step of each sample.
+
+    Shapes (n, 3), (n, 3), (n,). The step is infinite where it overflows, and NaN for a reading that
+    is not finite. `conditions` are temperature, thermal branch and vibration.
+    """
     measured = {'accelerometer': force_s, 'gyroscope': rate_s}
-    true = {s: (measured[s] - bias[s]) @ inverse[s].T for s in SENSORS}
+    inverse = {}
+    true = {}
+    for sensor in SENSORS:
+        bias = model.value(sensor, Role.OFFSET, values)
+        inverse[sensor] = np.linalg.inv(model.value(sensor, Role.LINEAR, values))
+        true[sensor] = (measured[sensor] - bias) @ inverse[sensor].T
     attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
     for _ in range(MAX_INVERSION_STEPS):
         change = np.zeros(len(force_s))
@@ -265,29 +283,32 @@ def _invert(model, values, force_s, rate_s, alpha_s, beside):
                 true['gyroscope'],
                 alpha_s,
                 0.0,
-                *beside,
+                *conditions,
             )
-            step = (measured[sensor] - sensor_output(model, sensor, values, ref=ref)) @ inverse[
-                sensor
-            ].T
+            residual = measured[sensor] - sensor_output(model, sensor, values, ref=ref)
+            step = residual @ inverse[sensor].T
             true[sensor] = true[sensor] + step
             change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))
         if np.max(change, initial=0.0) < 1e-14:
             break
-    given = np.isfinite(force_s).all(axis=1) & np.isfinite(rate_s).all(axis=1)
-    return (
-        true['accelerometer'],
-        true['gyroscope'],
-        np.where(np.isnan(change) & given, np.inf, change),
-    )
+    is_finite = np.isfinite(force_s).all(axis=1) & np.isfinite(rate_s).all(axis=1)
+    change = np.where(np.isnan(change) & is_finite, np.inf, change)
+    return true['accelerometer'], true['gyroscope'], change
 
 
 def at_target(
     transfer: Transfer, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (force, rate) at the target point in the target frame."""
-    force, rate, alpha = (vector @ transfer.mat_ts.T for vector in (force_s, rate_s, alpha_s))
-    return force - lever_matrix(rate, alpha) @ transfer.arm_t, rate
+    """
+    Return (force, rate) at the target point in the target frame, each shape (n, 3).
+
+    ``force = mat_ts f - (alpha x r + omega x (omega x r))`` with r = `Transfer.arm_t`, and omega
+    and alpha in the target frame.
+    """
+    force_t = force_s @ transfer.mat_ts.T
+    rate_t = rate_s @ transfer.mat_ts.T
+    alpha_t = alpha_s @ transfer.mat_ts.T
+    return force_t - lever_matrix(rate_t, alpha_t) @ transfer.arm_t, rate_t
 
 
 def saturation_level(calibration: FittedErrors, sensor: str) -> float:
@@ -304,9 +325,9 @@ def saturation_marks(
     calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray
 ) -> np.ndarray:
     """
-    Return the square of the saturation level where a component reaches it, else 0.
+    Return the square of the saturation level of (force, rate), shape (n, 2).
 
-    The components are the ones of (force, rate), and the result has shape (n, 2).
+    0 for a sample of which no component reaches the level.
     """
     marks = np.zeros((len(force_s), 2))
     for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):
@@ -329,11 +350,11 @@ def outside_conditions(
     Return lines on a largest rate (rad/s) and temperatures outside the range of the calibration.
     """
     lines = []
-    largest = calibration.conditions.get('largest_rate')
-    if largest is not None and fastest > 1.1 * largest + 0.1:
+    calibrated_rate = calibration.conditions.get('largest_rate')
+    if calibrated_rate is not None and fastest > 1.1 * calibrated_rate + 0.1:
         lines.append(
-            f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up'
-            ' to the rates of use'
+            f'the rate reaches {fastest:.2f} rad/s, the calibration saw {calibrated_rate:.2f};'
+            ' calibrate up to the rates of use'
         )
     limits = calibration.conditions.get('temperature_range_c')
     if limits and temperature_c:

@@ -26,6 +26,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import AXES, LEVER, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
+from imu_calibration.effects.sensor_model import SensorModel
 
 CONVERGED_CHANGE = 1e-13
 """
@@ -52,7 +53,7 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix
     here), and the temperature above the calibration's reference temperature (K). The thermal branch
     and the vibration ((m/s^2)^2; `kinematics.signal_history`) are 0 if they are not given.
-    Where the non-linear effects cannot be undone it returns NaN.
+    Where the non-linear effects cannot be inverted it returns NaN.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
             f' characters of arithmetic, got {len(text)}; use fewer or shorter effects',
             code='effects_too_long',
         )
-    cost = 'a sum that Python cannot compile'
+    cost = 'a sum that Python cannot compile'  # unless the operations can be counted
     with suppress(RecursionError, MemoryError):  # the compiler steps into each term of a sum
         n_operations = count_operations(ast.parse(text))
         if n_operations <= MAX_OPERATIONS:
@@ -113,23 +114,24 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     """
     Return the Python text of the function that `make_kernel` compiles.
 
-    Measured f, w, a to true force u, rate v and slope g. With the arm r and the rotation of a
-    transfer, and the lever matrix L::
+    It computes the true force u, rate v and angular acceleration g from the measured force f, rate
+    w and derivative of the rate a. With the arm r and the rotation of a transfer, and the lever
+    matrix L::
 
         g = inverse gyroscope matrix @ a
         output = mat_ts (u - L(v, g) r), mat_ts v
     """
     model, values = invertible_values(calibration)
-    known = _known(model.temperature_ref_c)
-    accel = _Part(model, 'accelerometer', values, known)
-    gyro = _Part(model, 'gyroscope', values, known)
+    replacements = _replacements(model.temperature_ref_c)
+    accel = _SensorSums(model, 'accelerometer', values, replacements)
+    gyro = _SensorSums(model, 'gyroscope', values, replacements)
 
     mat_ts = np.eye(3)
     arm_s = np.zeros(3)
     if transfer is not None:
         mat_ts = transfer.mat_ts
         arm_s = transfer.mat_ts.T @ transfer.arm_t
-    lever = LEVER.products(known)
+    lever = LEVER.products(replacements)
     force_of_arm = [_sum(arm_s, lever[start : start + 3]) for start in (0, 3, 6)]
 
     slope = _turned(gyro.inverse, _vector('a'))
@@ -141,9 +143,9 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     # from the rate and, linearly, from the slope.
     rate_is_explicit = gyro.uses <= BEFOREHAND
     force_is_explicit = accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'}
-    if rate_is_explicit and force_is_explicit and not accel.bends:
-        lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
-        force = _less(_less(accel.alone, accel.rest), force_of_arm)
+    if rate_is_explicit and force_is_explicit and not accel.has_nonlinear_slope:
+        lines += _assigned('v', _less(gyro.linear, gyro.disturbance), '    ')
+        force = _less(_less(accel.linear, accel.disturbance), force_of_arm)
         force = [_with_slope(row, slope) for row in force]
     else:
         lines += _assigned('g', slope, '    ') + _iteration(accel, gyro)
@@ -153,41 +155,62 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     return '\n'.join([*lines, *assignments, f'    return ({", ".join(texts)})']) + '\n'
 
 
-class _Part:
+class _SensorSums:
     """
-    One sensor: true = alone - rest(true), each three sums of products.
+    The equation of one sensor: true = linear - disturbance(true).
 
-    The sums are described in `effects.expressions`. `alone` is in the measured readings.
+    With the matrix M, the bias b and the other inverted effects e::
+
+        reading = b + M true + e(true)
+        linear = M^-1 (reading - b)
+        disturbance = M^-1 e(true)
+
+    Each vector is three sums of products (`effects.expressions`) in the variables of the kernel.
+
+    Parameters
+    ----------
+    model, values : SensorModel, ndarray
+        The inverted effects.
+    sensor : str
+    replacements : dict
+        As `_replacements`.
+
     """
 
-    def __init__(self, model, sensor, values, known):
+    def __init__(self, model: SensorModel, sensor: str, values: np.ndarray, replacements: dict):
         matrix = model.value(sensor, Role.LINEAR, values)
         bias = model.value(sensor, Role.OFFSET, values)
         self.inverse = np.linalg.inv(matrix)
-        # reading = bias + matrix @ true + further; true = inverse @ (reading - bias - further).
+        """M^-1, shape (3, 3)."""
         readings = _turned(self.inverse, _vector('f' if sensor == 'accelerometer' else 'w'))
         constants = self.inverse @ bias
-        self.alone = [added(row, {(): -constant}) for row, constant in zip(readings, constants)]
+        self.linear = [added(row, {(): -constant}) for row, constant in zip(readings, constants)]
+        """Sums in the measured readings, one per axis."""
 
+        # Coefficients of the columns of the other effects, shape (n_columns, 3).
         further = coefficients_at_point(model, sensor, values)
         further[model.columns_of(sensor, Role.OFFSET)] -= bias
         further[model.columns_of(sensor, Role.LINEAR)] -= matrix.T
         further = further @ self.inverse.T
-        self.rest = [{}, {}, {}]
-        self.uses = set()
+        self.disturbance: list[dict] = [{}, {}, {}]
+        """Sums in the true motion and the conditions, one per axis."""
+        self.uses: set[str] = set()
+        """Quantities on which the disturbance depends, as `BEFOREHAND`."""
         layout = model.layout(sensor)
         for name, group in layout.groups.items():
             block = further[layout.rows[name]]
             if np.any(block):
-                columns = group.products(known)
+                columns = group.products(replacements)
                 for axis in range(3):
-                    self.rest[axis] = added(self.rest[axis], _sum(block[:, axis], columns))
+                    self.disturbance[axis] = added(
+                        self.disturbance[axis], _sum(block[:, axis], columns)
+                    )
                 self.uses |= group.uses
 
     @property
-    def bends(self):
-        """Whether the angular acceleration enters the rest in a product or a function."""
-        for factors in chain.from_iterable(self.rest):
+    def has_nonlinear_slope(self) -> bool:
+        """Whether the angular acceleration enters the disturbance in a product or a function."""
+        for factors in chain.from_iterable(self.disturbance):
             product_text = ' '.join(factors)
             # Longer than the name itself, e.g. 'gx'.
             if re.search(r'\bg[xyz]\b', product_text) and len(product_text) > 2:
@@ -195,8 +218,8 @@ class _Part:
         return False
 
 
-def _known(temperature_ref_c):
-    """Return name in a column -> the sum of products that replaces it in the function."""
+def _replacements(temperature_ref_c: float) -> dict[str, dict]:
+    """Return name in a column -> the sum of products that replaces it in the kernel."""
     letters = {'f': 'u', 'w': 'v', 'alpha': 'g', 'vibration': 's'}
     vectors = {}
     for name, variable in letters.items():
@@ -209,22 +232,22 @@ def _known(temperature_ref_c):
     }
 
 
-def _iteration(accel, gyro):
+def _iteration(accel: _SensorSums, gyro: _SensorSums) -> list[str]:
     """
     Return the lines that compute the true force in u and the true rate in v.
 
     By the same steps as `compensation.compensate`.
     """
     # ax, ay, az are already in gx, gy, gz: a is the force, b the rate, from matrix and bias only.
-    lines = _assigned('a', accel.alone, '    ') + _assigned('b', gyro.alone, '    ')
+    lines = _assigned('a', accel.linear, '    ') + _assigned('b', gyro.linear, '    ')
     lines += [
         '    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz',
         f'    for _ in range({MAX_INVERSION_STEPS}):',
         '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz',
     ]
-    for part, true, alone in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
-        if any(part.rest):
-            lines += _assigned(true, _less(_vector(alone), part.rest), '        ')
+    for sums, true, linear in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
+        if any(sums.disturbance):
+            lines += _assigned(true, _less(_vector(linear), sums.disturbance), '        ')
     # p and q are the force u and the rate v of the previous step.
     components = ('ux', 'uy', 'uz', 'vx', 'vy', 'vz')
     previous = ('px', 'py', 'pz', 'qx', 'qy', 'qz')
@@ -238,28 +261,31 @@ def _iteration(accel, gyro):
     ]
 
 
-def _vector(letter):
+def _vector(letter: str) -> list[dict]:
+    """Return the components of a vector of the kernel as sums, e.g. fx, fy, fz."""
     return [{(letter + axis,): 1.0} for axis in AXES]
 
 
-def _sum(coefficients, rows):
+def _sum(coefficients: np.ndarray, rows: list[dict]) -> dict:
     """Return the linear combination of sums of products."""
     return added(*(scaled(row, float(c)) for c, row in zip(coefficients, rows)))
 
 
-def _turned(matrix, rows):
+def _turned(matrix: np.ndarray, rows: list[dict]) -> list[dict]:
+    """Return ``matrix @ rows`` of a vector of sums."""
     return [_sum(coefficients, rows) for coefficients in matrix]
 
 
-def _less(rows, others):
-    return [added(row, scaled(other, -1.0)) for row, other in zip(rows, others)]
+def _less(rows: list[dict], subtracted: list[dict]) -> list[dict]:
+    """Return the difference of two vectors of sums."""
+    return [added(row, scaled(other, -1.0)) for row, other in zip(rows, subtracted)]
 
 
-def _with_slope(row, slope):
+def _with_slope(row: dict, slope: list[dict]) -> dict:
     """
-    Return a sum with the derivative of the measured rate as angular acceleration.
+    Return a sum with g, the angular acceleration, replaced by its sums in the measured derivative.
 
-    The derivative replaces the angular acceleration, which enters as it is.
+    Each term contains a component of g not at all or as its only factor.
     """
     slope_of = {(f'g{axis}',): measured for axis, measured in zip(AXES, slope)}
     terms = []
@@ -271,19 +297,20 @@ def _with_slope(row, slope):
     return added(*terms)
 
 
-def _assigned(letter, rows, indent):
+def _assigned(letter: str, rows: list[dict], indent: str) -> list[str]:
     """Return the lines that assign three sums to the components of a vector, all at once."""
     lines, texts = _worked_out(rows, indent)
     return [*lines, f'{indent}{", ".join(letter + axis for axis in AXES)} = {", ".join(texts)}']
 
 
-def _worked_out(rows, indent):
-    """Return (lines that work each function and product out once, the sums as texts)."""
-    names = {}
-    lines = []
+def _worked_out(rows: list[dict], indent: str) -> tuple[list[str], list[str]]:
+    """Return (lines that compute each function and product once, the sums as texts)."""
+    names: dict[str, str] = {}
+    lines: list[str] = []
     sums = []
 
-    def name_of(text):
+    def name_of(text: str) -> str:
+        """Return the variable of a function or product, assigned at its first use."""
         if text not in names:
             names[text] = f'm{len(names)}'
             lines.append(f'{indent}{names[text]} = {text}')

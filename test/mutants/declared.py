@@ -1076,7 +1076,7 @@ SIGNS = _of(
     ),
     (
         'bias added instead of taken away',
-        '_Part.__init__',
+        '_SensorSums.__init__',
         '-_1',
         '_1',
         'test_kernel.py',
