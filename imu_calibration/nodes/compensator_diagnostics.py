@@ -31,7 +31,14 @@ ANOTHER_RATE = 0.1
 """Relative change of the period from which the stamps are worth another line."""
 COLD = 10.0
 """Seconds without a temperature after which diagnostics report it; drivers send one per second."""
-HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
+HEALTH_LEVELS: dict[str, Any] = {
+    WAITING: OK,
+    HOLDS: OK,
+    FOLLOWED: OK,
+    MOVED: WARN,
+    HARMS: ERROR,
+    UNIT: ERROR,
+}
 TEXT_OF_REASON = {
     WITHHELD: 'messages before the unit of the readings was known are not published',
     'no temperature yet': (

@@ -22,7 +22,6 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import true_calibration
@@ -37,7 +36,12 @@ from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
-from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, true_imu
+from imu_calibration.simulation.session import (
+    LiveSimulation,
+    SimulatedBlock,
+    SimulationOptions,
+    true_imu,
+)
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import trajectory_from_message
@@ -325,7 +329,7 @@ class SimulatorNode(Node):
                 until = min(until, self._motion.end)
             yield self._batch(self._simulation.take(until), until)
 
-    def _batch(self, block: SampleBlock, until: float) -> Batch:
+    def _batch(self, block: SimulatedBlock, until: float) -> Batch:
         """Return the messages of a block of samples in the order of their stamps."""
         encode_with_velocity = partial(encode_joints, with_velocity=self.settings.velocity)
         # Publisher, samples, and function that encodes them.

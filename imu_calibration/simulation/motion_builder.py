@@ -6,6 +6,7 @@ Rests, moves, ramps, spins and oscillations, with exact derivatives.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,9 +40,11 @@ class Segment:
     """
     A stretch of motion of all joints.
 
-    ``position = start + rate blend + shift blend + envelope * sum of sines``: the rate changes from
-    `rate_from` to `rate_to` and the position gains `shift`, both by smooth steps, and the sines
-    fade in and out.
+    With the smooth steps Q (quintic) and S (septic) from 0 to 1, the duration T and u = t / T::
+
+        position = start + rate_from t + (rate_to - rate_from) T integral Q du + shift S(u)
+                   + envelope(t) sum amplitude sin(2 pi frequency t + phase)
+        envelope = S(t / fade) - S(1 - (T - t) / fade)      with arguments limited to 0 to 1
     """
 
     kind: str
@@ -84,25 +87,31 @@ class Segment:
             self._add_sines(motion, time)
         return motion
 
-    def _add_steps(self, motion, time):
+    def _add_steps(self, motion: np.ndarray, time: np.ndarray) -> None:
+        """Add change of rate and shift to position and derivatives, shape (4, n, n_joints)."""
         part = time / self.duration
-        for steps, gain, power in (
-            (_RATE_STEP, self.rate_to - self.rate_from, 1),
-            (_POSITION_STEP, self.shift, 0),
-        ):
-            if gain.any():
-                for order in range(4):
-                    motion[order] += np.outer(
-                        steps[order](part), gain * self.duration ** (power - order)
-                    )
+        change = self.rate_to - self.rate_from
+        if change.any():
+            for order in range(4):
+                scale = change * self.duration ** (1 - order)
+                motion[order] += np.outer(_RATE_STEP[order](part), scale)
+        if self.shift.any():
+            for order in range(4):
+                scale = self.shift * self.duration ** (0 - order)
+                motion[order] += np.outer(_POSITION_STEP[order](part), scale)
 
-    def _add_sines(self, motion, time):
+    def _add_sines(self, motion: np.ndarray, time: np.ndarray) -> None:
+        """
+        Add the sines with their envelope to position and derivatives, shape (4, n, n_joints).
+
+        By Leibniz: ``(e w)^(m) = sum_i binomial(m, i) e^(m - i) w^(i)``.
+        """
+        # The envelope and its derivatives.
         rise = np.clip(time / self.fade, 0.0, 1.0)
         fall = np.clip((time - self.duration) / self.fade + 1.0, 0.0, 1.0)
-        envelope = [
-            (step(rise) - step(fall)) * self.fade**-order
-            for order, step in enumerate(_POSITION_STEP)
-        ]
+        envelope = []
+        for order, step in enumerate(_POSITION_STEP):
+            envelope.append((step(rise) - step(fall)) * self.fade**-order)
         # A segment has all three, or none.
         assert self.amplitude is not None
         assert self.frequency is not None and self.phase is not None
@@ -122,6 +131,7 @@ class Segment:
 
 
 _BINOMIAL = ((1,), (1, 1), (1, 2, 1), (1, 3, 3, 1))
+"""Coefficients of the derivatives of a product by their order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,18 +140,15 @@ class Profile:
 
     name: str
     """Name in the registry."""
-    segments: tuple
+    segments: tuple[Segment, ...]
     """Segments in the order of time."""
-    joint_names: tuple | None = None
+    joint_names: tuple[str, ...] | None = None
     """Joints in column order, when the profile is tied to a table."""
     table: dict | None = None
-    """
-    Description of the table that the profile is made for (as in the table's YAML), when it brings
-    its own.
-    """
+    """Description of the table that the profile is made for (as in the table's YAML), or None."""
 
     def table_moved(self, given: Table) -> Table:
-        """Return the table that moves: that of the profile if it has one, otherwise `given`."""
+        """Return the table of the profile if it has one, otherwise `given`."""
         return given if self.table is None else Table.from_mapping(self.table)
 
     @property
@@ -172,15 +179,20 @@ class Profile:
         motion = self._evaluate(np.clip(time, 0.0, self.duration))
         return JointMotion(time, *motion)
 
-    def _evaluate(self, time):
+    def _evaluate(self, time: np.ndarray) -> np.ndarray:
+        """Return position, rate, acceleration and jerk at times within the profile, (4, n, m)."""
         edges = self.edges
-        order = None if np.all(time[1:] >= time[:-1]) else np.argsort(time, kind='stable')
-        ordered = time if order is None else time[order]
+        order = None
+        ordered = time
+        if not np.all(time[1:] >= time[:-1]):
+            order = np.argsort(time, kind='stable')
+            ordered = time[order]
         motion = np.empty((4, len(time), len(self.segments[0].start)))
+        # Times low:high are in a segment.
         cuts = np.searchsorted(ordered, edges[1:-1])
-        for segment, start, low, high in zip(
-            self.segments, edges, [0, *cuts], [*cuts, len(time)], strict=False
-        ):
+        lows = [0, *cuts]
+        highs = [*cuts, len(time)]
+        for segment, start, low, high in zip(self.segments, edges, lows, highs, strict=False):
             if high > low:
                 motion[:, low:high] = segment.at(ordered[low:high] - start)
         if order is None:
@@ -192,9 +204,11 @@ class Profile:
     def find(self, kind: str) -> np.ndarray:
         """Return (start, end) of every segment of a kind, s, shape (n, 2)."""
         edges = self.edges
-        return np.array(
-            [(edges[i], edges[i + 1]) for i, s in enumerate(self.segments) if s.kind == kind]
-        ).reshape(-1, 2)
+        spans = []
+        for k, segment in enumerate(self.segments):
+            if segment.kind == kind:
+                spans.append((edges[k], edges[k + 1]))
+        return np.array(spans).reshape(-1, 2)
 
 
 class MotionBuilder:
@@ -220,9 +234,11 @@ class MotionBuilder:
         ramps.
         """
         self.segments: tuple[Segment, ...] = ()
+        """The segments so far."""
         self.dwell = dwell
         self.limits = limits or free_limits(n_joints)
         self.home = np.clip(np.zeros(n_joints), self.limits.lower, self.limits.upper)
+        """Zero, or the nearest position within the limits, shape (n_joints,)."""
         self._position = self.home if start is None else np.asarray(start, float)
 
     @property
@@ -240,35 +256,33 @@ class MotionBuilder:
 
     def move(self, angles_deg: ArrayLike, shortest: bool = True) -> 'MotionBuilder':
         """
-        Move to the joint angles (NaN: do not move that joint).
+        Move to the joint angles (NaN: do not move that joint), of which the first are repeated.
 
-        When `shortest`, each joint moves by less than half a turn.
+        When `shortest`, each endless joint moves by less than half a turn.
         """
-        return self.move_to(
-            np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest
-        )
+        angles = np.resize(np.asarray(angles_deg, float), self.n_joints)
+        return self.move_to(np.radians(angles), shortest)
 
     def move_to(self, target: np.ndarray, shortest: bool = True) -> 'MotionBuilder':
         """
-        Move to joint positions in rad and m.
+        Move to joint positions in rad and m (NaN: do not move that joint).
 
-        Endless joints by less than half a turn when `shortest`.
+        When `shortest`, each endless joint moves by less than half a turn.
         """
         shift = np.where(np.isnan(target), 0.0, target - self._position)
         if shortest:
-            shift = np.where(self.limits.endless, (shift + np.pi) % (2.0 * np.pi) - np.pi, shift)
+            wrapped = (shift + np.pi) % (2.0 * np.pi) - np.pi
+            shift = np.where(self.limits.endless, wrapped, shift)
         distance = np.abs(shift)
-        return (
-            self
-            if np.max(distance) < 1e-9
-            else self._append('move', move_time(distance, self.limits), shift=shift)
-        )
+        if np.max(distance) < 1e-9:
+            return self
+        return self._append('move', move_time(distance, self.limits), shift=shift)
 
     def spin(self, rates_deg: ArrayLike, duration: float) -> 'MotionBuilder':
         """
-        Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints).
+        Turn at each of the rates in `rates_deg`, shape (n_rates, n_joints), then stop.
 
-        For `duration` times dwell, then stop.
+        Each rate is constant for `duration` times dwell, s.
         """
         last = np.zeros(self.n_joints)
         for rate in np.radians(np.atleast_2d(np.asarray(rates_deg, float))):
@@ -287,9 +301,10 @@ class MotionBuilder:
         fade: float | None = None,
     ) -> 'MotionBuilder':
         """
-        Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,).
+        Swing every joint by sums of sines for `duration` times dwell, s.
 
-        For `duration` times dwell.
+        Amplitude, frequency (Hz) and phase (rad) have shape (n_sines, n_joints) or (n_joints,).
+        `fade` is as in `Segment`; by default the longest period.
         """
         return self.swing(np.radians(amplitude_deg), frequency, duration, phase=phase, fade=fade)
 
@@ -302,16 +317,14 @@ class MotionBuilder:
         phase: ArrayLike = 0.0,
         fade: float | None = None,
     ) -> 'MotionBuilder':
-        """Do the same with amplitudes in rad and m."""
+        """Swing every joint as `oscillate`, with amplitudes in rad and m."""
         amplitude = np.atleast_2d(np.asarray(amplitude, float))
-        frequency, phase = (
-            np.broadcast_to(np.asarray(value, float), amplitude.shape)
-            for value in (frequency, phase)
-        )
+        frequency = np.broadcast_to(np.asarray(frequency, float), amplitude.shape)
+        phase = np.broadcast_to(np.asarray(phase, float), amplitude.shape)
         duration = duration * self.dwell
-        fade = min(
-            0.5 * duration, 1.0 / np.min(frequency[amplitude != 0.0]) if fade is None else fade
-        )
+        if fade is None:
+            fade = 1.0 / np.min(frequency[amplitude != 0.0])
+        fade = min(0.5 * duration, fade)
         return self._append(
             'oscillation',
             duration,
@@ -321,7 +334,8 @@ class MotionBuilder:
             fade=fade,
         )
 
-    def _ramp(self, rate_from, rate_to):
+    def _ramp(self, rate_from: np.ndarray, rate_to: np.ndarray) -> 'MotionBuilder':
+        """Change the rates of the joints within the limits of acceleration, rad/s."""
         change = np.max(np.abs(rate_to - rate_from) / self.limits.acceleration)
         if change == 0.0:
             return self
@@ -329,7 +343,16 @@ class MotionBuilder:
             'ramp', max(SHORTEST_MOVE, PEAK_ACCELERATION_OF_RAMP * change), rate_from, rate_to
         )
 
-    def _append(self, kind, duration, rate_from=None, rate_to=None, shift=None, **sines):
+    def _append(
+        self,
+        kind: str,
+        duration: float,
+        rate_from: np.ndarray | None = None,
+        rate_to: np.ndarray | None = None,
+        shift: np.ndarray | None = None,
+        **sines: Any,
+    ) -> 'MotionBuilder':
+        """Append a Segment from the present position; None: zeros, `sines`: its other fields."""
         zero = np.zeros(self.n_joints)
         segment = Segment(
             kind,
@@ -346,19 +369,10 @@ class MotionBuilder:
 
 
 def move_time(distance: np.ndarray, limits: MotionLimits) -> float:
-    """
-    Return the duration of a move of all joints by `distance`.
-
-    Shape (n_joints,), within the limits, s.
-    """
-    rate = np.max(PEAK_RATE_OF_MOVE * distance / limits.speed)
-    return float(
-        max(
-            SHORTEST_MOVE,
-            rate,
-            np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration)),
-        )
-    )
+    """Return the duration of a move within the limits by `distance`, shape (n_joints,), s."""
+    by_speed = np.max(PEAK_RATE_OF_MOVE * distance / limits.speed)
+    by_acceleration = np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration))
+    return float(max(SHORTEST_MOVE, by_speed, by_acceleration))
 
 
 def stretch(build: Callable, duration: float) -> tuple[Segment, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class JointTrajectory:
         """
         Return the JointMotion at `time`, shape (m,).
 
-        Before the first point as there at rest, after the last at rest.
+        Outside the points the joints rest at the position of the first or the last one.
         """
         time = np.atleast_1d(np.asarray(time, float))
         inside = np.clip(time, self.time[0], self.time[-1])
@@ -58,16 +59,16 @@ class JointTrajectory:
         return JointMotion(time, *motion)
 
     @cached_property
-    def _curve(self):
+    def _curve(self) -> Any:
         """The polynomials (PPoly), each by the quantities that are given at both of its ends."""
         from scipy.interpolate import BPoly, PPoly  # here, because its import is slow
 
-        given = [
-            values for values in (self.position, self.rate, self.acceleration) if values is not None
-        ]
-        return PPoly.from_bernstein_basis(
-            BPoly.from_derivatives(self.time, np.stack(given, axis=1))
-        )
+        derivatives = [self.position]
+        for values in (self.rate, self.acceleration):
+            if values is not None:
+                derivatives.append(values)
+        bernstein = BPoly.from_derivatives(self.time, np.stack(derivatives, axis=1))
+        return PPoly.from_bernstein_basis(bernstein)
 
 
 def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajectory:
@@ -92,30 +93,31 @@ def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajec
             f'a trajectory must have points with {start.position.shape[1]} positions each, got'
             f' {points.position.shape}; name every joint of the table'
         )
-    parts = {
-        name: np.concatenate([getattr(start, name)[:1], values])
-        for name, values in points.columns().items()
-    }
-    return JointTrajectory(np.concatenate([[0.0], points.time]) + start.time[0], **parts)
+    # The present motion is the first point.
+    columns = {}
+    for name, values in points.columns().items():
+        columns[name] = np.concatenate([getattr(start, name)[:1], values])
+    return JointTrajectory(np.concatenate([[0.0], points.time]) + start.time[0], **columns)
 
 
 def braking_from(start: JointMotion, limits: MotionLimits) -> JointTrajectory:
     """
-    Return the braking trajectory within the acceleration limits.
+    Return the braking trajectory: within the acceleration limits, or faster to stay in the range.
 
-    More acceleration is used if the range ends before.
+    A joint with the rate w that brakes in the duration T moves by ``w T / 2``.
     """
     position = start.position[0]
     rate = start.rate[0]
-    wanted = float(np.max(PEAK_ACCELERATION_OF_BRAKING * np.abs(rate) / limits.acceleration))
+    duration = float(np.max(PEAK_ACCELERATION_OF_BRAKING * np.abs(rate) / limits.acceleration))
     room = np.where(rate > 0, limits.upper - position, position - limits.lower)
-    ends = room[(rate != 0) & (room > 0)] / np.abs(rate[(rate != 0) & (room > 0)])
-    duration = max(min([wanted, *2.0 * ends]), SHORTEST_BRAKING)
+    can_hit = (rate != 0) & (room > 0)
+    longest = 2.0 * (room[can_hit] / np.abs(rate[can_hit]))
+    duration = max(min([duration, *longest]), SHORTEST_BRAKING)
     return JointTrajectory(
-        start.time[0] + np.array([0.0, duration]),
-        np.stack([position, position + 0.5 * rate * duration]),
-        np.stack([rate, 0.0 * rate]),
-        np.zeros((2, len(rate))),
+        time=start.time[0] + np.array([0.0, duration]),
+        position=np.stack([position, position + 0.5 * rate * duration]),
+        rate=np.stack([rate, 0.0 * rate]),
+        acceleration=np.zeros((2, len(rate))),
     )
 
 
@@ -123,15 +125,14 @@ def limit_excess(
     trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.005
 ) -> tuple[float, float, float]:
     """
-    Return the excess of a trajectory over limits.
+    Return (position beyond the range, largest speed, largest acceleration) of a trajectory.
 
-    Positions beyond the range (rad or m; at most 0 within it), and the largest speed and
-    acceleration in units of theirs. Velocity jumps of straight lines are ignored.
+    The position is in rad or m, at most 0 within the range; speed and acceleration are in units of
+    their limits. They are evaluated every `step` s, without the velocity jumps of straight lines.
     """
-    count = max(int(np.ceil((trajectory.end - trajectory.time[0]) / step)), 20)
-    motion = trajectory.at(
-        np.union1d(np.linspace(trajectory.time[0], trajectory.end, count + 1), trajectory.time)
-    )
+    n_steps = max(int(np.ceil((trajectory.end - trajectory.time[0]) / step)), 20)
+    grid = np.linspace(trajectory.time[0], trajectory.end, n_steps + 1)
+    motion = trajectory.at(np.union1d(grid, trajectory.time))
     beyond = np.maximum(limits.lower - motion.position, motion.position - limits.upper)
     speed = np.abs(motion.rate) / limits.speed
     acceleration = np.abs(motion.acceleration) / limits.acceleration
@@ -233,18 +234,20 @@ class TableController:
         self._profile = profile
         self._repeat = repeat
         self._n_followed = 0
+        """Number of accepted trajectories."""
         self._home = np.clip(np.zeros(len(joint_names)), self.limits.lower, self.limits.upper)
-        self._taken: list[tuple[float, JointTrajectory]] = []
-        self._stalled: JointTrajectory | None = None
+        """Position at rest without a profile: zero, or the nearest one in the range."""
+        self._started: list[tuple[float, JointTrajectory]] = []
+        """The last `KEPT_MOTIONS` trajectories with their beginnings, s."""
+        self._stalling: JointTrajectory | None = None
+        """Braking trajectory from the stall on, of which one joint is used; None before."""
 
     @property
     def end(self) -> float:
-        """When the motion ends, s; infinite when it repeats or waits for trajectories."""
-        return (
-            np.inf
-            if self._profile is None or self._repeat or self._taken
-            else self._profile.duration
-        )
+        """Time at which the motion ends, s; infinite if it repeats or waits for trajectories."""
+        if self._profile is None or self._repeat or self._started:
+            return np.inf
+        return self._profile.duration
 
     def follow(self, now: float, points: TrajectoryPoints) -> None:
         """
@@ -260,7 +263,8 @@ class TableController:
         begin = now + self.settings.lag
         start = self._commanded(np.array([begin]))
         if not len(points):
-            return self._take(begin, braking_from(start, self.limits))
+            self._start(begin, braking_from(start, self.limits))
+            return
         if 0 <= self.settings.refuse_after <= self._n_followed:
             raise InputError(
                 f'the controller accepts at most {self.settings.refuse_after} trajectories, by its'
@@ -272,12 +276,21 @@ class TableController:
         if self.settings.limits != 'none':
             trajectory = self._within_limits(start, points, trajectory)
         self._n_followed += 1
-        return self._take(begin, trajectory)
+        self._start(begin, trajectory)
 
-    def _take(self, begin, trajectory):
-        self._taken = [*self._taken, (begin, trajectory)][-KEPT_MOTIONS:]
+    def _start(self, begin: float, trajectory: JointTrajectory) -> None:
+        """Follow a trajectory from the time `begin` on, s."""
+        self._started = [*self._started, (begin, trajectory)][-KEPT_MOTIONS:]
 
-    def _within_limits(self, start, points, trajectory):
+    def _within_limits(
+        self, start: JointMotion, points: TrajectoryPoints, trajectory: JointTrajectory
+    ) -> JointTrajectory:
+        """
+        Return the trajectory through `points`, slowed to the limits where the settings say so.
+
+        Raises an InputError where it exceeds the range, or speed and acceleration if it must not be
+        slowed.
+        """
         beyond, speed, acceleration = limit_excess(trajectory, self.limits)
         if beyond > LIMIT_ROUNDING:
             raise InputError(
@@ -285,8 +298,9 @@ class TableController:
                 f' {beyond:.3g} rad or m; see the limits in the description of the table',
                 code='joint_range',
             )
-        fastest = max(speed, np.sqrt(acceleration))
-        if fastest <= 1.0 + LIMIT_ROUNDING:
+        # A motion that is slower by this factor keeps both limits.
+        slowing = max(speed, np.sqrt(acceleration))
+        if slowing <= 1.0 + LIMIT_ROUNDING:
             return trajectory
         if self.settings.limits == 'refuse':
             raise InputError(
@@ -295,46 +309,50 @@ class TableController:
                 ' time',
                 code='joint_limits',
             )
-        return trajectory_from(start, points.slowed(1.0 / fastest))
+        return trajectory_from(start, points.slowed(1.0 / slowing))
 
     def at(self, time: np.ndarray) -> JointMotion:
         """Return the JointMotion at `time`, shape (m,)."""
         time = np.atleast_1d(np.asarray(time, float))
         motion = self._commanded(time)
-        late = time > self.settings.stall_time
-        if not self.settings.stall_joint or not late.any():
+        is_after_stall = time > self.settings.stall_time
+        if not self.settings.stall_joint or not is_after_stall.any():
             return motion
-        if self._stalled is None:
-            self._stalled = braking_from(
-                self._commanded(np.array([self.settings.stall_time])), self.limits
-            )
+        if self._stalling is None:
+            stall_start = self._commanded(np.array([self.settings.stall_time]))
+            self._stalling = braking_from(stall_start, self.limits)
         column = self.joint_names.index(self.settings.stall_joint)
-        stuck = self._stalled.at(time[late])
+        stalled = self._stalling.at(time[is_after_stall])
         for name in ('position', 'rate', 'acceleration', 'jerk'):
-            getattr(motion, name)[late, column] = getattr(stuck, name)[:, column]
+            getattr(motion, name)[is_after_stall, column] = getattr(stalled, name)[:, column]
         return motion
 
-    def _commanded(self, time):
-        """Motion of the joints if none of them stalled."""
-        begins = np.array([begin for begin, _ in self._taken])
-        which = np.searchsorted(begins, time, side='right') - 1
-        parts = np.zeros((4, len(time), len(self.joint_names)))
-        for k in np.unique(which):
-            mask = which == k
-            part = self._before(time[mask]) if k < 0 else self._taken[k][1].at(time[mask])
-            parts[:, mask] = part.position, part.rate, part.acceleration, part.jerk
-        return JointMotion(time, *parts)
+    def _commanded(self, time: np.ndarray) -> JointMotion:
+        """Return the motion of the joints if none of them stalled, at times of shape (m,)."""
+        begins = np.array([begin for begin, _ in self._started])
+        # Index of the last trajectory that began before each time; -1: the profile.
+        index = np.searchsorted(begins, time, side='right') - 1
+        motion = np.zeros((4, len(time), len(self.joint_names)))
+        for k in np.unique(index):
+            mask = index == k
+            if k < 0:
+                part = self._profile_motion(time[mask])
+            else:
+                _, trajectory = self._started[k]
+                part = trajectory.at(time[mask])
+            motion[:, mask] = part.position, part.rate, part.acceleration, part.jerk
+        return JointMotion(time, *motion)
 
-    def _before(self, time):
-        """Motion of the joints before the first trajectory."""
+    def _profile_motion(self, time: np.ndarray) -> JointMotion:
+        """Return the motion of the joints before the first trajectory, at times of shape (m,)."""
         if self._profile is None:
             zero = np.zeros((len(time), len(self.joint_names)))
             return JointMotion(time, zero + self._home, zero, zero, zero)
         if not self._repeat:
             return self._profile.at(time)
-        turns = np.floor(time / self._profile.duration)
-        motion = self._profile.at(time - turns * self._profile.duration)
+        # Each repetition starts from the position at the end of the previous one.
+        n_complete = np.floor(time / self._profile.duration)
+        motion = self._profile.at(time - n_complete * self._profile.duration)
         first, last = self._profile.at(np.array([0.0, self._profile.duration])).position
-        return replace(
-            motion, time=time, position=motion.position + turns[:, None] * (last - first)
-        )
+        position = motion.position + n_complete[:, None] * (last - first)
+        return replace(motion, time=time, position=position)
