@@ -11,7 +11,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import Role
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.forward_equations import References, clip, predict
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
@@ -31,7 +31,7 @@ from imu_calibration.simulation.sensor_noise import (
 )
 from imu_calibration.simulation.table_controller import TableController
 
-LOUDEST = 0.25
+LOUDEST_HUM = 0.25
 """Rms of the machine's vibration on each axis in its loudest gear, m/s^2."""
 GEAR_AMPLITUDES, GEAR_SECONDS = (0.0, 1.0, 0.5, 0.0, 0.75), 11.0
 """Relative amplitudes of the gears of the machine in their order, and time in each gear, s."""
@@ -41,9 +41,9 @@ ALIASED = 0.31
 
 def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the contribution of the machine to the specific force, and its variance.
+    Return (specific force by the machine's vibration, its variance), each shape (n, 3).
 
-    The units are m/s^2 and (m/s^2)^2, and each has shape (n, 3).
+    The units are m/s^2 and (m/s^2)^2.
 
     Parameters
     ----------
@@ -53,13 +53,9 @@ def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndar
         Samples per second.
 
     """
-    loudness = (
-        LOUDEST
-        * np.array(GEAR_AMPLITUDES)[
-            (np.asarray(time) // GEAR_SECONDS).astype(int) % len(GEAR_AMPLITUDES)
-        ][:, None]
-    )
-    return loudness * unit_hum(time, rate), np.tile(loudness**2, 3)
+    gear = (np.asarray(time) // GEAR_SECONDS).astype(int) % len(GEAR_AMPLITUDES)
+    rms = LOUDEST_HUM * np.array(GEAR_AMPLITUDES)[gear][:, None]
+    return rms * unit_hum(time, rate), np.tile(rms**2, 3)
 
 
 def unit_hum(time: np.ndarray, rate: float) -> np.ndarray:
@@ -107,19 +103,19 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
     Bias, matrix and arms scatter with the sd of the grade; every other effect is zero.
     """
     rng = np.random.default_rng([seed, 7])
-    grade = GRADES[grade]
+    sizes = GRADES[grade]
     values = model.start()
     for effect in model.effects:
         part = model.slices[effect.key]
         if effect.role is Role.OFFSET:
-            values[part] += rng.normal(
-                0.0, grade.accel_bias if effect.sensor == 'accelerometer' else grade.gyro_bias, 3
-            )
+            bias_sd = sizes.accel_bias if effect.sensor == 'accelerometer' else sizes.gyro_bias
+            values[part] += rng.normal(0.0, bias_sd, 3)
         elif effect.role is Role.LINEAR:
-            spread = np.where(np.eye(3), grade.scale, grade.misalignment).ravel()
-            values[part] += rng.normal(0.0, 1.0, 9) * spread
+            element_sd = np.where(np.eye(3), sizes.scale, sizes.misalignment).ravel()
+            values[part] += rng.normal(0.0, 1.0, 9) * element_sd
         elif effect.role is Role.ARMS:
-            arms = rng.normal(0.0, grade.arm, (3, 3))
+            # The arms are those from the mean of the three sensitive points.
+            arms = rng.normal(0.0, sizes.arm, (3, 3))
             values[part] = (arms - arms.mean(axis=0)).ravel()
     return values
 
@@ -133,7 +129,7 @@ def true_imu(
     catalogue: Catalogue = CATALOGUE,
 ) -> tuple[SensorModel, np.ndarray]:
     """
-    Return (model, values): the known ones, or those of a random IMU of a grade with size effect.
+    Return `known`, (model, values), or for None those of a random IMU of a grade with size effect.
     """
     if known is None:
         model = SensorModel(
@@ -180,24 +176,22 @@ def hidden_effect(
     sensor = model.catalogue.owner_of(name, model.joint_names)
     effect = model.catalogue.find(sensor, name, model.joint_names)
     if not effect.plausible:
-        or_else = (
-            ', or give its largest size in its definition (largest)' if effect.definition else ''
-        )
+        alternative = ''
+        if effect.definition:
+            alternative = ', or give its largest size in its definition (largest)'
         raise InputError(
             f"effect '{name}' cannot be simulated by name, for its size is not known; "
-            f'simulate with a calibration that contains it{or_else}',
+            f'simulate with a calibration that contains it{alternative}',
             key='calibration',
             code='size_unknown',
         )
     rng = np.random.default_rng([seed, 11])
-    values = (
-        share
-        * effect.largest
-        * rng.uniform(0.4, 1.0, effect.size)
-        * rng.choice((-1.0, 1.0), effect.size)
-    )
+    sizes = rng.uniform(0.4, 1.0, effect.size)
+    signs = rng.choice((-1.0, 1.0), effect.size)
+    values = share * effect.largest * sizes * signs
     if effect.nonnegative:
         values = np.abs(values)
+    # The last value is the moment of a step, or a time constant.
     if effect.timed:
         values[-1] = moment if effect.located else 0.8 * effect.prior_values()[-1]
     return sensor, values
@@ -262,7 +256,8 @@ class LiveSimulation:
         self.start_ns = start_ns
         self.causes = tuple(causes)
         self._rng = np.random.default_rng([seed, 3])
-        self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
+        self._n_samples = {'imu': 0, 'joints': 0, 'temperature': 0}
+        """Stream -> number of samples that `take` has returned."""
         self._noise = ImuNoise(
             options.noise, sample_rate=options.imu_rate, rng=self._rng, drawn=drawn
         )
@@ -275,57 +270,61 @@ class LiveSimulation:
             self._times('temperature', TEMPERATURE_RATE, 0.0, until),
         )
 
-    def _times(self, stream, rate, offset, until):
-        """Return the times of a stream's next samples before `until`, s."""
-        first = self._n[stream]
+    def _times(self, stream: str, rate: float, offset: float, until: float) -> np.ndarray:
+        """
+        Return the times of a stream's next samples before `until`, s.
+
+        Sample k is at ``(k + offset) / rate``.
+        """
+        first = self._n_samples[stream]
         stop = max(int(np.ceil(until * rate - offset)), first)
-        self._n[stream] = stop
+        self._n_samples[stream] = stop
         return (np.arange(first, stop) + offset) / rate
 
     def at(
         self, imu_time: np.ndarray, joint_time: np.ndarray, temperature_time: np.ndarray
     ) -> SimulatedBlock:
         """Return the samples at the times of each stream, s."""
+        # The order of the random numbers (IMU, then encoders) belongs to the result of a seed.
         imu = self._imu(imu_time)
         motion = self.motion.at(joint_time)
-        warmth = warm_up_temperature(temperature_time, self.options)
         position = read_encoders(motion.position, self.options.noise, self._rng)
         velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
         joints = JointSamples(
             self._stamps(motion.time), position, velocity, tuple(self.table.joint_names)
         )
-        return SimulatedBlock(
-            imu,
-            joints,
-            None if warmth is None else TemperatureSamples(self._stamps(temperature_time), warmth),
-            imu_time,
-        )
+        temperature = None
+        temperature_c = warm_up_temperature(temperature_time, self.options)
+        if temperature_c is not None:
+            temperature = TemperatureSamples(self._stamps(temperature_time), temperature_c)
+        return SimulatedBlock(imu, joints, temperature, imu_time)
 
-    def _stamps(self, time):
+    def _stamps(self, time: np.ndarray) -> np.ndarray:
+        """Return the stamps of times in s, ns."""
         return self.start_ns + np.round(time * 1e9).astype(np.int64)
 
-    def _imu(self, time):
+    def _imu(self, time: np.ndarray) -> ImuSamples:
+        """Return the readings at times in s: outputs, noise, and the limits of the sensors."""
         if not len(time):
             return ImuSamples(
                 np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id
             )
-        parts = zip(
-            *(
-                self._outputs(time[k : k + SIMULATED_BLOCK_SAMPLES])
-                for k in range(0, len(time), SIMULATED_BLOCK_SAMPLES)
-            )
-        )
-        noisy = self._noise.add(*map(np.concatenate, parts))
-        force, rate = (
-            clip(self.model, sensor, self.values, output=output)
-            for sensor, output in zip(SENSORS, noisy)
-        )
+        # In parts, which bound the memory.
+        force_parts = []
+        rate_parts = []
+        for k in range(0, len(time), SIMULATED_BLOCK_SAMPLES):
+            force, rate = self._noiseless_outputs(time[k : k + SIMULATED_BLOCK_SAMPLES])
+            force_parts.append(force)
+            rate_parts.append(rate)
+        force, rate = self._noise.add(np.concatenate(force_parts), np.concatenate(rate_parts))
+        force = clip(self.model, 'accelerometer', self.values, output=force)
+        rate = clip(self.model, 'gyroscope', self.values, output=rate)
         stamps = jitter_stamps(self._stamps(time), self.options.noise.stamp_jitter, self._rng)
         return ImuSamples(stamps, force, rate, self.options.frame_id)
 
-    def _outputs(self, time):
-        """Return the outputs of the sensors without noise, each (n, 3)."""
-        outputs = answered(
+    def _noiseless_outputs(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (force, rate) of the sensors with hidden causes and without noise, (n, 3) each."""
+        outputs = noiseless_outputs(
             self.model,
             self.values,
             self.table,
@@ -349,16 +348,16 @@ class LiveSimulation:
         force, rate = self._true_motion(block.imu_time)
         return ImuSamples(block.imu.stamp_ns, force, rate, self.options.frame_id)
 
-    def _true_motion(self, time):
-        """Return true specific force and rate, each (n, 3)."""
+    def _true_motion(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return true specific force and rate at the origin of the arms, each (n, 3)."""
         references = References(self.model, self.table, self.motion.at(time))
-        accelerometer, gyroscope = (references.at(sensor) for sensor in SENSORS)
+        accelerometer = references.at('accelerometer')
+        gyroscope = references.at('gyroscope')
         true_force = accelerometer.force_s
         arm = self.model.value('accelerometer', Role.ARM, self.values)
         if arm is not None:
-            true_force = (
-                true_force + lever_matrix(accelerometer.rate_s, accelerometer.alpha_s) @ arm
-            )
+            lever = lever_matrix(accelerometer.rate_s, accelerometer.alpha_s)
+            true_force = true_force + lever @ arm
         return true_force, gyroscope.rate_s
 
 
@@ -390,12 +389,12 @@ def simulate_session(
     (ImuSamples, JointSamples, TemperatureSamples or None)
 
     """
-    n_imu, n_joint = (
-        int(profile.duration * rate) for rate in (options.imu_rate, options.joint_rate)
-    )
-    block = LiveSimulation(
+    simulation = LiveSimulation(
         model, values, table, motion=profile, options=options, seed=seed, drawn=False
-    ).at(
+    )
+    n_imu = int(profile.duration * options.imu_rate)
+    n_joint = int(profile.duration * options.joint_rate)
+    block = simulation.at(
         np.arange(n_imu) / options.imu_rate,
         (np.arange(n_joint) + 0.5) / options.joint_rate,
         np.arange(0, profile.duration),
@@ -403,7 +402,7 @@ def simulate_session(
     return block.imu, block.joints, block.temperature
 
 
-def answered(
+def noiseless_outputs(
     model: SensorModel,
     values: np.ndarray,
     table: Table,
@@ -413,21 +412,20 @@ def answered(
     options: SimulationOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the outputs of the sensors without noise, each (n, 3).
+    Return (force, rate) of the sensors without noise, each (n, 3).
 
-    Motion, warm-up, and a machine if biases depend on vibration.
+    They follow from the motion, the warm-up, and a vibrating machine if biases depend on vibration.
     """
-    warmth = warm_up_temperature(time, options)
-    hum = 0.0
-    if warmth is not None:  # it never turns (`kinematics.signal_history`)
-        motion = replace(
-            motion,
-            thermal_branch=np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0),
-        )
+    temperature_c = warm_up_temperature(time, options)
+    if temperature_c is not None:
+        # A temperature that only rises has this branch (`kinematics.signal_history`).
+        rise = temperature_c - options.temperature_start_c
+        motion = replace(motion, thermal_branch=np.clip(rise / HALF_WIDTH, -1.0, 1.0))
+    hum: np.ndarray | float = 0.0
     if model.uses('vibration'):
         hum, variance = hum_and_variance(time, options.imu_rate)
         motion = replace(motion, vibration=variance)
-    force, rate = predict(model, values, table, motion=motion, temperature_c=warmth)
+    force, rate = predict(model, values, table, motion=motion, temperature_c=temperature_c)
     return force + hum, rate
 
 

@@ -21,7 +21,11 @@ from imu_calibration.references.turntable.selection.testable_effects import (
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
-from imu_calibration.simulation.session import SimulationOptions, answered, simulate_session
+from imu_calibration.simulation.session import (
+    SimulationOptions,
+    noiseless_outputs,
+    simulate_session,
+)
 
 from worlds.compensation_cases import random_calibration
 from worlds.diagnosing import diagnose
@@ -153,7 +157,7 @@ def test_a_machine_shakes_simulated_sensors_whose_bias_follows_vibration_recorde
         added, size * BandVariance().of(0.01, imu.force_s).mean(axis=0), rtol=0.1
     )
     time = (imu.stamp_ns - imu.stamp_ns[0]) * 1e-9
-    live = answered(
+    live = noiseless_outputs(
         model, values, table, motion=profile.at(time[:900]), time=time[:900], options=options
     )
     np.testing.assert_allclose(live[0], imu.force_s[:900], atol=1e-12)
