@@ -1,7 +1,7 @@
 """Simulation of a calibrated IMU on the motion of a recording."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,9 +36,7 @@ def predict_windows(
     windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
 ) -> dict[str, np.ndarray]:
     """
-    Return sensor -> output of a model without noise at the samples of some windows.
-
-    The units are m/s^2 and rad/s, and the shape is (n, 3).
+    Return sensor -> output of a model without noise at the samples of windows, shape (n, 3), SI.
     """
     motion, temperature, rows = all_samples(windows)
     if temperature is None and model.needs_temperature:
@@ -56,7 +54,7 @@ def recorded_noise(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
     """
     Return sensor -> noise of a recording.
 
-    Median over the windows at rest of their white noise, and no bias process.
+    The white noise is the median over the windows at rest; there is no bias process.
 
     Raises
     ------
@@ -64,17 +62,18 @@ def recorded_noise(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
         When no window is at rest.
 
     """
-    found = [window.noise_sd for window in windows if window.kind is WindowKind.STATIC]
-    if not found:
+    white_sds = [window.noise_sd for window in windows if window.kind is WindowKind.STATIC]
+    if not white_sds:
         raise InputError(
             'the noise must be in the statistics of the calibration, or a rest in the recording;'
             ' both are missing; calibrate from a recording with rests',
             key='calibration',
             code='noise_unknown',
         )
+    force_sd, rate_sd = np.median(white_sds, axis=0)
     return {
-        sensor: ReplayNoise(white, np.zeros(3))
-        for sensor, white in zip(SENSORS, np.median(found, axis=0))
+        'accelerometer': ReplayNoise(force_sd, np.zeros(3)),
+        'gyroscope': ReplayNoise(rate_sd, np.zeros(3)),
     }
 
 
@@ -88,9 +87,9 @@ def simulate_on_recording(
     seed: int = 0,
 ) -> tuple[SampleBlock, int]:
     """
-    Return (the recording with simulated readings, number of its samples left out).
+    Return (the recording with simulated readings, number of omitted samples).
 
-    Samples without known motion are left out.
+    Samples without known motion are omitted.
 
     Parameters
     ----------
@@ -120,6 +119,8 @@ def simulate_on_recording(
             ' the topics and the stamps',
             code='no_motion',
         )
+
+    # Outputs without noise.
     outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
     stamps = np.concatenate([window.stamp_ns for window in windows])
     period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
@@ -128,30 +129,42 @@ def simulate_on_recording(
     exact = {}
     for sensor in SENSORS:
         exact[sensor] = np.concatenate([output[sensor] for output in outputs])
-    if model.uses('vibration'):  # biases follow the vibration of the readings
-        of_chunks = []
+
+    # Biases follow the vibration of the readings: a hum with the variance of the recording.
+    if model.uses('vibration'):
+        variances = []
         for motion, _, rows in map(all_samples, chunks(windows)):
-            of_chunks.append(np.asarray(motion.vibration)[rows])
-        variance = np.concatenate(of_chunks)
+            variances.append(np.asarray(motion.vibration)[rows])
+        variance = np.concatenate(variances)
         unit = unit_hum(period * np.arange(len(variance)), 1.0 / period)
-        exact['accelerometer'] += unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
+        unit_variance = BandVariance().of(period, unit)[-1]
+        exact['accelerometer'] += unit * np.sqrt(variance / unit_variance)
+
+    # Noise and the limits of the sensors.
     readings = []
     for sensor in SENSORS:
-        own = noise[sensor]
+        sensor_noise = noise[sensor]
         shape = exact[sensor].shape
-        noisy = exact[sensor] + rng.normal(0.0, own.white_sd, shape)
-        noisy += gauss_markov_samples(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
+        noisy = exact[sensor] + rng.normal(0.0, sensor_noise.white_sd, shape)
+        noisy += gauss_markov_samples(
+            sensor_noise.bias_sd, sensor_noise.bias_time, period, shape=shape, rng=rng
+        )
         readings.append(clip(model, sensor, values, output=noisy))
-    frame = next(block.imu.frame_id for block in blocks if block.imu is not None and len(block.imu))
-    joints = _joined([block.joints for block in blocks])
-    temperature = _joined([block.temperature for block in blocks])
-    lost = sum(len(block.imu) for block in blocks if block.imu is not None) - len(stamps)
-    return (
-        SampleBlock(ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature),
-        lost,
+
+    # The other streams of the recording are unchanged.
+    imu_blocks = [block.imu for block in blocks if block.imu is not None]
+    frame_id = next(imu.frame_id for imu in imu_blocks if len(imu))
+    n_omitted = sum(len(imu) for imu in imu_blocks) - len(stamps)
+    force, rate = readings
+    replayed = SampleBlock(
+        ImuSamples(stamps, force, rate, frame_id),
+        _concatenated([block.joints for block in blocks]),
+        _concatenated([block.temperature for block in blocks]),
     )
+    return replayed, n_omitted
 
 
-def _joined(parts):
+def _concatenated(parts: list) -> Any:
+    """Return the samples of several blocks of one stream; None without samples."""
     parts = [part for part in parts if part is not None and len(part)]
     return type(parts[0]).concatenate(parts) if parts else None

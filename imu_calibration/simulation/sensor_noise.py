@@ -151,10 +151,11 @@ def gauss_markov_samples(
     """
     decay = np.exp(-step / correlation_time)
     drive = rng.normal(0.0, standard_deviation, shape)
-    drive[1 if before is None else 0 :] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
-    return autoregressive(
-        drive.reshape(len(drive), -1), decay, 0.0 if before is None else before
-    ).reshape(shape)
+    # The first value of a new process is from the stationary distribution.
+    first_step = 1 if before is None else 0
+    drive[first_step:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
+    start = 0.0 if before is None else before
+    return autoregressive(drive.reshape(len(drive), -1), decay, start).reshape(shape)
 
 
 def quantise(values: np.ndarray, step: float) -> np.ndarray:
@@ -168,9 +169,8 @@ def jitter_stamps(
     """Return stamps with white jitter (s), still int64 and in the order of arrival."""
     if standard_deviation == 0.0:
         return stamp_ns
-    return stamp_ns + np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns))).astype(
-        np.int64
-    )
+    jitter_ns = np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns)))
+    return stamp_ns + jitter_ns.astype(np.int64)
 
 
 class ImuNoise:
@@ -198,33 +198,38 @@ class ImuNoise:
         drawn: bool = False,
     ):
         self._model = model
-        self._rate = sample_rate
+        self._sample_rate = sample_rate
         self._rng = rng
-        sizes = (model.accel_instability, model.gyro_instability)
-        self._force_bias, self._rate_bias = (
-            [rng.normal(0.0, size, 3) for size in sizes] if drawn else (None, None)
-        )
+        self._force_bias: np.ndarray | None = None
+        """Last bias of the accelerometer, m/s^2, shape (3,); None before the first samples."""
+        self._rate_bias: np.ndarray | None = None
+        """Last bias of the gyroscope, rad/s, shape (3,); None before the first samples."""
+        if drawn:
+            self._force_bias = rng.normal(0.0, model.accel_instability, 3)
+            self._rate_bias = rng.normal(0.0, model.gyro_instability, 3)
 
     def add(self, force_s: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         Return readings from outputs without noise, m/s^2 and rad/s, shape (n, 3), n at least 1.
         """
         model = self._model
-        force, self._force_bias = self._added(
+        force, self._force_bias = self._with_noise(
             force_s, model.accel_density, model.accel_instability, self._force_bias
         )
-        rate, self._rate_bias = self._added(
+        rate, self._rate_bias = self._with_noise(
             rate_s, model.gyro_density, model.gyro_instability, self._rate_bias
         )
         return quantise(force, model.accel_resolution), quantise(rate, model.gyro_resolution)
 
-    def _added(self, true, density, instability, before):
-        """Return (values with noise, last value of the bias)."""
-        values = true + self._rng.normal(0.0, density * np.sqrt(self._rate), true.shape)
+    def _with_noise(
+        self, true: np.ndarray, density: float, instability: float, before: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (values with noise, last value of the bias), which continues from `before`."""
+        values = true + self._rng.normal(0.0, density * np.sqrt(self._sample_rate), true.shape)
         bias = gauss_markov_samples(
             instability,
             self._model.correlation_time,
-            1.0 / self._rate,
+            1.0 / self._sample_rate,
             shape=true.shape,
             rng=self._rng,
             before=before,
@@ -238,18 +243,12 @@ def read_encoders(
     """
     Return joint positions as read by noisy encoders of finite resolution, rad, shape (n, n_joints).
     """
-    return quantise(
-        position + rng.normal(0.0, model.encoder_noise, np.shape(position)),
-        model.encoder_resolution,
-    )
+    noisy = position + rng.normal(0.0, model.encoder_noise, np.shape(position))
+    return quantise(noisy, model.encoder_resolution)
 
 
-class Felt(NamedTuple):
-    """
-    True motion of the housing, and the outputs of its sensing elements up to this cause.
-
-    All shape (n, 3).
-    """
+class SensorMotion(NamedTuple):
+    """True motion of the housing, and the outputs of its sensors so far, all of shape (n, 3)."""
 
     true_force: np.ndarray
     """Specific force, m/s^2."""
@@ -261,49 +260,42 @@ class Felt(NamedTuple):
     """Output of the gyroscopes, rad/s."""
 
 
-Cause = Callable[[Felt], Felt]
+Cause = Callable[[SensorMotion], SensorMotion]
+"""A fault of the sensors: returns the same motion with the changed outputs."""
 
 
 def _two_half_ranges(rng: np.random.Generator) -> Cause:
-    """
-    Each gyroscope's electrodes have different gains for the two senses of rotation.
-
-    By 0.2 to 0.4 %.
-    """
+    """Gains of each gyroscope that differ by 0.2 to 0.4 % between the two senses of rotation."""
     gap = rng.uniform(2e-3, 4e-3, 3) * rng.choice([-1, 1], 3)
-    return lambda felt: felt._replace(rate=felt.rate + 0.5 * gap * np.abs(felt.true_rate))
+    return lambda motion: motion._replace(rate=motion.rate + 0.5 * gap * np.abs(motion.true_rate))
 
 
 def _unbalanced_mass(rng: np.random.Generator) -> Cause:
-    """
-    The gyroscopes' masses are off their axes: specific force turns them, 20 to 60 deg/h per g.
-    """
+    """Gyroscopes with masses off their axes: they read 20 to 60 deg/h per g of specific force."""
     per_force = (
         rng.uniform(20.0, 60.0, (3, 3)) * rng.choice([-1, 1], (3, 3)) * DEG_H / STANDARD_GRAVITY
     )
-    return lambda felt: felt._replace(rate=felt.rate + felt.true_force @ per_force.T)
+    return lambda motion: motion._replace(rate=motion.rate + motion.true_force @ per_force.T)
 
 
 def _soft_spring(rng: np.random.Generator) -> Cause:
-    """
-    The accelerometers' springs grow softer one way.
-
-    A parabola in the force along each axis, 0.2 to 0.5 mg at 1 g.
-    """
+    """Accelerometers with springs softer in one sense: 0.2 to 0.5 mg (f / g)^2 on each axis."""
     per_square = rng.uniform(2e-4, 5e-4, 3) * rng.choice([-1, 1], 3) / STANDARD_GRAVITY
-    return lambda felt: felt._replace(force=felt.force + per_square * felt.true_force**2)
+    return lambda motion: motion._replace(force=motion.force + per_square * motion.true_force**2)
 
 
 def _gain_by_sense(rng: np.random.Generator) -> Cause:
-    """Each accelerometer's amplifier has different gains for the two signs, by 0.05 to 0.1 %."""
+    """Gains of each accelerometer that differ by 0.05 to 0.1 % between the two signs."""
     gap = rng.uniform(5e-4, 1e-3, 3) * rng.choice([-1, 1], 3)
-    return lambda felt: felt._replace(force=felt.force + 0.5 * gap * np.abs(felt.true_force))
+    return lambda motion: motion._replace(
+        force=motion.force + 0.5 * gap * np.abs(motion.true_force)
+    )
 
 
 def _narrow_range(rng: np.random.Generator) -> Cause:
-    """The gyroscopes' converter ends at 100 to 120 deg/s."""
+    """Gyroscopes whose converter ends at 100 to 120 deg/s."""
     most = rng.uniform(100.0, 120.0) * DEG
-    return lambda felt: felt._replace(rate=np.clip(felt.rate, -most, most))
+    return lambda motion: motion._replace(rate=np.clip(motion.rate, -most, most))
 
 
 CAUSES: dict[str, Callable[[np.random.Generator], Cause]] = {
@@ -338,19 +330,23 @@ def hidden_causes(names: Sequence[str], seed: int, size: float = 1.0) -> list[Ca
                 ' them',
                 code='cause_unknown',
             )
-    return [
-        _scaled(CAUSES[name](np.random.default_rng([seed, list(CAUSES).index(name)])), size)
-        for name in CAUSES
-        if name in names
-    ]
+    causes = []
+    for number, (name, draw) in enumerate(CAUSES.items()):
+        if name in names:
+            causes.append(_scaled(draw(np.random.default_rng([seed, number])), size))
+    return causes
 
 
-def _scaled(cause, size):
-    def answer(felt):
-        answered = cause(felt)
-        return felt._replace(
-            force=felt.force + size * (answered.force - felt.force),
-            rate=felt.rate + size * (answered.rate - felt.rate),
+def _scaled(cause: Cause, size: float) -> Cause:
+    """Return a cause whose changes of force and rate are `size` times as large."""
+    if size == 1.0:
+        return cause
+
+    def scaled_cause(motion: SensorMotion) -> SensorMotion:
+        changed = cause(motion)
+        return motion._replace(
+            force=motion.force + size * (changed.force - motion.force),
+            rate=motion.rate + size * (changed.rate - motion.rate),
         )
 
-    return cause if size == 1.0 else answer
+    return scaled_cause

@@ -23,8 +23,8 @@ from imu_calibration.simulation.motion_builder import Profile
 from imu_calibration.simulation.sensor_noise import (
     GRADES,
     Cause,
-    Felt,
     ImuNoise,
+    SensorMotion,
     SimulatedNoise,
     jitter_stamps,
     read_encoders,
@@ -336,10 +336,10 @@ class LiveSimulation:
             return outputs
         force, rate = outputs
         true_force, true_rate = self._true_motion(time)
-        felt = Felt(true_force, true_rate, force, rate)
+        sensor_motion = SensorMotion(true_force, true_rate, force, rate)
         for cause in self.causes:
-            felt = cause(felt)
-        return felt.force, felt.rate
+            sensor_motion = cause(sensor_motion)
+        return sensor_motion.force, sensor_motion.rate
 
     def truth(self, block: SimulatedBlock) -> ImuSamples:
         """
