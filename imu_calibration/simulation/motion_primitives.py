@@ -7,6 +7,7 @@ The module also holds the motions of the two source papers.
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,7 @@ from imu_calibration.simulation.motion_builder import MotionBuilder
 
 GOLDEN_ANGLE_DEG = 137.50776
 FACES = np.concatenate([np.eye(3), -np.eye(3)])
+"""Directions to the faces of a cube, shape (6, 3)."""
 Task = Callable[[MotionBuilder], object]
 """Part of a session: appends segments to a builder."""
 
@@ -24,13 +26,13 @@ def pose_deg(up_b: np.ndarray, heading_deg: float = 0.0) -> np.ndarray:
     """
     Return the joint angles of a z-y-x table that bring the vertical along `up_b`, deg.
 
-    The joints of the table are in the order outer, middle, inner.
-
-    From ``up_b = (-sin m, sin i cos m, cos i cos m)``; the outer joint only sets the heading.
+    They are in the order outer, middle m, inner i, from
+    ``up_b = (-sin m, sin i cos m, cos i cos m)``; the outer joint only sets the heading.
     """
     x, y, z = np.asarray(up_b, float) / np.linalg.norm(up_b)
-    inner = np.arctan2(y, z) if np.hypot(y, z) > 1e-9 else 0.0
-    return np.array([heading_deg, *np.degrees([-np.arcsin(np.clip(x, -1, 1)), inner])])
+    middle = -np.arcsin(np.clip(x, -1, 1))
+    inner = np.arctan2(y, z) if np.hypot(y, z) > 1e-9 else 0.0  # any angle with x vertical
+    return np.array([heading_deg, *np.degrees([middle, inner])])
 
 
 def pose(up_b: np.ndarray, heading_deg: float, dwell: float) -> Task:
@@ -48,26 +50,26 @@ def spin_vertical(up_b: np.ndarray, speeds_deg: ArrayLike, dwell: float) -> Task
 
 
 def spin_joint(joint: int, at_deg: ArrayLike, speeds_deg: ArrayLike, *, dwell: float) -> Task:
-    """Turn one joint both ways at each speed."""
+    """Turn one joint both ways at each speed (deg/s), from the joint angles `at_deg`."""
     rates_deg = np.multiply.outer(speeds_deg, (1, -1)).reshape(-1, 1)
-    return lambda builder: builder.move(at_deg).spin(
-        np.where(np.arange(builder.n_joints) == joint, rates_deg, 0.0), dwell
-    )
+
+    def task(builder: MotionBuilder) -> None:
+        is_turned = np.arange(builder.n_joints) == joint
+        builder.move(at_deg).spin(np.where(is_turned, rates_deg, 0.0), dwell)
+
+    return task
 
 
 def swing(axis: int, amplitude_deg: float, frequency: float, *, duration: float) -> Task:
     """
-    Swing about sensor axis 0, 1 or 2.
+    Swing about sensor axis 0, 1 or 2 (x, y, z) of a z-y-x table.
 
-    The inner joint, the middle one, or the middle one with the inner a quarter turn on.
+    The joint is the inner one, the middle one, or the middle one with the inner at 90 deg.
     """
-    at_deg, joint = (([0, 0, 0], 2), ([0, 0, 0], 1), ([0, 0, 90], 1))[axis]
-    return swing_at(
-        np.radians(at_deg),
-        np.radians(amplitude_deg * np.eye(3)[joint]),
-        frequency,
-        duration=duration,
-    )
+    joint = (2, 1, 1)[axis]
+    at_deg = ([0, 0, 0], [0, 0, 0], [0, 0, 90])[axis]
+    amplitude = np.radians(amplitude_deg * np.eye(3)[joint])
+    return swing_at(np.radians(at_deg), amplitude, frequency, duration=duration)
 
 
 def swing_at(
@@ -80,7 +82,7 @@ def swing_at(
 ) -> Task:
     """Swing about joint positions (rad, m), with a rest before and, to `settle`, after it."""
 
-    def task(builder):
+    def task(builder: MotionBuilder) -> None:
         builder.move_to(position).rest(1.0).swing(amplitude, frequency, duration)
         if settle:
             builder.rest(1.0)
@@ -101,9 +103,9 @@ def run(
     reference_every: int = 12,
 ) -> None:
     """
-    Run tasks in a random order, with returns to the reference pose.
+    Run tasks in a random order, so that drift is separable from other effects.
 
-    So that drift is separable from other effects.
+    After every `reference_every` tasks the joints rest at the reference pose.
     """
     builder.rest_at_home(8.0)
     for count, index in enumerate(rng.permutation(len(tasks)), start=1):
@@ -137,21 +139,18 @@ def swings(
 
 def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> list[Task]:
     """
-    Outer and inner, outer and middle (about y, about z), middle and inner.
+    Return the five tasks of turning two joints at a time, at the two speeds.
 
-    Turns about two axes at a time.
+    Outer and inner joint, outer and middle (about y, about z), outer and inner, middle and inner.
     """
     a, b = speeds_deg
-    found = []
-    for at, rates in (
-        ([0, 0, 0], [a, 0, b]),
-        ([0, 0, 0], [a, b, 0]),
-        ([0, 0, 90], [a, -b, 0]),
-        ([0, 45, 0], [a, 0, -b]),
-        ([0, 0, 30], [0, b, a]),
-    ):
-        found.append(two_axes(at, rates, dwell))
-    return found
+    return [
+        two_axes([0, 0, 0], [a, 0, b], dwell),
+        two_axes([0, 0, 0], [a, b, 0], dwell),
+        two_axes([0, 0, 90], [a, -b, 0], dwell),
+        two_axes([0, 45, 0], [a, 0, -b], dwell),
+        two_axes([0, 0, 30], [0, b, a], dwell),
+    ]
 
 
 AXIS_ORDERS = ('XYX', 'XYZ', 'XZX', 'XZY', 'YXY', 'YXZ', 'YZX', 'YZY', 'ZXY', 'ZXZ', 'ZYX', 'ZYZ')
@@ -161,7 +160,13 @@ EQUAL_ANGLES_DEG = np.arange(0.0, 401.0, 10.0)
 """Avrutov 2017, samples 1 and 2: the 41 equal angles (40 according to the paper)."""
 
 
-def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, rpy_deg=(0.0, 0.0, 0.0)):
+def _table(
+    axes: Sequence[Sequence[float]],
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    latitude: float = 50.45,
+    rpy_deg: Sequence[float] = (0.0, 0.0, 0.0),
+) -> dict[str, Any]:
+    """Return the description of a table with the axes of its joints from the base outwards."""
     names = ('outer', 'middle', 'inner') if len(axes) == 3 else ('turn',)
     joints = [{'name': name, 'axis': list(axis)} for name, axis in zip(names, axes, strict=True)]
     mount = {'rpy_deg': list(rpy_deg), 'xyz': None}
@@ -191,22 +196,22 @@ def avrutov_rates_deg(sample: int) -> np.ndarray:
     return np.stack([rate, np.exp(-rate), rate**2], axis=1)
 
 
-def _equal_angles(builder, _rng):
+def _equal_angles(builder: MotionBuilder, _rng: np.random.Generator) -> None:
     """
-    All gimbals at the same angle, 41 positions.
+    Rest with all gimbals at the same angle, in 41 positions.
 
-    Averaging of 30...60 s is shortened, and `duration` stretches it.
+    The rests of 30...60 s in the paper are shortened; `duration` of `make_profile` stretches them.
     """
     builder.rest(5.0)
     for angle in EQUAL_ANGLES_DEG:
         builder.move(np.full(builder.n_joints, angle), shortest=False).rest(5.0)
 
 
-def _body_rates(builder, _rng, sample):
+def _body_rates(builder: MotionBuilder, _rng: np.random.Generator, sample: int) -> None:
     """
-    Each row as one turn of the vertical joint.
+    Turn with each row of `avrutov_rates_deg` as the rate of the body.
 
-    The inner two hold the wanted direction of the rate upright.
+    The outer joint turns about the vertical; the other two bring the rate's direction upright.
     """
     for rates in avrutov_rates_deg(sample):
         speed = np.linalg.norm(rates)
@@ -214,22 +219,24 @@ def _body_rates(builder, _rng, sample):
         builder.move(pose_deg(upright, np.nan)).rest(2.0).spin([[speed, 0.0, 0.0]], 10.0)
 
 
-def _gimbal_rates(builder, _rng, sample):
+def _gimbal_rates(builder: MotionBuilder, _rng: np.random.Generator, sample: int) -> None:
     """
-    Each row commanded to the three gimbals (x inner, z outer).
+    Turn with each row of `avrutov_rates_deg` as the rates of the gimbals (x inner, z outer).
 
-    The body rates are not the gimbal rates.
+    The rates of the body differ from them.
     """
     for x, y, z in avrutov_rates_deg(sample):
         builder.move([0.0, 0.0, 0.0]).rest(2.0).spin([[z, y, x]], 30.0)
 
 
-def _six_faces(builder):
+def _six_faces(builder: MotionBuilder) -> None:
+    """Rest with each axis up and down."""
     for face in FACES:
         pose(face, 0.0, 10.0)(builder)
 
 
-def _zhang_spins(builder, _rng):
+def _zhang_spins(builder: MotionBuilder, _rng: np.random.Generator) -> None:
+    """Six faces, and spins about each axis at three speeds (Zhang)."""
     _six_faces(builder)
     for axis in np.eye(3):
         builder.move(pose_deg(axis, np.nan))
@@ -237,14 +244,16 @@ def _zhang_spins(builder, _rng):
             builder.spin([[speed, 0.0, 0.0]], 10.0)
 
 
-def _zhang_oscillations(builder, _rng):
+def _zhang_oscillations(builder: MotionBuilder, _rng: np.random.Generator) -> None:
+    """Six faces, and swings about each axis (Zhang)."""
     _six_faces(builder)
     for axis in range(3):
         for amplitude, frequency in ((10.0, 1.0), (5.0, 2.0), (90.0, 0.5)):
             swing(axis, amplitude, frequency, duration=12.0)(builder)
 
 
-def _zhang_mixed(builder, _rng):
+def _zhang_mixed(builder: MotionBuilder, _rng: np.random.Generator) -> None:
+    """Six faces, spins, swings and turns about two axes at once (Zhang)."""
     _six_faces(builder)
     tasks = [
         *(spin_vertical(axis, 200.0, 6.0) for axis in np.eye(3)),
@@ -266,7 +275,7 @@ sensor axes.
 """
 
 
-def _gimbals(order, up_axis):
+def _gimbals(order: str, up_axis: str) -> dict[str, Any]:
     """Return a table with axes in an order from the base, e.g. 'ZYX', and its vertical."""
     return _table([AXIS_VECTORS[axis] for axis in order], AXIS_VECTORS[up_axis])
 

@@ -7,14 +7,16 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imu_calibration.core.errors import InputError, did_you_mean
-from imu_calibration.kinematics.motion_limits import free_limits, limits_of
+from imu_calibration.kinematics.motion_limits import MotionLimits, free_limits, limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation import motion_primitives
-from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, stretch
+from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment, stretch
 from imu_calibration.simulation.motion_primitives import (
     FACES,
+    Task,
     poses,
     run,
     simultaneous,
@@ -48,9 +50,9 @@ def within_limits(
     n_other: int = 20,
 ) -> None:
     """
-    Poses, swings of one joint and of two at once, and spins of a joint without an end.
+    Append poses, swings of one joint and of two at once, and spins of joints without an end.
 
-    Two joints swing with at most `n_other` other joints.
+    Each joint swings together with at most `n_other` joints before it, for `swing_time` s.
     """
     limits = builder.limits
     count = builder.n_joints
@@ -58,47 +60,47 @@ def within_limits(
     upper = np.where(limits.endless, np.pi, limits.upper)
     moving = np.flatnonzero(upper > lower)
 
-    def places(n):
-        """Spread positions over the range of every joint, each value once (Latin hypercube)."""
+    def spread_positions(n: int) -> np.ndarray:
+        """Return n positions, each joint evenly over its range (Latin hypercube), (n, n_joints)."""
         number = rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T
         return lower + (upper - lower) * (number + 0.5) / n
 
-    def swing(at, frequency):
+    def swing(at: np.ndarray, frequency: np.ndarray) -> Task:
         """
-        Swing the joints in which `frequency` is not zero.
+        Return the task of swinging about `at`, the joints with a frequency above zero (Hz).
 
-        They swing up to the limits of range, speed and acceleration.
+        The amplitude is 70 % of the smallest limit by range, speed and acceleration.
         """
         omega = 2 * np.pi * np.maximum(frequency, 1e-9)
-        reach = [
+        largest = [
             0.3 * (upper - lower),
             limits.speed / omega,
             limits.acceleration / omega**2,
             np.full(count, MAX_PROFILE_SWING),
         ]
-        amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(reach), 0.0)
-        middle = np.where(
-            limits.endless, at, np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude)
-        )
+        amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(largest), 0.0)
+        within_range = np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude)
+        middle = np.where(limits.endless, at, within_range)
         return swing_at(middle, amplitude, np.maximum(frequency, 0.1), duration=swing_time)
 
-    tasks = [_rest_at(position) for position in places(n_poses)]
-    of_joint = np.eye(count)  # row: 1 for one joint
+    tasks = [_rest_at(position) for position in spread_positions(n_poses)]
+    unit = np.eye(count)  # row: 1 for one joint
     for joint in moving.tolist():
         # One joint swings.
-        for at, frequency in zip(places(len(frequencies)), frequencies, strict=True):
-            tasks.append(swing(at, frequency * of_joint[joint]))
+        for at, frequency in zip(spread_positions(len(frequencies)), frequencies, strict=True):
+            tasks.append(swing(at, frequency * unit[joint]))
 
         # Two joints swing.
-        others = moving[moving < joint][-n_other:]
-        for other, at in zip(others, places(max(len(others), 1)), strict=False):
-            tasks.append(swing(at, 0.3 * of_joint[joint] + 0.45 * of_joint[other]))
+        earlier_joints = moving[moving < joint][-n_other:]
+        positions = spread_positions(max(len(earlier_joints), 1))
+        for other, at in zip(earlier_joints, positions, strict=False):
+            tasks.append(swing(at, 0.3 * unit[joint] + 0.45 * unit[other]))
 
         # A joint without an end spins, up to 90 % of its speed.
         if limits.endless[joint]:
             shares = 0.9 * np.linspace(0.3, 1.0, len(frequencies))
             speeds = shares * np.degrees(limits.speed[joint])
-            for at, speed in zip(places(len(shares)), speeds, strict=True):
+            for at, speed in zip(spread_positions(len(shares)), speeds, strict=True):
                 at_deg = np.where(limits.turns, np.degrees(at), np.nan)
                 tasks.append(spin_joint(joint, at_deg, speed, dwell=4.0))
     run(builder, rng, tasks)
@@ -109,7 +111,8 @@ within_limits_short = partial(
 )
 
 
-def _rest_at(position):
+def _rest_at(position: np.ndarray) -> Task:
+    """Return the task of resting at joint positions, rad and m."""
     return lambda builder: builder.move_to(position).rest(4.0)
 
 
@@ -120,12 +123,16 @@ SPEEDS_DEG = (60.0, 120.0, 200.0)
 
 @dataclass(frozen=True)
 class _Entry:
+    """A profile in the registry."""
+
     description: str
+    """One line for the help."""
     build: Callable
     """``build(builder, rng)`` appends the segments; `rng` is seeded."""
     table: dict | None = None
+    """Description of the table that the profile brings; None: it moves the given table."""
     n_joints: int | None = None
-    """Joints that it needs; None: any number."""
+    """Number of joints that the profile needs; None: any number."""
     adapts: bool = False
     """
     Whether a table with another number of joints gets `any_table` instead, and one with joint
@@ -190,40 +197,41 @@ def make_profile(
     if entry.adapts and not limits.endless.all():
         build = within_limits
 
-    def segments(dwell):
+    def build_segments(dwell: float) -> tuple[Segment, ...]:
         builder = MotionBuilder(len(joint_names), dwell, limits)
         build(builder, np.random.default_rng(seed))
         return builder.segments
 
-    chosen = segments(1.0) if duration is None else stretch(segments, duration)
-    profile = Profile(name, chosen, joint_names, entry.table)
+    segments = build_segments(1.0) if duration is None else stretch(build_segments, duration)
+    profile = Profile(name, segments, joint_names, entry.table)
     _require_within(profile, limits)
     return profile
 
 
-def _require_within(profile, limits):
-    """Refuse a motion that exceeds the range of a joint."""
+def _require_within(profile: Profile, limits: MotionLimits) -> None:
+    """Refuse a motion that exceeds the range of a joint, evaluated at 20 Hz."""
     if limits.endless.all():
         return
-    position = profile.at(
-        np.linspace(0.0, profile.duration, int(20 * profile.duration) + 1)
-    ).position
+    time = np.linspace(0.0, profile.duration, int(20 * profile.duration) + 1)
+    position = profile.at(time).position
     for column, name in enumerate(profile.joint_names):
-        reached = np.array([position[:, column].min(), position[:, column].max()])
-        if reached[0] < limits.lower[column] - 1e-6 or reached[1] > limits.upper[column] + 1e-6:
+        lower = limits.lower[column]
+        upper = limits.upper[column]
+        least = position[:, column].min()
+        most = position[:, column].max()
+        if least < lower - 1e-6 or most > upper + 1e-6:
             unit, factor = ('deg', np.degrees(1.0)) if limits.turns[column] else ('m', 1.0)
-            lower, upper, least, most = (
-                f'{factor * end:.4g}'
-                for end in (limits.lower[column], limits.upper[column], *reached)
-            )
             raise InputError(
-                f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}]"
-                f" {unit}, it would move from {least} to {most}; choose 'within_limits'",
+                f"profile '{profile.name}' must keep joint '{name}' within"
+                f' [{factor * lower:.4g}, {factor * upper:.4g}] {unit}, it would move from'
+                f' {factor * least:.4g} to {factor * most:.4g};'
+                " choose 'within_limits'",
                 code='joint_range',
             )
 
 
-def _joint_names(entry, table):
+def _joint_names(entry: _Entry, table: dict[str, Any] | Table | None) -> tuple[str, ...]:
+    """Return the joints of a table; without one those of a table with two or three axes."""
     if table is None:
         return THREE_AXIS if entry.n_joints in (None, 3) else THREE_AXIS[:1] + THREE_AXIS[2:]
     if isinstance(table, dict):
@@ -231,11 +239,13 @@ def _joint_names(entry, table):
     return tuple(table.joint_names)
 
 
-def _spins(directions, speeds_deg, dwell):
+def _spins(directions: np.ndarray, speeds_deg: ArrayLike, dwell: float) -> list[Task]:
+    """Return the tasks of turning about the vertical with each direction upright."""
     return [spin_vertical(up_b, speeds_deg, dwell) for up_b in directions]
 
 
-def _calibration(builder, rng):
+def _calibration(builder: MotionBuilder, rng: np.random.Generator) -> None:
+    """All poses, three speeds about each axis, single joints, swings and two axes at once."""
     run(
         builder,
         rng,
@@ -254,7 +264,8 @@ def _calibration(builder, rng):
     )
 
 
-def _short(builder, rng):
+def _short(builder: MotionBuilder, rng: np.random.Generator) -> None:
+    """The motions of `_calibration`, fewer and shorter."""
     run(
         builder,
         rng,
@@ -269,7 +280,8 @@ def _short(builder, rng):
     )
 
 
-def _quick(builder, rng):
+def _quick(builder: MotionBuilder, rng: np.random.Generator) -> None:
+    """The fewest motions that determine all parameters."""
     run(
         builder,
         rng,
@@ -283,7 +295,7 @@ def _quick(builder, rng):
     )
 
 
-def _six_faces(builder, _rng):
+def _six_faces(builder: MotionBuilder, _rng: np.random.Generator) -> None:
     """The usual motion: every axis up and down, and turned both ways at one speed."""
     builder.rest(3.0)
     for task in [*poses(FACES, 3.0), *_spins(np.eye(3), SPEEDS_DEG[1], 2.0)]:
@@ -291,7 +303,8 @@ def _six_faces(builder, _rng):
     builder.rest_at_home(3.0)
 
 
-def _static_only(builder, rng):
+def _static_only(builder: MotionBuilder, rng: np.random.Generator) -> None:
+    """Poses only."""
     run(builder, rng, poses(np.concatenate([FACES, EDGES, CORNERS]), 8.0))
 
 
@@ -336,26 +349,32 @@ _separating_short = partial(
 )
 
 
-def _thermal(builder, _rng):
+def _thermal(builder: MotionBuilder, _rng: np.random.Generator) -> None:
     """
     The same short round again and again, so that only time and temperature differ between rounds.
     """
     builder.rest_at_home(20.0)
-    for turn in range(6):
+    for round_number in range(6):
         for task in [
             *poses(FACES, 5.0),
             *_spins(np.eye(3), SPEEDS_DEG[1], 3.0),
             *swings(((10.0, 1.0),), 3.0),
         ]:
             task(builder)
-        builder.move([90.0 * turn, 0.0, 0.0]).rest(15.0)
+        builder.move([90.0 * round_number, 0.0, 0.0]).rest(15.0)
 
 
-def _tumbling(builder, _rng, rest, parts):
+def _tumbling(
+    builder: MotionBuilder,
+    _rng: np.random.Generator,
+    rest: float,
+    parts: Sequence[tuple[list[float], list[float], float, float]],
+) -> None:
     """
-    Rest, then swing all joints at once from zero.
+    Rest for `rest` s, then swing all joints at once from zero, part after part.
 
-    For each part (deg, Hz, s, s of the rest after it).
+    A part is (amplitude of each joint in deg, frequency of each joint in Hz, duration in s, rest
+    after it in s).
     """
     builder.rest(rest)
     for amplitude_deg, frequency, duration, rest_after in parts:
@@ -375,14 +394,14 @@ def _random(
 ):
     """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
     # The order of the draws is part of the recording of a seed. Angles in deg, speeds in deg/s.
-    tasks = poses([_near(rng, up_b, 0.25) for up_b in directions], 2.6)
+    tasks = poses([_random_direction_near(rng, up_b, 0.25) for up_b in directions], 2.6)
 
     # Spins about each axis of the sensor at every speed, about oblique axes, and of one joint.
     speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
     for k, axis in enumerate(np.eye(3)):
-        tasks.append(spin_vertical(_near(rng, axis, 0.2), speeds[:, k], 2.0))
+        tasks.append(spin_vertical(_random_direction_near(rng, axis, 0.2), speeds[:, k], 2.0))
     for _ in range(n_oblique):
-        axis = _near(rng, rng.choice(CORNERS), 0.3)
+        axis = _random_direction_near(rng, rng.choice(CORNERS), 0.3)
         tasks.append(spin_vertical(axis, rng.uniform(120, 220), 2.0))
     for joint in (1, 2):
         position = rng.uniform(-180, 180, 3)
@@ -412,27 +431,30 @@ _random_short = partial(
 )
 
 
-def _near(rng, direction, spread):
+def _random_direction_near(
+    rng: np.random.Generator, direction: np.ndarray, spread: float
+) -> np.ndarray:
+    """Return a direction near another one, with the sd `spread` of each component."""
     vector = direction + rng.normal(0.0, spread, 3)
     return vector / np.linalg.norm(vector)
 
 
-def _any_table(builder, rng):
+def _any_table(builder: MotionBuilder, rng: np.random.Generator) -> None:
     """Poses, spins at three speeds, swings and two joints at once for any number of joints."""
     count = builder.n_joints
     angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
     tasks = [_rest_at(np.radians(row)) for row in angles]
-    only = np.eye(count)
+    unit = np.eye(count)
     for joint in range(count):
         for speed in SPEEDS_DEG:
             tasks.append(spin_joint(joint, rng.uniform(-180, 180, count), speed, dwell=4.0))
         for frequency in (0.5, 1.0, 2.0):
             place = np.radians(rng.uniform(-180, 180, count))
             # The same largest rate at each frequency.
-            amplitude = np.radians(10.0 / frequency * only[joint])
+            amplitude = np.radians(10.0 / frequency * unit[joint])
             tasks.append(swing_at(place, amplitude, frequency, duration=4.0, settle=False))
         for other in range(joint):
-            rates_deg = 120.0 * only[joint] + 80.0 * only[other]
+            rates_deg = 120.0 * unit[joint] + 80.0 * unit[other]
             for at_deg in rng.uniform(-180, 180, (3, count)):
                 tasks.append(two_axes(at_deg, rates_deg, 5.0))
     run(builder, rng, tasks)
