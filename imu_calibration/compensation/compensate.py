@@ -270,7 +270,9 @@ def _invert(
     true = {}
     for sensor in SENSORS:
         bias = model.value(sensor, Role.OFFSET, values)
-        inverse[sensor] = np.linalg.inv(model.value(sensor, Role.LINEAR, values))
+        matrix = model.value(sensor, Role.LINEAR, values)
+        assert matrix is not None and bias is not None, 'every model has both'
+        inverse[sensor] = np.linalg.inv(matrix)
         true[sensor] = (measured[sensor] - bias) @ inverse[sensor].T
     attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
     for _ in range(MAX_INVERSION_STEPS):

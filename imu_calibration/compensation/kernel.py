@@ -180,6 +180,7 @@ class _SensorSums:
     def __init__(self, model: SensorModel, sensor: str, values: np.ndarray, replacements: dict):
         matrix = model.value(sensor, Role.LINEAR, values)
         bias = model.value(sensor, Role.OFFSET, values)
+        assert matrix is not None and bias is not None, 'every model has both'
         self.inverse = np.linalg.inv(matrix)
         """M^-1, shape (3, 3)."""
         readings = _turned(self.inverse, _vector('f' if sensor == 'accelerometer' else 'w'))

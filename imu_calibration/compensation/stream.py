@@ -365,7 +365,9 @@ def _as_samples(calibration: FittedErrors, force_s: Vectors, rate_s: Any, time: 
                 code='time_missing',
             )
         time = np.arange(len(force_s)) * 0.01
-    return SampleBlock.from_arrays(time, force_s, rate_s).imu
+    imu = SampleBlock.from_arrays(time, force_s, rate_s).imu
+    assert imu is not None, 'a block of arrays has readings'
+    return imu
 
 
 def _as_temperatures(

@@ -214,7 +214,7 @@ def _body_rates(builder: MotionBuilder, _rng: np.random.Generator, sample: int) 
     The outer joint turns about the vertical; the other two bring the rate's direction upright.
     """
     for rates in avrutov_rates_deg(sample):
-        speed = np.linalg.norm(rates)
+        speed = float(np.linalg.norm(rates))
         upright = rates if speed else np.array([0.0, 0.0, 1.0])
         builder.move(pose_deg(upright, np.nan)).rest(2.0).spin([[speed, 0.0, 0.0]], 10.0)
 

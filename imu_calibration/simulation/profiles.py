@@ -214,7 +214,7 @@ def _require_within(profile: Profile, limits: MotionLimits) -> None:
         return
     time = np.linspace(0.0, profile.duration, int(20 * profile.duration) + 1)
     position = profile.at(time).position
-    for column, name in enumerate(profile.joint_names):
+    for column, name in enumerate(profile.joint_names or ()):
         lower = limits.lower[column]
         upper = limits.upper[column]
         least = position[:, column].min()
