@@ -99,7 +99,7 @@ def count_operations(tree: ast.Module) -> int:
     return n_operations
 
 
-def _operations_in(tree):
+def _operations_in(tree: ast.AST) -> int:
     """Return the operations of a tree that is executed once."""
     n_operations = 0
     for node in ast.walk(tree):

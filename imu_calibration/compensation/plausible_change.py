@@ -83,7 +83,10 @@ def implausible_change(calibration: FittedErrors, reference: FittedErrors | None
     return ''
 
 
-def _corrected(calibration, raw, temperature_c):
+def _corrected(
+    calibration: FittedErrors, raw: ProbeReadings, temperature_c: float
+) -> ProbeReadings:
+    """Return the correction of readings without angular acceleration at one temperature."""
     corrected = compensated_samples(
         calibration,
         raw.force,
@@ -94,8 +97,12 @@ def _corrected(calibration, raw, temperature_c):
     return ProbeReadings(corrected.force, corrected.rate)
 
 
-def _beyond(sensor, change, size):
-    """Return the limit that an offset or slope of a sensor exceeds, as text; '' without one."""
+def _beyond(sensor: str, change: np.ndarray, size: float) -> str:
+    """
+    Return a text on the limit that an offset or slope of a sensor exceeds; '' without one.
+
+    `change` has the changes d(+a) on each axis, then d(-a), shape (6, 3), with |a| = `size`.
+    """
     plus, minus = np.split(change, 2)
     offset = np.abs(plus + minus).max() / 2.0
     slope = np.abs(plus - minus).max() / (2.0 * size)
@@ -108,7 +115,8 @@ def _beyond(sensor, change, size):
     return _beyond_offset(sensor, offset)
 
 
-def _beyond_offset(sensor, offset):
+def _beyond_offset(sensor: str, offset: float) -> str:
+    """Return a text on an offset beyond its limit; '' for one within it."""
     if not offset <= MOST_OFFSET[sensor]:
         return (
             f'a change of the {sensor} offset must be at most {MOST_OFFSET[sensor]:g}'

@@ -216,6 +216,8 @@ class CalibrationNode(Node):
             self, LiveByHandSettings, self._change_place
         )
         robot = declare_parameters(self, RobotSettings)
+
+        # The reference and the session, new or resumed.
         joints = joint_topics(robot, self.settings.table_file)
         announce(
             self,
@@ -236,6 +238,7 @@ class CalibrationNode(Node):
         self._gatherer = LiveGatherer(
             self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id
         )
+        # Publishers of the results, and the thread that makes them.
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
@@ -256,6 +259,8 @@ class CalibrationNode(Node):
             hints=HINTS['calibration_node'],
             provenance=self._provenance(robot),
         )
+
+        # Services and streams, then logs and diagnostics.
         for service in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{service}', partial(self._serve, service))
         self._complaints = Complaints(self.get_logger())
@@ -362,22 +367,27 @@ class CalibrationNode(Node):
     # between two steps.
 
     def _change_files(self, group: CalibrationNodeSettings) -> None:
+        """Use another period of saving."""
         self.worker.autosave_period = group.autosave_period
         self.settings = group
 
     def _change_place(self, group: LiveByHandSettings) -> None:
+        """Use another place by hand; raises an ImuCalibrationError if the reference refuses it."""
         self._reference.check_place(self._session_settings[LiveByHandSettings].place, group.place)
         self._change_session(group)
 
     def _change_session(self, group: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+        """Use other settings of the session from the worker's next step on."""
         self._session_settings[type(group)] = group
         self.worker.ask(lambda: self.worker.change(group))
 
     def _publish_residuals(self, residuals: Any) -> None:
+        """Publish ImuSamples as messages."""
         for message in Packed.of_rows(encode_imu(residuals)).views():
             self._publish(self._residual, bytes(message))
 
     def _publish(self, publisher: Any, message: Any) -> None:
+        """Publish a message, from the worker's thread."""
         try:
             publisher.publish(message)
         except Exception:

@@ -100,6 +100,8 @@ class CompensatorNode(Node):
         """Code of the error of the last refusal; '' after an adoption."""
         self.corrected_already = ''
         """Why the input is corrected already, so that no message is published; '' otherwise."""
+
+        # Topics. With the wait set the messages are received outside the executor.
         announce(
             self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected']
         )
@@ -157,6 +159,7 @@ class CompensatorNode(Node):
             )
 
     def _look_for_file(self) -> None:
+        """Adopt the calibration file once it exists."""
         if self.settings.calibration_path.exists():
             self.destroy_timer(self._file_timer)
             self._try_file()
@@ -199,6 +202,7 @@ class CompensatorNode(Node):
         return newest
 
     def _on_imu(self, data: bytes, information: dict) -> None:
+        """Correct and publish a message, where the public executor receives it."""
         converted = self.convert(data, information)
         if converted is not None:
             self._publisher.publish(converted)
@@ -217,6 +221,7 @@ class CompensatorNode(Node):
             )
 
     def _on_document(self, message: String) -> None:
+        """Adopt a received document, unless the settings or its publishers forbid that."""
         self.documents.look()
         if self.documents.mixed:
             self.complaints.event(
@@ -382,6 +387,7 @@ class CompensatorNode(Node):
             self._try_file()
 
     def _on_reload(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Read the calibration file again."""
         if self.settings.calibration_file:
             why = self._try_file()
         else:
@@ -413,6 +419,7 @@ class CompensatorNode(Node):
             self._retry()
 
     def _on_temperature(self, message: Temperature) -> None:
+        """Pass a usable temperature to the compensation."""
         if self.diagnostics.note_temperature(message.temperature) and self.compensation is not None:
             self.compensation.set_temperature(message.temperature)
 
@@ -425,6 +432,7 @@ class CompensatorNode(Node):
             self._refresh_timer = self.create_timer(1.0 / rate, self._guarded(self._refresh))
 
     def _refresh(self) -> None:
+        """Update the covariances at the present motion."""
         if self.compensation is not None:
             self.compensation.refresh()
 

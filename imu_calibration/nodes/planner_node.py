@@ -185,6 +185,8 @@ class PlannerNode(Node):
             ['joint_trajectory', 'imu/coverage'],
             note=NOT_CHECKED,
         )
+
+        # The joints to be moved, and the calibration to be planned for.
         self._table = live_reference(self, robot, settings.table_file).table_for(
             "planner_node moves the joints of 'table_file' or 'urdf_file'", 'table_missing'
         )
@@ -222,6 +224,8 @@ class PlannerNode(Node):
         self.driver = Driver(self._names, limits_of(self._table), driver_settings)
         self._is_placed = False
         """Whether the ranges of the joints are set, at the first start."""
+
+        # Commands to the joints, and the thread that selects them.
         self._command = make_command(self, settings.command, self._refused)
         self._others = OtherDrivers(self, self._command)
         self.worker = PlannerWorker(
@@ -294,11 +298,13 @@ class PlannerNode(Node):
             self.worker.halt('the node is ending')
 
     def _change_campaign(self, group: CampaignSettings) -> None:
+        """Use other settings for the selection of motions."""
         self._campaign_settings = group
         if self.worker.campaign is not None:
             self.worker.campaign.settings = group
 
     def _change_driver(self, group: DriverSettings) -> None:
+        """Use other settings for the execution of motions."""
         with self._lock:
             self.driver.change(group)
 
@@ -379,12 +385,14 @@ class PlannerNode(Node):
             self._stopped()
 
     def _document(self, message: String) -> None:
+        """Store a calibration document."""
         with self._received:
             self._document_text = message.data
             self._n_documents += 1
             self._received.notify_all()
 
     def _diagnostic(self, message: DiagnosticArray) -> None:
+        """Store the values of calibration_node's status 'diagnosis'."""
         wanted = f'{self.settings.calibration_node.lstrip("/")}: diagnosis'
         for status in message.status:
             if status.name.endswith(wanted):
@@ -426,6 +434,7 @@ class PlannerNode(Node):
         self._say(LOG_ERROR, self.driver.reason)
 
     def _stop_joints(self) -> None:
+        """Send the stop to the controller unless the context has ended."""
         if not self.context.ok():
             return
         self._command.stop(self._names)
@@ -531,6 +540,7 @@ class PlannerNode(Node):
         return True, f'{extent}; limits: {self._limit_words()}'
 
     def _limit_words(self) -> str:
+        """Return a text on the present limits of the joints."""
         return '; '.join(limit_words(self._table, self.driver.limits))
 
     def _stop(self) -> tuple[bool, str]:

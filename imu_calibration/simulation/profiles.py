@@ -309,16 +309,19 @@ def _static_only(builder: MotionBuilder, rng: np.random.Generator) -> None:
 
 
 def _separating(
-    builder,
-    rng,
-    n_angles=16,
-    n_oblique=4,
-    cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)),
-    swing_time=4.0,
-):
+    builder: MotionBuilder,
+    rng: np.random.Generator,
+    n_angles: int = 16,
+    n_oblique: int = 4,
+    cycles: tuple[tuple[float, float], ...] = ((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)),
+    swing_time: float = 4.0,
+) -> None:
     """
     Many angles, three speeds both ways, swings at several frequencies: separates similar effects.
+
+    `cycles` are the amplitudes (deg) and frequencies (Hz) of the swings.
     """
+    # Vertical directions on the three great circles between the axes of the sensor.
     angles = 2 * np.pi * (np.arange(n_angles) + 0.25) / n_angles
     rings = []
     for c, s in zip(np.cos(angles), np.sin(angles)):
@@ -384,15 +387,20 @@ def _tumbling(
 
 
 def _random(
-    builder,
-    rng,
-    directions=np.concatenate([FACES, CORNERS]),
-    speed_ranges=((40, 80), (100, 150), (170, 220)),
-    n_oblique=2,
-    n_swings=2,
-    n_simultaneous=4,
-):
-    """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
+    builder: MotionBuilder,
+    rng: np.random.Generator,
+    directions: np.ndarray = np.concatenate([FACES, CORNERS]),
+    speed_ranges: tuple[tuple[float, float], ...] = ((40, 80), (100, 150), (170, 220)),
+    n_oblique: int = 2,
+    n_swings: int = 2,
+    n_simultaneous: int = 4,
+) -> None:
+    """
+    Drawn poses, spins both ways at every speed, swings and two-axis turns.
+
+    Poses are near `directions`; `n_oblique` spins are about oblique axes, `n_swings` swings about
+    each axis, and `n_simultaneous` turns about two axes at once.
+    """
     # The order of the draws is part of the recording of a seed. Angles in deg, speeds in deg/s.
     tasks = poses([_random_direction_near(rng, up_b, 0.25) for up_b in directions], 2.6)
 

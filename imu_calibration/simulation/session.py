@@ -114,7 +114,7 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
             element_sd = np.where(np.eye(3), sizes.scale, sizes.misalignment).ravel()
             values[part] += rng.normal(0.0, 1.0, 9) * element_sd
         elif effect.role is Role.ARMS:
-            # The arms are those from the mean of the three sensitive points.
+            # The origin of the arms is the mean of the three sensitive points.
             arms = rng.normal(0.0, sizes.arm, (3, 3))
             values[part] = (arms - arms.mean(axis=0)).ravel()
     return values
