@@ -254,7 +254,7 @@ class RateSlope:
         self._n_counted = 0
         """Number of the newest counted sample, lost samples included."""
         self._pending: list[tuple] = []
-        """Rates after a long step, until a later stamp decides between lost and late samples."""
+        """Rates since a long step, which may be of lost samples or a late stamp, rad/s."""
         self._pending_ns = 0
         """Time from the stamp before `_pending` to the newest one."""
 
@@ -288,12 +288,16 @@ class RateSlope:
         self._newest_ns = stamp_ns
         self._reading = (x, y, z)
         self._stamps.append(stamp_ns)
+
+        # The class of the stamps, which may change the derivative in use.
         self._until_review -= 1
         if not self._until_review:
             self._review()
         if self.line is None and self._begins_equally():
             period_ns = (stamp_ns - self._stamps[0]) / (len(self._stamps) - 1)
             self.settle(StampLine(REGULAR, period_ns))
+
+        # Without a derivative the rates are stored instead.
         if self._tracker is None:
             if self.line is None:
                 self.n_changes += 1
@@ -301,6 +305,7 @@ class RateSlope:
                 self.n_without += 1
             self._recent.append((x, y, z))
             return NO_SLOPE
+
         n_used_before = self._tracker.n_used
         if self._most_step_ns:
             slope = self._push_counted(self._tracker, step_ns, (x, y, z))
@@ -309,6 +314,7 @@ class RateSlope:
         n_used = self._tracker.n_used
         self._slope = slope
         self._recent.append(slope if n_used == self._tracker.taps else UNKNOWN)
+
         # In a new window each sample changes the derivative's noise, delay and error.
         is_restarted = n_used < n_used_before
         if is_restarted:

@@ -272,7 +272,7 @@ class CalibrationWorker(threading.Thread):
         """Set to begin the next round of steps at once."""
         self._ending = False
         """Whether the thread ends after the present round."""
-        self._looked = time.monotonic()
+        self._read_at = time.monotonic()
         """Time of the last reading of messages, s of the steady clock."""
         self._n_solutions = 0
         """Number of the last solution."""
@@ -370,9 +370,9 @@ class CalibrationWorker(threading.Thread):
         """Add the received messages to the session, and publish the residuals of new windows."""
         # Silence is measured from the last call: messages that arrived during a solution are
         # processed in the next one.
-        self._looked = time.monotonic()
+        self._read_at = time.monotonic()
         block = self.gatherer.flush()
-        self._watch.note(block, self._looked)
+        self._watch.note(block, self._read_at)
         windows: Any = self.live.push(block)  # of the kind that the session itself reads
         if block.imu is not None or block.joints is not None:
             self._includes_pending = False
@@ -397,7 +397,7 @@ class CalibrationWorker(threading.Thread):
 
     def _solve_when_due(self) -> None:
         """Publish a solution of new data, and of open windows once no message arrives."""
-        silence = self._looked - (self._watch.last_arrival or 0.0)
+        silence = self._read_at - (self._watch.last_arrival or 0.0)
         idle = not self._includes_pending and silence > IDLE
         if idle:
             self._includes_pending = True
@@ -532,7 +532,7 @@ class CalibrationWorker(threading.Thread):
     def _tell(self) -> None:
         """Replace `state` by the present one."""
         counts = self.live.counts
-        self._watch.note_counts(counts, self._looked)
+        self._watch.note_counts(counts, self._read_at)
         result = self.live.result
         lines: list[str] = []
         verdict = ''
@@ -571,7 +571,7 @@ class CalibrationWorker(threading.Thread):
         }
         self.state = WorkerState(
             groups=groups,
-            streams=self._watch.state(self._looked, self.live.stamping),
+            streams=self._watch.state(self._read_at, self.live.stamping),
             solution=self._n_solutions,
             verdict=verdict,
             lines=tuple(lines),

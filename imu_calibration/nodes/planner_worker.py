@@ -17,6 +17,7 @@ from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.nodes.diagnostics import LOG_ERROR, LOG_INFO
 from imu_calibration.planning.campaign import Campaign, Suspect
 from imu_calibration.planning.driver import Driver, DriveState
+from imu_calibration.planning.planner import Decision
 from imu_calibration.references.turntable.live_diagnosis import FOUND, MATES_KEY, SIZE_KEY
 
 DRIVER_CHECK_SECONDS = 0.05
@@ -220,7 +221,7 @@ class PlannerWorker(threading.Thread):
                 if self.driver.state is DriveState.MEASURING:
                     self.driver.wait('rests until the next motion is requested')
 
-    def _decide(self) -> Any:
+    def _decide(self) -> Decision | None:
         """Return the campaign's decision on the next step; None without a request."""
         if not self._n_wanted or self._ending:
             return None
@@ -232,7 +233,7 @@ class PlannerWorker(threading.Thread):
         self.outside = sum(excess > 1.0 for excess in self.campaign.planner.excess.values())
         return decision
 
-    def _carry_out(self, decision: Any) -> None:
+    def _carry_out(self, decision: Decision) -> None:
         """Begin the motion of a decision, or end the campaign where it has none."""
         if decision.motion is None:
             self._n_wanted = 0

@@ -1205,14 +1205,14 @@ LIVE = _of(
     (
         'its own work taken for silence of the sensor',
         'CalibrationWorker._tell',
-        'self._watch.state(self._looked, self.live.stamping)',
+        'self._watch.state(self._read_at, self.live.stamping)',
         'self._watch.state(time.monotonic(), self.live.stamping)',
         'test_calibration_worker.py',
     ),
     (
         'its own work taken for the end of the motion',
         'CalibrationWorker._solve_when_due',
-        'self._looked',
+        'self._read_at',
         'time.monotonic()',
         'test_calibration_worker.py',
     ),
