@@ -5,6 +5,7 @@ The module also holds the motions of the two source papers.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import Any
@@ -20,6 +21,25 @@ FACES = np.concatenate([np.eye(3), -np.eye(3)])
 """Directions to the faces of a cube, shape (6, 3)."""
 Task = Callable[[MotionBuilder], object]
 """Part of a session: appends segments to a builder."""
+
+
+@dataclass(frozen=True)
+class ProfileEntry:
+    """A profile in the registry."""
+
+    description: str
+    """One line for the help."""
+    build: Callable
+    """``build(builder, rng)`` appends the segments; `rng` is seeded."""
+    table: dict | None = None
+    """Description of the table that the profile brings; None: it moves the given table."""
+    n_joints: int | None = None
+    """Number of joints that the profile needs; None: any number."""
+    adapts: bool = False
+    """
+    Whether a table with another number of joints gets `any_table` instead, and one with joint
+    limits `within_limits`.
+    """
 
 
 def pose_deg(up_b: np.ndarray, heading_deg: float = 0.0) -> np.ndarray:
@@ -280,9 +300,9 @@ def _gimbals(order: str, up_axis: str) -> dict[str, Any]:
     return _table([AXIS_VECTORS[axis] for axis in order], AXIS_VECTORS[up_axis])
 
 
-REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
+REGISTRY: dict[str, ProfileEntry] = {
     **{
-        f'avrutov_{order}{suffix}': (
+        f'avrutov_{order}{suffix}': ProfileEntry(
             (
                 f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x'
                 ' or _up_y to turn gravity'
@@ -295,14 +315,14 @@ REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
             AXIS_ORDERS, (('', 'Z'), ('_up_x', 'X'), ('_up_y', 'Y'))
         )
     },
-    'avrutov_111': (
+    'avrutov_111': ProfileEntry(
         "the literal reading of 'around three axes simultaneously': one turn about (1, 1, 1)",
         _equal_angles,
         _table([[1.0, 1.0, 1.0]]),
         1,
     ),
     **{
-        f'avrutov_rates_{sample}': (
+        f'avrutov_rates_{sample}': ProfileEntry(
             (
                 f'gyroscope series of sample {sample} as body rates: one turn about a fixed axis'
                 ' for each row'
@@ -314,7 +334,7 @@ REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
         for sample in (3, 4)
     },
     **{
-        f'avrutov_gimbals_{sample}': (
+        f'avrutov_gimbals_{sample}': ProfileEntry(
             (
                 f'gyroscope series of sample {sample} commanded to the gimbals, which are not body'
                 ' rates'
@@ -325,25 +345,25 @@ REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
         )
         for sample in (3, 4)
     },
-    'zhang_z0': (
+    'zhang_z0': ProfileEntry(
         'six faces, spins about the sensor axes at 100, 150, 200 deg/s',
         _zhang_spins,
         GIMBALS,
         3,
     ),
-    'zhang_z60': (
+    'zhang_z60': ProfileEntry(
         'the same with a fixture skewed by 60 deg about (1, 1, 1)',
         _zhang_spins,
         _table([AXIS_VECTORS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG),
         3,
     ),
-    'zhang_o': (
+    'zhang_o': ProfileEntry(
         'six faces, swings about the sensor axes: 10 deg 1 Hz, 5 deg 2 Hz, 90 deg 0.5 Hz',
         _zhang_oscillations,
         GIMBALS,
         3,
     ),
-    'zhang_m': (
+    'zhang_m': ProfileEntry(
         'six faces, three spins, three swings, three simultaneous turns',
         _zhang_mixed,
         GIMBALS,

@@ -1,7 +1,6 @@
 """Named motions of a turntable, for the verb simulate and the simulator node."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from itertools import product
 from typing import Any
@@ -16,6 +15,7 @@ from imu_calibration.simulation import motion_primitives
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment, stretch
 from imu_calibration.simulation.motion_primitives import (
     FACES,
+    ProfileEntry,
     Task,
     poses,
     run,
@@ -121,25 +121,6 @@ SPEEDS_DEG = (60.0, 120.0, 200.0)
 """Three speeds: with one or two, a delay is a mounting angle and a square is an asymmetry."""
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """A profile in the registry."""
-
-    description: str
-    """One line for the help."""
-    build: Callable
-    """``build(builder, rng)`` appends the segments; `rng` is seeded."""
-    table: dict | None = None
-    """Description of the table that the profile brings; None: it moves the given table."""
-    n_joints: int | None = None
-    """Number of joints that the profile needs; None: any number."""
-    adapts: bool = False
-    """
-    Whether a table with another number of joints gets `any_table` instead, and one with joint
-    limits `within_limits`.
-    """
-
-
 def profile_names() -> dict[str, str]:
     """Return the names of all profiles with one line of description each, a dict."""
     return {name: entry.description for name, entry in _REGISTRY.items() if '_up_' not in name}
@@ -230,7 +211,7 @@ def _require_within(profile: Profile, limits: MotionLimits) -> None:
             )
 
 
-def _joint_names(entry: _Entry, table: dict[str, Any] | Table | None) -> tuple[str, ...]:
+def _joint_names(entry: ProfileEntry, table: dict[str, Any] | Table | None) -> tuple[str, ...]:
     """Return the joints of a table; without one those of a table with two or three axes."""
     if table is None:
         return THREE_AXIS if entry.n_joints in (None, 3) else THREE_AXIS[:1] + THREE_AXIS[2:]
@@ -474,52 +455,52 @@ _ON_ARM = {
 }
 
 _REGISTRY = {
-    'calibration': _Entry(
+    'calibration': ProfileEntry(
         'full session on a three-axis table, about 11 min: poses, spins, swings, two axes at once',
         _calibration,
         n_joints=3,
         adapts=True,
     ),
-    'short': _Entry('the same in about 5 min', _short, n_joints=3, adapts=True),
-    'quick': _Entry(
+    'short': ProfileEntry('the same in about 5 min', _short, n_joints=3, adapts=True),
+    'quick': ProfileEntry(
         'the shortest that determines all parameters, about 2 min', _quick, n_joints=3, adapts=True
     ),
-    'six_faces': _Entry(
+    'six_faces': ProfileEntry(
         'every axis up and down, and turned both ways at one speed, about 1 min: similar effects'
         ' are collinear',
         _six_faces,
         n_joints=3,
         adapts=True,
     ),
-    'static_only': _Entry('26 poses, no deliberate rotation', _static_only, n_joints=3),
-    'random': _Entry(
+    'static_only': ProfileEntry('26 poses, no deliberate rotation', _static_only, n_joints=3),
+    'random': ProfileEntry(
         'poses, spins, swings and two-axis turns drawn from the seed, about 5 min',
         _random,
         n_joints=3,
         adapts=True,
     ),
-    'random_short': _Entry(
+    'random_short': ProfileEntry(
         'the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True
     ),
-    'separating': _Entry(
+    'separating': ProfileEntry(
         'many angles, three speeds both ways, four frequencies: separates similar effects',
         _separating,
         n_joints=3,
         adapts=True,
     ),
-    'separating_short': _Entry(
+    'separating_short': ProfileEntry(
         'the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True
     ),
-    'separating_arm': _Entry(
+    'separating_arm': ProfileEntry(
         'separating with the sensor on an arm of 0.27 m, so that spins exceed 1 g',
         _separating,
         _ON_ARM,
         3,
     ),
-    'thermal': _Entry(
+    'thermal': ProfileEntry(
         'the same round six times while the temperature changes', _thermal, n_joints=3
     ),
-    'navigation': _Entry(
+    'navigation': ProfileEntry(
         'rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling',
         partial(
             _tumbling,
@@ -531,21 +512,21 @@ _REGISTRY = {
         ),
         n_joints=3,
     ),
-    'tumbling': _Entry(
+    'tumbling': ProfileEntry(
         '60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)',
         partial(_tumbling, rest=5.0, parts=(([60.0, 45.0, 30.0], [0.7, 0.9, 1.1], 60.0, 5.0),)),
         n_joints=3,
     ),
-    'two_axis': _Entry(
+    'two_axis': ProfileEntry(
         'poses, spins, swings and simultaneous turns of a two-axis table', _any_table, n_joints=2
     ),
-    'within_limits': _Entry(
+    'within_limits': ProfileEntry(
         'poses, swings and, where a joint has no end, spins, within the limits of every joint',
         within_limits,
     ),
-    'within_limits_short': _Entry('the same with fewer of them', within_limits_short),
-    'any_table': _Entry(
+    'within_limits_short': ProfileEntry('the same with fewer of them', within_limits_short),
+    'any_table': ProfileEntry(
         'poses, spins, swings and simultaneous turns of all joints of the table', _any_table
     ),
-    **{name: _Entry(*entry) for name, entry in motion_primitives.REGISTRY.items()},
+    **motion_primitives.REGISTRY,
 }
