@@ -14,7 +14,12 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import CAUSES, Felt, SimulatedNoise, hidden_causes
+from imu_calibration.simulation.sensor_noise import (
+    CAUSES,
+    SensorMotion,
+    SimulatedNoise,
+    hidden_causes,
+)
 from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, simulate_session
 from imu_calibration.simulation.table_controller import (
     ControllerSettings,
@@ -218,9 +223,10 @@ def test_hidden_causes_change_what_their_physics_changes():
     for name in CAUSES:
         (cause,) = hidden_causes([name], 1)
         felt, mirrored = (
-            cause(Felt(sign * force, sign * rate, sign * force, sign * rate)) for sign in (1, -1)
+            cause(SensorMotion(sign * force, sign * rate, sign * force, sign * rate))
+            for sign in (1, -1)
         )
-        at_rest_turned = cause(Felt(force, 0 * rate, force, 0 * rate)).rate
+        at_rest_turned = cause(SensorMotion(force, 0 * rate, force, 0 * rate)).rate
         changed = {'force': np.any(felt.force != force), 'rate': np.any(felt.rate != rate)}
         assert list(changed.values()) == [
             name in ('soft_spring', 'gain_by_sense'),
@@ -232,7 +238,9 @@ def test_hidden_causes_change_what_their_physics_changes():
         assert odd == (name in ('unbalanced_mass', 'narrow_range'))
         (half,) = hidden_causes([name], 1, 0.5)
         np.testing.assert_allclose(
-            half(Felt(force, rate, force, rate)).rate - rate, 0.5 * (felt.rate - rate), atol=1e-12
+            half(SensorMotion(force, rate, force, rate)).rate - rate,
+            0.5 * (felt.rate - rate),
+            atol=1e-12,
         )
     with refused(InputError, 'cause_unknown', 'two_half_ranges'):
         hidden_causes(['gremlins'], 0)
