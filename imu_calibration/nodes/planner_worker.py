@@ -248,6 +248,8 @@ class PlannerWorker(threading.Thread):
         with self._lock:
             if not self._n_wanted:  # stopped meanwhile
                 return
+            # Joints that rest have a position.
+            assert self.driver.position is not None
             points = self.driver.begin(
                 decision.motion.points(self.driver.position),
                 decision.motion.words,
