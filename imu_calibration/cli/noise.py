@@ -1,6 +1,5 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
-from collections.abc import Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -76,7 +75,7 @@ def run(options: Options) -> VerbResult:
         return VerbResult(noise.exit_code, document, noise.reasons)
 
 
-def _show(noise: 'IdentifiedNoise', rates: Sequence[float]) -> None:
+def _show(noise: 'IdentifiedNoise', rates: list[float]) -> None:
     """Print the figures, their remarks, and the figures for filters at sampling rates, Hz."""
     from imu_calibration.allan import document
 

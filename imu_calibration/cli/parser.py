@@ -480,7 +480,7 @@ def add_verbs(
 
 def _usage(action: argparse.Action) -> str:
     """Return a required argument as the usage line shows it."""
-    name = action.metavar or action.dest.upper()
+    name = str(action.metavar or action.dest.upper())
     if action.option_strings:
         return f'{action.option_strings[0]} {name}'
     return f'{name} [{name} ...]' if action.nargs == '+' else name

@@ -195,9 +195,9 @@ class Calibration:
         """Whether the noise of a sensor is known at any sampling rate."""
         return any('noise_density' in self.statistics.get(sensor, {}) for sensor in SENSORS)
 
-    def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, float]:
+    def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (sd of a sample, shape (3,); sd of window offsets and wander).
+        Return (sd of a sample, shape (3,); sd of window offsets and wander, shape ()).
 
         With a noise density and a `period` (s), the sample sd is for that rate; else for the rate
         of the recording. Zero where the statistics have none.
