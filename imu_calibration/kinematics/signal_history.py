@@ -137,7 +137,9 @@ class ThermalBranch:
 
     def of(self, temperature_c: np.ndarray) -> np.ndarray:
         """Return the branch at each of the next readings, shape (n,)."""
-        return np.array([self.push(each) for each in np.asarray(temperature_c, float).tolist()])
+        return np.array(
+            [self.push(reading) for reading in np.asarray(temperature_c, float).tolist()]
+        )
 
 
 SLOPE_SECONDS = 5.0

@@ -422,18 +422,18 @@ def _with_limits(joints: Sequence[Joint], entries: Iterable[Any], link: str) -> 
                 f' {name!r}',
                 code='joint_unknown',
             )
-        known = by_name[name]
-        limits = mapping({'name': text()}, LIMITS[known.type], closed=True)
+        joint = by_name[name]
+        limits = mapping({'name': text()}, LIMITS[joint.type], closed=True)
         require(entry, replace(SITE, name=f"limits of joint '{name}'"), limits)
-        given = limits_from_mapping(entry, known.type)
+        given = limits_from_mapping(entry, joint.type)
         changes: dict[str, Any] = {}
         for key, value in vars(given).items():
             if key != 'described' and value is not None and value is not False:
                 changes[key] = value
         if given.endless or given.lower is not None:  # a range and endless exclude each other
             changes = {'lower': None, 'upper': None, 'endless': False} | changes
-        changes['described'] = known.limits.described - set(changes)
-        by_name[name] = replace(known, limits=replace(known.limits, **changes))
+        changes['described'] = joint.limits.described - set(changes)
+        by_name[name] = replace(joint, limits=replace(joint.limits, **changes))
     return tuple(by_name.values())
 
 

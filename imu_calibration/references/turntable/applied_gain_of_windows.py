@@ -52,7 +52,7 @@ class _Side:
 
 
 def gain_of_findings(
-    found: Investigation,
+    investigation: Investigation,
     table: Table,
     before: Sequence[Question],
     *,
@@ -69,29 +69,31 @@ def gain_of_findings(
 
     Parameters
     ----------
-    found : Investigation
+    investigation : Investigation
     table : Table
     before, after : sequence of Question
     sensors : sequence of str
         Sensors that the difference acts on.
 
     """
-    compensated = compensated_findings(found, before, after)
+    compensated = compensated_findings(investigation, before, after)
     if compensated is None:
-        return heldout_gain(found.problem, before, after, sensors=sensors)
+        return heldout_gain(investigation.problem, before, after, sensors=sensors)
 
     # Sensor and measure from the windows that choose, then the errors in the locked windows.
-    chosen = gain_in_turn(found.problem, compensated.before, compensated.after, sensors=sensors)
+    chosen = gain_in_turn(
+        investigation.problem, compensated.before, compensated.after, sensors=sensors
+    )
     sides = [
-        _applied_parameters(found, compensated.before),
-        _applied_parameters(found, compensated.after),
+        _applied_parameters(investigation, compensated.before),
+        _applied_parameters(investigation, compensated.after),
     ]
-    sums = _locked_errors(found, table, sides)
+    sums = _locked_errors(investigation, table, sides)
     return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
 
 
 def gains_of_formulas(
-    found: Investigation, table: Table, proposals: Sequence[Proposal]
+    investigation: Investigation, table: Table, proposals: Sequence[Proposal]
 ) -> dict[str, Gain]:
     """
     Return sensor -> Gain of the proposed formulas over the findings on the locked windows.
@@ -102,7 +104,7 @@ def gains_of_formulas(
 
     Parameters
     ----------
-    found : Investigation
+    investigation : Investigation
     table : Table
     proposals : sequence of Proposal
         At most one for each sensor.
@@ -110,8 +112,8 @@ def gains_of_formulas(
     """
     if not proposals:
         return {}
-    problem = found.problem
-    before = _applied_parameters(found, found.adopted)
+    problem = investigation.problem
+    before = _applied_parameters(investigation, investigation.adopted)
 
     # The model with the formulas, linearised at their amplitudes.
     model, values = with_formulas(before.model, before.values, proposals)
@@ -119,7 +121,7 @@ def gains_of_formulas(
 
     # Estimated from the windows that are not locked.
     accumulator = Accumulator()
-    unlocked = [window for window, locked in zip(found.used, problem.locked) if not locked]
+    unlocked = [window for window, locked in zip(investigation.used, problem.locked) if not locked]
     for group in chunks(unlocked):
         for window in reduce_windows(group, model, table):
             accumulator.add(window)
@@ -140,7 +142,9 @@ def gains_of_formulas(
         is_compensated = any(effect.compensation == 'exact' for effect in proposal.effects)
         error_kind = APPLIED if is_compensated else OF_MODEL
         if error_kind not in sums_of:
-            sums_of[error_kind] = _locked_errors(found, table, [before, after], of=error_kind)
+            sums_of[error_kind] = _locked_errors(
+                investigation, table, [before, after], of=error_kind
+            )
         gain = sums_of[error_kind].gains(proposal.sensor, error_kind)[SAMPLES]
         white_variance = problem.noise[proposal.sensor].white_variance
         gains[proposal.sensor] = replace(gain, noise_rms=float(np.sqrt(np.mean(white_variance))))
@@ -148,7 +152,7 @@ def gains_of_formulas(
 
 
 def _locked_errors(
-    found: Investigation,
+    investigation: Investigation,
     table: Table,
     sides: Sequence[_Side],
     *,
@@ -160,10 +164,10 @@ def _locked_errors(
     `of`: `APPLIED`, the errors of corrected readings, or `OF_MODEL`, the residuals of the model.
     Windows before effects have settled are omitted, as in `HeldOutData`.
     """
-    problem = found.problem
+    problem = investigation.problem
     start = max(judged_from_of(side.latest, problem.duration) for side in sides)
     held_out = []
-    for window, locked in zip(found.used, problem.locked):
+    for window, locked in zip(investigation.used, problem.locked):
         if locked and window.time[0] >= start:
             held_out.append(window)
 
@@ -176,9 +180,9 @@ def _locked_errors(
     return sums
 
 
-def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Side:
+def _applied_parameters(investigation: Investigation, chosen: Sequence[Question]) -> _Side:
     """Return the model with some effects, estimated without the locked windows."""
-    problem = found.problem
+    problem = investigation.problem
     gathered = problem.recording.model  # with all effects under test
     model = replace(problem.baseline, temperature_ref_c=gathered.temperature_ref_c)
     for question in chosen:
@@ -217,9 +221,9 @@ def _errors(
     for sensor in SENSORS:
         raw.append(np.concatenate([measured(window, sensor) for window in windows]))
     count = len(side.values)
-    known = Calibration(side.model, side.applied, np.zeros((count, count)), (HELD,) * count)
+    calibration = Calibration(side.model, side.applied, np.zeros((count, count)), (HELD,) * count)
     corrected = compensated_samples(
-        known,
+        calibration,
         *raw,
         alpha_s=ref.alpha_s,
         temperature_c=ref.temperature_c,

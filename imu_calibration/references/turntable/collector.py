@@ -365,6 +365,7 @@ class Collector:
         self.session = session
         self.windows = windows
         self.spread = spread
+        # Cleans the samples, joins the streams and finds the windows.
         self.gatherer = MotionGatherer(
             table,
             settings,

@@ -45,7 +45,7 @@ the effect is then reported with the finding.
 
 
 def build_diagnosis(
-    table: Table, found: Investigation, *, calibrated: Solution | None = None
+    table: Table, investigation: Investigation, *, calibrated: Solution | None = None
 ) -> Diagnosis:
     """
     Return the result of an investigation as a Diagnosis, without traces.
@@ -54,21 +54,25 @@ def build_diagnosis(
     ----------
     table : Table
         The reference.
-    found : Investigation
+    investigation : Investigation
     calibrated : Solution, optional
         Solution of a model with all findings, with the reported parameters; default: the solution
         of the investigation.
 
     """
-    problem = found.problem
-    named = found.named
-    analysis = ResidualAnalysis.of(found, table)
+    problem = investigation.problem
+    named = investigation.named
+    analysis = ResidualAnalysis.of(investigation, table)
     unexplained = analysis.unexplained
     baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
     solution = baseline
-    if named or found.limits:
+    if named or investigation.limits:
         solution = extended_solution(
-            problem.space, problem.noise, problem.baseline, chosen=named, saturations=found.limits
+            problem.space,
+            problem.noise,
+            problem.baseline,
+            chosen=named,
+            saturations=investigation.limits,
         )
 
     # Findings are added in their order: the functions below compare the model with the findings
@@ -76,7 +80,7 @@ def build_diagnosis(
     def gain_of(place: int) -> Gain:
         """Return the gain of a finding over the ones before it."""
         return gain_of_findings(
-            found,
+            investigation,
             table,
             named[:place],
             after=named[: place + 1],
@@ -100,8 +104,8 @@ def build_diagnosis(
 
     # Implausible findings are not in the calibration.
     reported = calibrated or solution
-    implausible = found.implausible
-    findings = [_clipping(limit, reported) for limit in found.limits]
+    implausible = investigation.implausible
+    findings = [_clipping(limit, reported) for limit in investigation.limits]
     affected: set[str] = set()
     for place, question in enumerate(named):
         affected |= set(question.effect.sensors)
@@ -111,11 +115,11 @@ def build_diagnosis(
                 named,
                 place,
                 solution=solution if question in implausible else reported,
-                share=found.explained.share,
+                share=investigation.explained.share,
                 gain_of=gain_of,
                 motion_of=motion_of,
                 shows=shows,
-                rivals=_rivals(found, question),
+                rivals=_rivals(investigation, question),
             )
         )
     sensors = sorted(affected) or list(unexplained)
@@ -124,22 +128,22 @@ def build_diagnosis(
         problem.search,
         named,
         agree=_agreement(problem),
-        withdrawn=found.unstable,
+        withdrawn=investigation.unstable,
         replaced=analysis.replaced,
     )
     return Diagnosis(
         findings=tuple(findings),
         unexplained=unexplained,
         candidates=candidates,
-        not_testable=tuple(found.not_testable),
+        not_testable=tuple(investigation.not_testable),
         baseline=baseline,
         solution=solution,
-        gain=gain_of_findings(found, table, [], after=named, sensors=sensors),
-        windows=len(found.used),
+        gain=gain_of_findings(investigation, table, [], after=named, sensors=sensors),
+        windows=len(investigation.used),
         locked=int(np.sum(problem.locked)),
-        onset=found.onset,
+        onset=investigation.onset,
         stamp_jitter=analysis.stamp_jitter,
-        formula_gains=gains_of_formulas(found, table, proposals),
+        formula_gains=gains_of_formulas(investigation, table, proposals),
     )
 
 
@@ -155,18 +159,21 @@ def _agreement(problem: LinearisedProblem) -> Callable[[Sequence[Question], Ques
     return agree
 
 
-def _rivals(found: Investigation, question: Question) -> list[Question]:
+def _rivals(investigation: Investigation, question: Question) -> list[Question]:
     """
     Return effects that may be the cause in place of a finding.
 
     Effects that fit nearly as well, and rejected effects that change a parameter of the finding by
     more than `MIN_SHARE_REPLACED` of its value when they are added to the model.
     """
-    alternatives = [rival.other for rival in found.rivals if rival.question.name == question.name]
-    names = found.problem.space.names
-    values = dict(zip(names, found.problem.values(found.named)))
-    for other in found.rejected:
-        moved = found.search.moved_by(found.named, other, names)
+    alternatives = [
+        rival.other for rival in investigation.rivals if rival.question.name == question.name
+    ]
+    names = investigation.problem.space.names
+    values = dict(zip(names, investigation.problem.values(investigation.named)))
+    for other in investigation.rejected:
+        # Parameter -> its change when the effect is added.
+        moved = investigation.search.moved_by(investigation.named, other, names)
         for index in question.parameters:
             name = names[index]
             if abs(moved.get(name, 0.0)) > MIN_SHARE_REPLACED * abs(values[name]):

@@ -220,20 +220,20 @@ def reference_model(calibration: Calibration, table: Table) -> SensorModel:
 
     It has bias, matrix, and the effects of the table and the clock that the calibration has.
     """
-    known = calibration.model
-    same_joints = known.joint_names == table.joint_names
+    calibrated = calibration.model
+    same_joints = calibrated.joint_names == table.joint_names
     names: dict[str, list[str]] = {sensor: [] for sensor in SENSORS}
-    for effect in known.effects:
+    for effect in calibrated.effects:
         is_plain = effect.role in (Role.OFFSET, Role.LINEAR)
         if effect.sensor in names and (is_plain or (same_joints and is_of_reference(effect))):
             names[effect.sensor].append(effect.name)
     model = SensorModel(
         tuple(names['accelerometer']),
         tuple(names['gyroscope']),
-        reference=known.reference if same_joints else (),
+        reference=calibrated.reference if same_joints else (),
         joint_names=table.joint_names,
-        temperature_ref_c=known.temperature_ref_c,
-        catalogue=known.catalogue,
+        temperature_ref_c=calibrated.temperature_ref_c,
+        catalogue=calibrated.catalogue,
     )
     model = model.at(reference_values(model, calibration))
     # The position of the sensor on the table is no error of either side: it is estimated for each.
@@ -248,8 +248,8 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
 
     Shape (n_params,).
     """
-    known = model.start_from(calibration.model, calibration.values)
-    return with_reference(model, nominal_values(model), known)
+    calibrated = model.start_from(calibration.model, calibration.values)
+    return with_reference(model, nominal_values(model), calibrated)
 
 
 def with_reference(model: SensorModel, values: np.ndarray, reference: np.ndarray) -> np.ndarray:

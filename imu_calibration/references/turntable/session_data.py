@@ -311,10 +311,10 @@ class HeldOut:
     @property
     def sensors(self) -> tuple[str, ...]:
         """Sensors with pieces for judging."""
-        found: set[str] = set()
+        with_pieces: set[str] = set()
         for block in self.blocks:
-            found.update(sensor for sensor, _ in block.pieces)
-        return tuple(sensor for sensor in SENSORS if sensor in found)
+            with_pieces.update(sensor for sensor, _ in block.pieces)
+        return tuple(sensor for sensor in SENSORS if sensor in with_pieces)
 
     @property
     def n_windows(self) -> int:

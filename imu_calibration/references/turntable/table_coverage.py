@@ -179,5 +179,6 @@ def _arms(result: TableResult) -> np.ndarray | None:
     if effect is None:
         return None
     part = result.model.slices[effect.key]
-    known = not set(LACKING) & set(result.calibration.status[part])
-    return result.calibration.values[part].reshape(3, 3) if known else None
+    if set(LACKING) & set(result.calibration.status[part]):
+        return None
+    return result.calibration.values[part].reshape(3, 3)

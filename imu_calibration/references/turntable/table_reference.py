@@ -104,7 +104,11 @@ class TableReference:
     def inspect(
         self, source: BlockSource, lenient: BlockSource, options: CalibrationOptions
     ) -> Inspection:
-        """Calibrate with the checks of a calibration; without data for it, only check."""
+        """
+        Return the checks of a recording and its calibration, or the error that prevents it.
+
+        If the calibration ended before the end of the recording, `lenient` is read for the checks.
+        """
         gravity = self.table.gravity_value
         preflight = Preflight(gravity, one_sensor=True)
         recordings = WatchedRecording.of([source], self.table)
@@ -112,12 +116,12 @@ class TableReference:
         calibrated: TableResult | ImuCalibrationError
         shown = []
         try:
-            found = calibrate_with_table_errors(recordings, options)
-            calibrated = found.result
+            with_errors = calibrate_with_table_errors(recordings, options)
+            calibrated = with_errors.result
             for finding in calibrated.gathered.findings:
                 if finding.check in STATED_CHECKS:
                     shown.append(finding)
-            shown += found.findings
+            shown += with_errors.findings
         except ImuCalibrationError as error:
             calibrated = error
         if not preflight.streams:  # not read to its end
@@ -132,7 +136,7 @@ class TableReference:
         return Inspection(preflight, (*findings, *shown), calibrated)
 
     def reasons(self, lacking: list[str], doubts: list[str]) -> list[str]:
-        """Return what the calibration lacks: a table moves for nothing else."""
+        """Return the reasons of the calibration; `doubts` need no further motion of a table."""
         return lacking
 
     def used_lines(self, calibration: Calibration) -> list[str]:

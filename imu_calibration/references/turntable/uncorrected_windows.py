@@ -71,10 +71,11 @@ def uncorrected_on_table(
                 of_group = _moved(effect, _projection(effect, columns, samples), change)
             centre[group.name] = of_group
 
-            # The output of the effect less that of this part.
-            own = model.layout(effect.sensor).rows[group.name]
-            applied = coefficients(model, effect.sensor, values)[own]
-            value = coefficients(at_columns, effect.sensor, values)[own]
+            # The output of the effect without that of the constant part. The coefficients of the
+            # effect are those at the time constant of the gathered columns.
+            rows = model.layout(effect.sensor).rows[group.name]
+            applied = coefficients(model, effect.sensor, values)[rows]
+            value = coefficients(at_columns, effect.sensor, values)[rows]
             squares += samples.squares_without(columns, value, of_group, applied)
         sizes.append(uncorrected_size(effect, np.sqrt(squares / samples.counts.sum()), at_end))
     return Uncorrected(centre, tuple(sizes))
@@ -108,18 +109,29 @@ class _Samples:
         self, columns: slice, value: np.ndarray, part: ColumnCentre, applied: np.ndarray
     ) -> np.ndarray:
         """
-        Return the sums of squares of the output of an effect less that of the constant part.
+        Return the sum over all samples of squares of an effect without its constant part, (3,).
 
-        Shape (3,). Coefficients of each axis: `value` of the columns, `applied` of the part, both
-        shape (width, 3).
+        ``columns @ value - (constant + slope @ true) @ applied`` for each axis.
+
+        Parameters
+        ----------
+        columns : slice
+            Columns of the effect.
+        value : array, shape (width, 3)
+            Their coefficients.
+        part : ColumnCentre
+            Constant and slope of each column.
+        applied : array, shape (width, 3)
+            Coefficients of the constant part.
+
         """
         constant = part.constant @ applied
         slope = part.slope.T @ applied
-        rest = self.means[:, columns] @ value - constant - self.means[:, self.true_input] @ slope
-        squares = self.counts @ rest**2
+        means = self.means[:, columns] @ value - constant - self.means[:, self.true_input] @ slope
+        squares = self.counts @ means**2
         for factor in self.within:
-            rest = factor[:, columns] @ value - factor[:, self.true_input] @ slope
-            squares += (rest**2).sum(axis=0)
+            about_mean = factor[:, columns] @ value - factor[:, self.true_input] @ slope
+            squares += (about_mean**2).sum(axis=0)
         return squares
 
 
@@ -128,9 +140,11 @@ def _projection(effect: Effect, columns: slice, samples: _Samples) -> ColumnCent
     Return the part of the columns of an effect that bias and matrix describe.
 
     It minimises the squares of ``column - constant - slope @ true`` over all samples. An effect in
-    time only is no function of the motion: its mean is the value in another session.
+    time only is no function of the motion and has no slope: its mean is the value in another
+    session.
     """
-    counts, true_input = samples.counts, samples.true_input
+    counts = samples.counts
+    true_input = samples.true_input
     mean = counts @ samples.means / counts.sum()
     slope = np.zeros((columns.stop - columns.start, 3))
     if not in_time(effect):
@@ -148,9 +162,10 @@ def _projection(effect: Effect, columns: slice, samples: _Samples) -> ColumnCent
 
 def _moved(effect: Effect, part: ColumnCentre, change: np.ndarray) -> ColumnCentre:
     """
-    Return the part at parameters that differ by `change` from the point of the columns.
+    Return the constant part of an effect with parameters that differ from the point of its columns.
 
-    Of a time constant, to first order: the second half of its columns are the derivatives.
+    To first order in the change of a time constant: the second half of its columns are the
+    derivatives of the first half. `change`: parameters minus the point.
     """
     if not effect.time_constant:
         return part

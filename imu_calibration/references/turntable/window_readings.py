@@ -106,17 +106,16 @@ class BothReadings(GatherStep):
         """Yield the blocks of a recording with corrected readings."""
         temperature = None
         if invertible(self.calibration.model).needs_temperature:
-            known = [block.temperature for block in source if block.temperature is not None]
-            temperature = TemperatureSamples.concatenate(known) if known else None
+            readings = [block.temperature for block in source if block.temperature is not None]
+            temperature = TemperatureSamples.concatenate(readings) if readings else None
         stream = CompensationStream(self.calibration, temperature=temperature)
         for block in source:
             if block.imu is not None and len(block.imu):
                 # The cleaner converts the raw readings of the block afterwards.
-                readings = self.nominal or RawReadings()
-                found = stream.correct(readings.apply(block.imu))
-                block = replace(
-                    block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate]))
-                )
+                conversion = self.nominal or RawReadings()
+                samples = stream.correct(conversion.apply(block.imu))
+                corrected = np.hstack([samples.force, samples.rate])
+                block = replace(block, imu=replace(block.imu, corrected=corrected))
             yield block
 
 
@@ -130,8 +129,8 @@ def _both(window: Window) -> tuple[Window, Window]:
     assert corrected is not None, 'the window is of corrected readings'
     # An absent sensor has no corrected readings, and its rows are not read.
     present = np.repeat([sensor not in window.absent for sensor in SENSORS], 3)
-    known = np.isfinite(corrected[:, present]).all(axis=1)
-    if not known.all():
-        window = window.select(known)
-        corrected = corrected[known]
+    is_corrected = np.isfinite(corrected[:, present]).all(axis=1)
+    if not is_corrected.all():
+        window = window.select(is_corrected)
+        corrected = corrected[is_corrected]
     return window, replace(window, force_s=corrected[:, :3], rate_s=corrected[:, 3:])
