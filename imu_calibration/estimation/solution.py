@@ -292,7 +292,7 @@ def statuses(
         Largest standard deviation of a determined parameter, SI.
 
     """
-    found = []
+    of_parameters = []
     for is_held, deviation, tolerance in zip(held, sd, tolerances, strict=True):
         status = WEAK
         if is_held:
@@ -301,8 +301,8 @@ def statuses(
             status = FIXED
         elif deviation <= tolerance:
             status = DETERMINED
-        found.append(status)
-    return tuple(found)
+        of_parameters.append(status)
+    return tuple(of_parameters)
 
 
 def reasons_held(

@@ -136,6 +136,7 @@ class _RowProblem:
     """Estimate from the rows of a reference (`EstimateProblem`)."""
 
     reference: RowReference
+    """Linearises its equations at a state."""
     fallback: np.ndarray
     """Variances of the components where the data are too few, shape (n_components,)."""
     withheld: np.ndarray
@@ -202,6 +203,7 @@ class _RowSquares:
     """Sum of squares of the rows of a reference and of the priors (`LeastSquares`)."""
 
     reference: RowReference
+    """Linearises its equations at a state."""
     free: np.ndarray
     """True for the parameters that are estimated, shape (n,)."""
     priors: np.ndarray

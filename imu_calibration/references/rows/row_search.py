@@ -146,7 +146,9 @@ class RowTests(EffectTests):
     """The tests of a choice on few rows."""
 
     problem: RowProblem
+    """All rows."""
     explained: Explained
+    """Their excess over noise."""
     held_out: list[ChoiceWithout] = field(default_factory=list)
     """The search without each part of the groups; empty before it is needed."""
 

@@ -181,9 +181,9 @@ class WindowRows:
             axes.append(_ChangingOfAxis(rows, order, mean, within, within[:, columns]))
         return ChangingColumns(len(self.expected), self.space.size + 1, len(at), tuple(axes))
 
-    def fit(self, own: np.ndarray, changes: Changes | None = None) -> ChangeFit:
+    def fit(self, parameters: np.ndarray, changes: Changes | None = None) -> ChangeFit:
         """
-        Return the least squares fit of the parameters `own`, with their priors, and of changes.
+        Return the least squares fit of some parameters, with their priors, and of changes.
 
         With the columns A of the parameters, B of the changes and the residual r, all white, the
         prior mean m and its information W = diag(1 / sd^2)::
@@ -194,20 +194,21 @@ class WindowRows:
 
         Parameters
         ----------
-        own : ndarray of int, shape (p,)
+        parameters : ndarray of int, shape (p,)
+            Their places in the space.
         changes : Changes, optional
-            Their products with the columns, B'A, and with one another, B'B; no prior.
+            Products with the columns, B'A, and with one another, B'B; no prior.
 
         """
-        information = 1 / self.space.prior_sd[own] ** 2
-        prior_mean = self.space.prior_mean[own]
+        information = 1 / self.space.prior_sd[parameters] ** 2
+        prior_mean = self.space.prior_mean[parameters]
         # The last row and column of `self.normal` belong to the residual.
-        normal = self.normal[np.ix_(own, own)] + np.diag(information)
-        right = self.normal[own, -1] + prior_mean * information
+        normal = self.normal[np.ix_(parameters, parameters)] + np.diag(information)
+        right = self.normal[parameters, -1] + prior_mean * information
         if changes is not None:
             cross = changes.cross.sum(axis=0)
             squares = changes.squares.sum(axis=0)
-            normal = np.block([[normal, cross[own]], [cross[own].T, squares]])
+            normal = np.block([[normal, cross[parameters]], [cross[parameters].T, squares]])
             right = np.concatenate([right, cross[-1]])
 
         # Scaled to a unit diagonal, because the units differ; collinear columns share their value.
@@ -218,21 +219,21 @@ class WindowRows:
         prior_squares = (prior_mean**2 * information).sum()
         loss = self.normal[-1, -1] + prior_squares - right @ values
         sd = np.sqrt(np.diag(covariance))
-        count = len(own)
+        count = len(parameters)
         return ChangeFit(float(loss), values[:count], values[count:], sd[count:])
 
     def excess(
-        self, own: np.ndarray, fit: ChangeFit, changes: Changes | None = None
+        self, parameters: np.ndarray, fit: ChangeFit, changes: Changes | None = None
     ) -> SignificantExcess:
         """
-        Return the SignificantExcess at a ChangeFit of the parameters `own` and of changes.
+        Return the SignificantExcess at a ChangeFit of some parameters and of changes.
 
         With the vector v = (-x, 1) of parameters and residual, and the changes c, in each part::
 
             squares = v'N v - 2 v'C c + c'S c,   expected = n, variance 2 n
 
         """
-        weights = weights_of(own.tolist(), fit.values, self.space.size)
+        weights = weights_of(parameters.tolist(), fit.values, self.space.size)
         squares = np.einsum('i,kij,j->k', weights, self.part_normals, weights)
         if changes is not None:
             squares -= 2 * weights @ changes.cross @ fit.change

@@ -49,10 +49,10 @@ def extended_solution(
     )
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    weighed = {}
+    trusted = {}
     for sensor in space.sensors:
-        weighed[sensor] = _in_trusted_band(noise[sensor], space.slow_only[sensor])
-    solution = solve(space.recording.accumulated(model), model, noise=weighed)
+        trusted[sensor] = _in_trusted_band(noise[sensor], space.slow_only[sensor])
+    solution = solve(space.recording.accumulated(model), model, noise=trusted)
     solution = replace(solution, model=replace(model, folded_arms=None))
     for limit in saturations:
         solution = _with_limit(solution, limit)
@@ -61,7 +61,9 @@ def extended_solution(
 
 def _in_trusted_band(noise: NoiseModel, slow_only: np.ndarray) -> NoiseModel:
     """
-    Return the noise with weight zero for fast parts on axes where only the slow part is compared.
+    Return the noise with almost no weight for the fast part of some axes.
+
+    `slow_only`: whether only the slow part of an axis is compared, shape (3,).
     """
     moving = {}
     for kind, factors in noise.moving.items():
@@ -75,13 +77,14 @@ def _with_limit(solution: Solution, limit: Saturation) -> Solution:
     model = solution.model.with_role(limit.sensor, Role.LIMIT)
     place = model.part(limit.sensor, Role.LIMIT).start
 
-    def grown(matrix: np.ndarray, variance: float) -> np.ndarray:
+    def grown(matrix: np.ndarray, element: float) -> np.ndarray:
+        """Return a matrix with a row and a column for the level, zero but for the diagonal."""
         matrix = np.insert(matrix, place, 0.0, axis=0)
         matrix = np.insert(matrix, place, 0.0, axis=1)
-        matrix[place, place] = variance
+        matrix[place, place] = element
         return matrix
 
-    # Its only uncertainty is the noise of the clipped samples.
+    # The only uncertainty of the level is the noise of the clipped samples.
     terms = {}
     for name, term in solution.terms.items():
         terms[name] = grown(term, limit.level_sd**2 if name == SAMPLE_NOISE else 0.0)

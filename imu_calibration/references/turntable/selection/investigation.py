@@ -12,6 +12,7 @@ from typing import AbstractSet
 import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
+from imu_calibration.effects.base import Effect
 from imu_calibration.effects.reference_effects import CLOCK, FAMILY
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
@@ -156,30 +157,23 @@ def investigate(
     searched = SearchedWindows(used, table, model, effects, locked, bias_processes)
 
     # Search for constant parameters.
-    outcome, rivals, searched_again = _explained(searched.linearised(), searched)
+    result = _explained(searched.linearised(), searched)
 
     # An excess remains: do parameters change at one moment?
     onset = None
-    if outcome.rest:
+    if result.outcome.rest:
+        outcome = result.outcome
         onset = find_onset(
             outcome.problem, outcome.explained, outcome.named, windows=used, table=table
         )
 
-    # A step of the clock is an effect: the search is repeated with it, from the values of the
-    # onset, and counts if it removes most of the excess.
+    # A step of the clock is an effect: the search is repeated with it, and counts if it removes
+    # most of the excess.
     step = next((effect for effect in testable if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
-        stepped = replace(searched, effects=[*effects, step])
-        ((name, before),) = onset.before.items()
-        size_and_time = (onset.after[name] - before, onset.time)
-        values = {name: before, **dict(zip(step.param_names(), size_and_time))}
-        problem = stepped.linearised(point_with(model, [*effects, step], values))
-        start = [question for question in problem.questions if question.name == step.name]
-        with_step, rivals_with_step, stepped_again = _explained(problem, stepped, start)
-        if with_step.rest < LEFT * outcome.rest:
-            outcome = with_step
-            rivals = rivals_with_step
-            searched_again = stepped_again
+        with_step = _with_clock_step(searched, step, onset)
+        if with_step.outcome.rest < LEFT * result.outcome.rest:
+            result = with_step
             onset = None
 
     # Any other change: only the longer part.
@@ -191,17 +185,20 @@ def investigate(
         return replace(of_part, onset=onset)
 
     # Once more where an excess remains: with plausible sizes, then with any size.
+    outcome = result.outcome
     tried = {_labels(outcome.chosen)}
     for any_size in (False, True):
-        of_size = replace(searched_again, any_size=any_size)
+        of_size = replace(result.searched, any_size=any_size)
         outcome = _looked_again(outcome, of_size, tried)
 
+    # Rivals of effects that became findings, and are no findings themselves.
     named = outcome.named
     unstable = outcome.unstable
     names = {question.name for question in named}
-    rivals = [
-        rival for rival in rivals if rival.question.name in names and rival.other.name not in names
-    ]
+    rivals = []
+    for rival in result.rivals:
+        if rival.question.name in names and rival.other.name not in names:
+            rivals.append(rival)
     rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
     return Investigation(
         used=used,
@@ -216,11 +213,35 @@ def investigate(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _SearchResult:
+    """A search with its lags and rivals compared at their own linearisations."""
+
+    outcome: '_Outcome'
+    """The choice and its findings."""
+    rivals: Sequence[Rival]
+    """Alternatives to its effects that fit nearly as well."""
+    searched: SearchedWindows
+    """The windows for further searches, with the lags resolved if there are any."""
+
+
+def _with_clock_step(searched: SearchedWindows, step: Effect, onset: Onset) -> _SearchResult:
+    """Return the search with a step of the clock too, from the values of an onset of the clock."""
+    effects = [*searched.effects, step]
+    ((name, before),) = onset.before.items()
+    size_and_time = (onset.after[name] - before, onset.time)
+    values = {name: before, **dict(zip(step.param_names(), size_and_time))}
+    searched = replace(searched, effects=effects)
+    problem = searched.linearised(point_with(searched.baseline, effects, values))
+    start = [question for question in problem.questions if question.name == step.name]
+    return _explained(problem, searched, start)
+
+
 def _explained(
     problem: LinearisedProblem, searched: SearchedWindows, start: Sequence[Question] = ()
-) -> tuple['_Outcome', Sequence[Rival], SearchedWindows]:
+) -> _SearchResult:
     """
-    Return (outcome of a search, rivals of its findings, `searched` for further searches).
+    Return the result of a search from the effects `start`.
 
     Lags are explained together (`lag_explanations`); they are resolved effects in further searches.
     Without lags, timing effects are compared at their own linearisations (`settle_rivals`).
@@ -233,11 +254,12 @@ def _explained(
     explanations = lag_explanations(problem, [*chosen, *problem.search.early(chosen)], searched)
     if explanations is not None:
         searched = replace(searched, resolved=FAMILY)
-        return *_with_lags(explanations, searched), searched
+        outcome, rivals = _with_lags(explanations, searched)
+        return _SearchResult(outcome, rivals, searched)
     settled, rivals = settle_rivals(problem, chosen, searched)
     if settled is not problem:
         chosen = settled.search.run()
-    return _settled(searched, settled, chosen), rivals, searched
+    return _SearchResult(_settled(searched, settled, chosen), rivals, searched)
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,13 +328,13 @@ def _with_lags(
     tried = []
     for number in range(EXPLANATIONS):
         selected = explanations.select(most, refused)
-        at_lags, chosen, rivals_of_lags = explanations.settled(selected, searched)
-        chosen = at_lags.search.run(chosen)
-        settled, rivals = settle_rivals(at_lags, chosen, searched)
-        if settled is not at_lags:
+        at_lags = explanations.settled(selected, searched)
+        chosen = at_lags.problem.search.run(at_lags.chosen)
+        settled, rivals = settle_rivals(at_lags.problem, chosen, searched)
+        if settled is not at_lags.problem:
             chosen = _chosen_again(settled, chosen)
         outcome = _outcome(settled, chosen)
-        trial = _Trial(number, selected.lags.keys(), outcome, [*rivals_of_lags, *rivals])
+        trial = _Trial(number, selected.lags.keys(), outcome, [*at_lags.rivals, *rivals])
         if trial.helps:
             trial = trial.finished(searched)
             if trial.helps:
@@ -455,7 +477,9 @@ class WindowTests(EffectTests):
     """The tests of a choice on the windows of a table."""
 
     problem: LinearisedProblem
+    """Linearised at the choice, or near it."""
     explained: ExplainedWindows
+    """Excess over noise in its windows."""
 
     def preferred(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects, or a simpler alternative."""
@@ -464,11 +488,11 @@ class WindowTests(EffectTests):
     def admissible(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects of a possible size on which the windows agree."""
         problem = self.problem
-        found = []
+        admissible = []
         for question in named:
             if problem.search.allowed(named, question) and problem.windows_agree(named, question):
-                found.append(question)
-        return found
+                admissible.append(question)
+        return admissible
 
     def least_predicting(self, kept: list[Question]) -> int | None:
         """

@@ -143,14 +143,8 @@ class LagExplanations:
         """Return the simplest explanation with at most `most` effects that is not refused."""
         return simplest(self.others(most, refused), self.silent)
 
-    def settled(
-        self, selected: Explanation, searched: SearchedWindows
-    ) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
-        """
-        Return (problem linearised at an explanation, its choice of effects, rivals of its lags).
-
-        The choice has the lags of the explanation first, then the other chosen effects.
-        """
+    def settled(self, selected: Explanation, searched: SearchedWindows) -> 'SettledLags':
+        """Return an explanation with the problem linearised at its lags."""
         # Linearise at the lags of the explanation.
         parameter = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
         values = dict(selected.values)
@@ -164,7 +158,19 @@ class LagExplanations:
         lags = [questions[name] for name in selected.lags]
         chosen = [*lags, *same_questions(settled, self.rest)]
         near = [each for each in self.explanations if each.cost < selected.cost + TIE]
-        return settled, chosen, _rivals(settled, selected, near)
+        return SettledLags(settled, chosen, _rivals(settled, selected, near))
+
+
+@dataclass(frozen=True, eq=False)
+class SettledLags:
+    """An explanation of the lags, linearised at its lags."""
+
+    problem: LinearisedProblem
+    """The problem there."""
+    chosen: list[Question]
+    """The lags of the explanation, then the other chosen effects."""
+    rivals: list[Rival]
+    """Alternatives to the lags that fit nearly as well."""
 
 
 def _questions_by_name(problem: LinearisedProblem) -> dict[str, Question]:
@@ -279,7 +285,7 @@ def _described(
 
     # Delays at their own estimate, then each other kind from there.
     first = _hypothesis(searched, DELAY, first.values, effects=effects, rest=rest)
-    found = [first]
+    hypotheses = [first]
     for kind in LAG_KINDS[1:]:
         values = dict(first.values)
         for sensor in SENSORS:
@@ -294,8 +300,8 @@ def _described(
         for _ in range(DELAY_LINEARISATIONS if len(kind) > 1 else 1):
             hypothesis = _hypothesis(searched, kind, values, effects=effects, rest=rest)
             values = hypothesis.values
-        found.append(hypothesis)
-    return found
+        hypotheses.append(hypothesis)
+    return hypotheses
 
 
 def _hypothesis(

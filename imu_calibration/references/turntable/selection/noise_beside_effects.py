@@ -364,6 +364,7 @@ class _WanderProblem:
     """Rows of one sensor, of which a bias process or a course in time explains the wander."""
 
     recording: ReducedRecording
+    """Times and temperatures of the windows."""
     rows: Rows
     """
     Means of the windows ``[structural | smooth | residual]``, with the known bias processes only.

@@ -74,16 +74,16 @@ class ParameterSpace:
         return np.append(self.index[sensor][axis], self.size)
 
     def restricted(self, kept: np.ndarray) -> 'ParameterSpace':
-        """Return the space of some of the parameters, in this order."""
+        """Return the space of the parameters `kept`, shape (q',), in this order."""
         order = np.argsort(kept)
         joined: dict[str, list[_Joined]] = {}
         for sensor in self.sensors:
             joined[sensor] = []
             for axis, acting in enumerate(self.index[sensor]):
-                own = np.isin(acting, kept)
+                is_kept = np.isin(acting, kept)
                 # The new number of a parameter is its place in `kept`.
-                place = np.searchsorted(kept, acting[own], sorter=order)
-                columns = np.append(own, True)
+                place = np.searchsorted(kept, acting[is_kept], sorter=order)
+                columns = np.append(is_kept, True)
                 join = self.join[sensor][axis][:, columns]
                 within = self.join_within[sensor][axis][:, columns]
                 joined[sensor].append(_Joined(order[place], join, within))
@@ -98,11 +98,11 @@ class ParameterSpace:
     @cached_property
     def mean(self) -> dict[str, list[np.ndarray]]:
         """Sensor -> mean rows of the windows for each axis, shape (k, q_a + 1)."""
-        found = {}
+        means = {}
         for sensor in self.sensors:
             rows = self.recording.mean(sensor)
-            found[sensor] = [rows @ join for join in self.join[sensor]]
-        return found
+            means[sensor] = [rows @ join for join in self.join[sensor]]
+        return means
 
     def within_each(self, sensor: str, axis: int, rows: np.ndarray) -> Iterator[np.ndarray]:
         """

@@ -286,23 +286,23 @@ def without_clipping(
     """
     locked = locked_windows(np.array([window.kind for window in windows]))
     piled = _piled(windows)
-    limits, noise_sd, values = _limits(windows_at(windows, piled | ~locked), table, model)
-    if not limits or values is None:
+    found = _limits(windows_at(windows, piled | ~locked), table, model)
+    if found is None or not found.limits:
         return windows, locked, []
     locked &= ~piled
 
     # Windows are cut at their clipped samples: locked and other ones separately, then in the order
     # of time again.
-    levels = {limit.sensor: limit.level for limit in limits}
+    levels = {limit.sensor: limit.level for limit in found.limits}
     entries = []
     for is_locked in (False, True):
         part = windows_at(windows, locked == is_locked)
-        predicted = predictions(part, table, model, values=values)
-        for window in without_clipped(part, predicted, levels, noise_sd=noise_sd):
+        predicted = predictions(part, table, model, values=found.values)
+        for window in without_clipped(part, predicted, levels, noise_sd=found.noise_sd):
             entries.append((window.time[0], is_locked, window))
     entries.sort(key=lambda entry: entry[:2])
     kept = [window for _, _, window in entries]
-    return kept, np.array([is_locked for _, is_locked, _ in entries]), limits
+    return kept, np.array([is_locked for _, is_locked, _ in entries]), found.limits
 
 
 def _piled(windows: Sequence[Window]) -> np.ndarray:
@@ -315,18 +315,27 @@ def _piled(windows: Sequence[Window]) -> np.ndarray:
     return piled
 
 
-def _limits(
-    windows: Sequence[Window], table: Table, model: SensorModel
-) -> tuple[list[Saturation], dict[str, np.ndarray], np.ndarray | None]:
-    """
-    Return (limits found, sensor -> sd of single samples, parameters by `simple_fit`).
+@dataclass(frozen=True, eq=False)
+class _Limits:
+    """Limits of the sensors, and a model of the samples that they do not spoil."""
 
-    The fit is without spoiled samples; None where no output may be clipped, or no limit can be
-    determined.
+    limits: list[Saturation]
+    """Limits that outputs pile up at; none where no limit agrees with the motion."""
+    noise_sd: dict[str, np.ndarray]
+    """Sensor -> standard deviation of single samples, shape (3,)."""
+    values: np.ndarray
+    """Parameters by `simple_fit`, shape (n_params,)."""
+
+
+def _limits(windows: Sequence[Window], table: Table, model: SensorModel) -> _Limits | None:
+    """
+    Return the limits of the sensors with a simple fit of the other samples.
+
+    None where no output may be clipped, or too few windows remain for the fit.
     """
     suspects = [sensor for sensor in sensors_of(windows) if may_be_clipped(windows, sensor)]
     if not suspects:
-        return [], {}, None
+        return None
 
     # Two fits without the samples near the largest reading: the first one still has clipped ones.
     largest_readings = {}
@@ -340,7 +349,7 @@ def _limits(
         kept = without_clipped(windows, predicted, largest_readings, noise_sd=noise_sd)
         # An output that is always at or near its limit does not determine it.
         if len(kept) < MIN_FOLD_WINDOWS:
-            return [], {}, None
+            return None
 
     values = simple_fit(kept, table, model)
     predicted = predictions(windows, table, model, values=values)
@@ -349,4 +358,4 @@ def _limits(
         limit = find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor)
         if limit:
             limits.append(limit)
-    return limits, noise_sd, values
+    return _Limits(limits, noise_sd, values)
