@@ -109,7 +109,7 @@ def test_locked_windows_show_no_limit(monkeypatch):
     monkeypatch.setattr(
         saturation,
         '_limits',
-        lambda some, table, model: (seen.extend(map(id, some)), ([], {}, None))[1],
+        lambda some, table, model: seen.extend(map(id, some)),
     )
     _, locked, _ = saturation.without_clipping(windows, None, None)
     assert locked.sum() == 3 and seen == [
@@ -122,10 +122,11 @@ def test_a_limit_that_one_window_alone_shows_is_seen(monkeypatch):
     force, seen = np.random.default_rng(0).normal(0.0, 1.0, (1200, 3)), []
     force[1020:1040, 2] = 9.0
     windows, limit = windows_of(force, 12), SimpleNamespace(sensor='accelerometer', level=9.0)
+    found = saturation._Limits([limit], {}, np.zeros(0))
     monkeypatch.setattr(
         saturation,
         '_limits',
-        lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, np.zeros(0)))[1],
+        lambda some, table, model: (seen.extend(map(id, some)), found)[1],
     )
     monkeypatch.setattr(saturation, 'predictions', lambda *given, **named: None)
     monkeypatch.setattr(saturation, 'without_clipped', lambda some, *given, **named: some)
