@@ -66,8 +66,12 @@ def excess_of_errors(deviation: np.ndarray, readings_per_mean: int) -> Excess:
     return Excess(float(np.sqrt(max(square, 1.0))), float(significance))
 
 
-def _log_likelihoods(counts):
-    """Return the log likelihood of each `NOISE_SDS`, with the likeliest errors and without."""
+def _log_likelihoods(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the log likelihood of each `NOISE_SDS`, (with the likeliest errors, without errors).
+
+    `counts` are the numbers of readings in the bins of the histogram.
+    """
     no_error, changes = _densities()
     share = np.full(changes.shape[:2], 0.5 * LARGEST_SHARE)
     for _ in range(NEWTON_STEPS):
@@ -81,12 +85,11 @@ def _log_likelihoods(counts):
 
 
 @lru_cache
-def _densities():
+def _densities() -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the probabilities of the bins.
+    Return (probabilities of the bins without an error, their change by each kind of error).
 
-    Without an error, shape (n_noise, n_bins), and their change by each kind of error, shape
-    (n_noise, n_kinds, n_bins).
+    The shapes are (n_noise, n_bins) and (n_noise, n_kinds, n_bins).
     """
     edges = HISTOGRAM_EDGES / NOISE_SDS[:, None, None]
     sizes = np.r_[0.0, SIZES, np.zeros_like(WIDE)][:, None]

@@ -19,7 +19,10 @@ CONTEXT_SAMPLES = 8
 FAR = 5.5
 """Standard deviations beyond which a reading is an outlier: white noise exceeds it in 4e-8."""
 MOST_AROUND = 6
-"""Outliers of an axis among the 2 CONTEXT_SAMPLES + 1 readings around one, at most; more: moved."""
+"""
+Largest number of outliers of an axis among the 2 CONTEXT_SAMPLES + 1 readings around one; with more
+the IMU moved.
+"""
 TAIL_QUANTILE, TAIL_SD = 0.9, 1.645
 """Quantile of absolute values, and its value for a standard normal distribution."""
 NORMAL_QUARTILE = 0.6745
@@ -48,9 +51,12 @@ class RestOutliers:
     def __init__(self) -> None:
         self.replaced = 0
         """Samples with a replaced reading."""
+        # Samples with a decision, and replaced readings of each axis.
         self._n_samples = 0
         self._n_readings = np.zeros(6)
+        # Random signs of the reflection.
         self._signs = np.random.default_rng(0)
+        # Buffered samples: `_n_before` samples with a decision, as context, then undecided ones.
         self._held: ImuSamples | None = None
         self._n_before = 0
 
@@ -73,10 +79,11 @@ class RestOutliers:
         passed = []
         if self._held is not None and len(self._held) > self._n_before:
             passed.append(self._decide(len(self._held)))
-        self._held, self._n_before = None, 0
+        self._held = None
+        self._n_before = 0
         return passed
 
-    def _decide(self, stop):
+    def _decide(self, stop: int) -> ImuSamples:
         """Return the samples up to row `stop` without outliers; their last rows become context."""
         assert self._held is not None
         context = self._held.select(slice(0, min(stop + CONTEXT_SAMPLES, len(self._held))))
@@ -96,13 +103,20 @@ class RestOutliers:
         self._held = self._held.select(slice(first, None))
         return kept
 
-    def _without(self, values, outlying):
-        """Return the values with another reading in place of each outlier."""
+    def _without(self, values: np.ndarray, outlying: np.ndarray) -> np.ndarray:
+        """
+        Return the values with another reading in place of each outlier, shape (n, 6).
+
+        `outlying` is the mask of the outliers.
+        """
         row, column = np.nonzero(outlying)
+
+        # Row of the last reading before each outlier that is none.
         rows = np.arange(len(values))[:, None]
         last_good = np.maximum.accumulate(np.where(outlying, 0, rows), axis=0)
         donor = last_good[row, column]
 
+        # Median of the readings around each outlier.
         n_around = min(LEVEL_SAMPLES, len(values))
         first = np.clip(row - n_around // 2, 0, len(values) - n_around)
         around = values[first[:, None] + np.arange(n_around), column[:, None]]
@@ -127,7 +141,8 @@ def without_outliers(
     yield CleanedBlock(imu=_not_empty(filters.finish()))
 
 
-def _not_empty(parts):
+def _not_empty(parts: list[tuple[int, ImuSamples]]) -> list[tuple[int, ImuSamples]]:
+    """Return the (epoch, samples) that have samples."""
     return [(epoch, samples) for epoch, samples in parts if len(samples)]
 
 

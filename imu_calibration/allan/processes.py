@@ -1,6 +1,6 @@
 """Noise processes, their Allan variance, and the covariance between scales."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -18,7 +18,7 @@ SERIES = 1.0 / factorial(np.arange(20, 2, -1))
 
 @dataclass(frozen=True, eq=False)
 class NoiseProcess:
-    """One process of unit coefficient."""
+    """A noise process with the coefficient 1."""
 
     name: str
     """Name in noise.yaml."""
@@ -64,20 +64,24 @@ def mean_covariance(process: NoiseProcess, lag: np.ndarray, seconds: float) -> n
     return (2 * same_ends - end_after_start - start_after_end) / seconds**2
 
 
-def _quantisation(lag):
+def _quantisation(lag: np.ndarray) -> np.ndarray:
+    """Return 1 at lag 0, else 0."""
     return (np.abs(lag) < 1e-12).astype(float)
 
 
-def _white(lag):
+def _white(lag: np.ndarray) -> np.ndarray:
+    """Return -|lag| / 2."""
     return -0.5 * np.abs(lag)
 
 
-def _flicker(lag):
+def _flicker(lag: np.ndarray) -> np.ndarray:
+    """Return lag^2 ln|lag| / (2 pi), 0 at lag 0."""
     lag = np.abs(lag)
     return lag**2 * np.log(np.maximum(lag, 1e-300)) / (2 * np.pi)
 
 
-def _random_walk(lag):
+def _random_walk(lag: np.ndarray) -> np.ndarray:
+    """Return |lag|^3 / 12."""
     return np.abs(lag) ** 3 / 12
 
 
@@ -114,12 +118,14 @@ DENSE = np.arange(-36, 37) / 12
 Lags around where a difference begins or ends, in units of the shorter averaging time; good to
 thousandths of a correlation.
 """
-LAG_GROWTH, MAX_LAG_RATIO = 1.5, 64.0
-"""Further lags grow by this factor, up to this many of the longer averaging time."""
+LAG_GROWTH = 1.5
+"""Ratio of neighbouring lags beyond the dense ones."""
+MAX_LAG_RATIO = 64.0
+"""Largest lag, in units of the longer averaging time."""
 DIFFERENCE_ROUNDING = 1e-14
 """Share of the terms of a fourth difference below which it is a rounding error."""
 MOST_LENGTHS = 24
-"""Stretches are sorted into this many lengths at most."""
+"""Largest number of different lengths of stretches."""
 
 
 class ScaleCovariance:
@@ -142,20 +148,29 @@ class ScaleCovariance:
         self.period = period
         self.tau = self.factors * period
         self.longest = float(np.max(lengths)) * period
+
+        # Pairs of scales, the shorter first: indices, shape (n_pairs,), and samples per mean,
+        # shape (n_pairs, 1).
         self._first, self._second = np.triu_indices(len(self.factors))
         self._short = self.factors[self._first][:, None].astype(float)
         self._long = self.factors[self._second][:, None].astype(float)
         self._lengths = _sorted_lengths(lengths)
+
+        # Lags of each pair, samples, shape (n_pairs, n_lags), their steps, and the mean weight of
+        # the products of correlations in each step.
         self._lag = _lags(self._short, self._long, self._lengths[0][-1])
         self._step = np.diff(self._lag, axis=1)
         weight = self._share(self._lag)
         self._weight = 0.5 * (weight[:, 1:] + weight[:, :-1])
+
+        # Results that are needed again.
         self._expectations: dict[NoiseProcess, np.ndarray] = {}
         self._correlations: dict[NoiseProcess, np.ndarray] = {}
         self._products: dict[tuple[NoiseProcess, NoiseProcess], np.ndarray] = {}
 
     @cached_property
     def _distances(self) -> '_Distances':
+        """Distances between the ends of two differences at all lags."""
         return _Distances.of(np.stack([np.abs(shifted) for shifted in self._shifted(self._lag)]))
 
     def expectation(self, process: NoiseProcess) -> np.ndarray:
@@ -201,7 +216,7 @@ class ScaleCovariance:
                 products[i, j] = self.product(one, other)
         return products
 
-    def _sum(self, first, second):
+    def _sum(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """
         Sum products of correlations over integer lags.
 
@@ -219,7 +234,7 @@ class ScaleCovariance:
         corners = (b - a) * (d - c) / (6 * np.maximum(self._step, 1.0))
         return np.einsum('pg,pg->p', self._weight, inside + corners)
 
-    def _sum_at_spikes(self, other):
+    def _sum_at_spikes(self, other: NoiseProcess) -> np.ndarray:
         """Sum products with the correlation of quantisation, which is spikes at nine lags."""
         total = np.zeros(len(self._first))
         for i, at_short in enumerate(SECOND_DIFFERENCE):
@@ -229,7 +244,7 @@ class ScaleCovariance:
                 total += (size * self._share(lag) * self._evaluate(other, lag))[:, 0]
         return total
 
-    def _share(self, lag):
+    def _share(self, lag: np.ndarray) -> np.ndarray:
         """
         Return the number of pairs of terms at distance `lag`, normalised.
 
@@ -250,7 +265,7 @@ class ScaleCovariance:
             n_long = n_long + n_stretches * n_long_here
         return n_pairs / (2.0 * n_short * n_long)
 
-    def _correlation(self, process):
+    def _correlation(self, process: NoiseProcess) -> np.ndarray:
         """
         Return the covariance of second differences at the lags for a unit coefficient.
 
@@ -263,7 +278,7 @@ class ScaleCovariance:
             self._correlations[process] = self._evaluate(process, self._lag)
         return self._correlations[process]
 
-    def _evaluate(self, process, lag):
+    def _evaluate(self, process: NoiseProcess, lag: np.ndarray) -> np.ndarray:
         """
         Return the covariance of second differences at `lag`, shape (n_pairs, n_lags).
 
@@ -288,7 +303,7 @@ class ScaleCovariance:
         total[np.abs(total) < DIFFERENCE_ROUNDING * size] = 0.0
         return total / (self._short * self._long * self.period**2)
 
-    def _shifted(self, lag):
+    def _shifted(self, lag: np.ndarray) -> Iterator[np.ndarray]:
         """Yield `lag` from each of three ends of one difference to each of the other."""
         for i in range(3):
             for j in range(3):
@@ -315,14 +330,13 @@ class _Distances:
         return cls(distinct, np.searchsorted(distinct, distances).astype(np.int32))
 
 
-def _lags(short, long, length):
+def _lags(short: np.ndarray, long: np.ndarray, length: float) -> np.ndarray:
     """
-    Return the lags at which the correlation of each pair is evaluated.
+    Return the lags at which the correlation of each pair of scales is evaluated, samples.
 
-    They are in samples, sorted integers of shape (n_pairs, n_lags).
-
-    Dense where one difference begins or ends inside the other, and where the number of pairs of
-    terms in the longest stretch bends.
+    They are rising integers, shape (n_pairs, n_lags), dense where one difference begins or ends
+    inside the other, and where the slope of the number of pairs of terms in the longest stretch
+    (`length` samples) changes.
     """
     # Around one end, in samples: dense near it, then growing by a factor.
     largest_ratio = MAX_LAG_RATIO * float((long / short).max())
@@ -343,20 +357,22 @@ def _lags(short, long, length):
     return np.sort(np.rint(np.concatenate(parts, axis=1)), axis=1)
 
 
-def _n_terms(length, factor):
+def _n_terms(length: float, factor: np.ndarray) -> np.ndarray:
     """Return the number of second differences (of 2 `factor` samples) in `length` samples."""
     return np.maximum(length - 2 * factor + 1, 0.0)
 
 
-def _sorted_lengths(lengths):
+def _sorted_lengths(lengths: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (lengths, numbers): each stretch, or classes of about equal length where there are many.
+    Return (lengths, numbers of stretches) in rising order.
+
+    More than `MOST_LENGTHS` stretches are joined in classes of about equal length.
     """
-    lengths = np.sort(np.asarray(lengths, float))
-    if len(lengths) <= MOST_LENGTHS:
-        return lengths, np.ones(len(lengths))
-    # Only the longest has terms at the longest scales.
-    classes = [*np.array_split(lengths[:-1], MOST_LENGTHS - 1), lengths[-1:]]
+    rising = np.sort(np.asarray(lengths, float))
+    if len(rising) <= MOST_LENGTHS:
+        return rising, np.ones(len(rising))
+    # The longest is a class by itself: only it has terms at the longest scales.
+    classes = [*np.array_split(rising[:-1], MOST_LENGTHS - 1), rising[-1:]]
     means = []
     numbers = []
     for part in classes:

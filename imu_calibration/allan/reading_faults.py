@@ -11,13 +11,14 @@ from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 LEAST_STEPS_IN_SCATTER = 4.0
 """Steps of the converter within the scatter, at least: below, its quantiles are those of steps."""
-NAMED_EXCESS, NAMED_SDS = 0.015, 3.0
-"""Excess from which on it is named, as a share and in its sds."""
-SMALLEST_TORN, LARGEST_TORN = 2.5, 10.0
-"""
-Standard deviations of an error by a torn read that tails can have: smaller errors lie in the
-core, and larger ones are outliers, which are excluded before.
-"""
+NAMED_EXCESS = 0.015
+"""Least excess of the noise that is named, as a share."""
+NAMED_EXCESS_SDS = 3.0
+"""Least excess that is named, in its standard deviations."""
+SMALLEST_TORN = 2.5
+"""Least error by a torn read in the tails, in sds of the noise: smaller ones are in the core."""
+LARGEST_TORN = 10.0
+"""Largest such error: larger ones are outliers, which are excluded before."""
 MEAN_DEVIATION = 0.8
 """Mean of the absolute value of a standard normal variable."""
 ROUNDING = 1e-12
@@ -43,10 +44,10 @@ MOST_KEPT_READINGS = 200_000
 
 @dataclass(frozen=True, eq=False)
 class ReadingFaults:
-    """What makes the white noise of readings appear larger than that of the sensor."""
+    """Faults by which the white noise of the readings exceeds that of the sensor."""
 
     tails: np.ndarray
-    """By how much tails and torn reads raise the noise of means, at least 1, shape (6,)."""
+    """Noise of means with tails and torn reads over that without, at least 1, shape (6,)."""
     named: np.ndarray
     """Whether this excess is significant, shape (6,)."""
     repeated: np.ndarray
@@ -75,12 +76,15 @@ class FaultSearch:
     """Accumulates differences and repetitions of the readings at rest (a `Sink`, raw values)."""
 
     def __init__(self) -> None:
+        # The last sample of the present rest, shape (1, 6); None before the first.
         self._last: np.ndarray | None = None
         # Readings of complete blocks, and the readings of the next block.
         self._readings: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
         self._n_kept = dict.fromkeys(SENSORS, 0)
         self._next_block = dict.fromkeys(SENSORS, np.zeros((0, 3)))
+        # Least difference of neighbours that is not zero: the step of the converter.
         self._smallest_step = np.full(6, np.inf)
+        # Pairs of neighbouring samples; periods at rest, and those without a sample.
         self._n_pairs = 0
         self._n_periods = 0
         self._n_missing = 0
@@ -119,7 +123,7 @@ class FaultSearch:
             # A repeated reading is no reading of the noise.
             self._add_blocks(sensor, rows[1:][~held][:, SENSOR_COLUMNS[sensor]])
 
-    def _add_blocks(self, sensor, readings):
+    def _add_blocks(self, sensor: str, readings: np.ndarray) -> None:
         """Add the complete blocks of a sensor; the last one is continued."""
         if self._n_kept[sensor] >= MOST_KEPT_READINGS:
             return
@@ -129,8 +133,12 @@ class FaultSearch:
         self._readings[sensor].append(readings[: n_complete * READINGS_PER_MEAN].copy())
         self._n_kept[sensor] += n_complete * READINGS_PER_MEAN
 
-    def _add_runs(self, k, changes, n_pairs):
-        """Add the lengths of the runs that end at `changes`; the last one is continued."""
+    def _add_runs(self, k: int, changes: np.ndarray, n_pairs: int) -> None:
+        """
+        Add the lengths of the runs of one reading of sensor `k`; the last run is continued.
+
+        A run ends at each of the pairs `changes`, of `n_pairs` new pairs of neighbours.
+        """
         if not len(changes):
             self._run_length[k] += n_pairs
             return
@@ -172,7 +180,7 @@ class FaultSearch:
         for column, excesses in enumerate(self._excesses()):
             for excess in excesses:
                 ratios[column] = max(ratios[column], excess.ratio)
-                if excess.sds > NAMED_SDS and excess.ratio > 1.0 + NAMED_EXCESS:
+                if excess.sds > NAMED_EXCESS_SDS and excess.ratio > 1.0 + NAMED_EXCESS:
                     named[column] = True
         return ReadingFaults(
             ratios,
@@ -182,7 +190,7 @@ class FaultSearch:
             np.minimum(replaced + self._n_missing / self._n_periods, MOST_LEFT_OUT),
         )
 
-    def _excesses(self):
+    def _excesses(self) -> list[list[Excess]]:
         """Return the list of `Excess` of each axis, by tails and by torn reads."""
         of_axes: list[list[Excess]] = []
         for sensor, columns in SENSOR_COLUMNS.items():
@@ -202,9 +210,9 @@ class FaultSearch:
         return of_axes
 
 
-def _excess_of_tails(readings, smallest_step):
+def _excess_of_tails(readings: np.ndarray, smallest_step: float) -> Excess | None:
     """
-    Return by how much heavy tails may raise the white noise of one axis.
+    Return the largest factor by which heavy tails raise the white noise of one axis.
 
     The tails are those of the readings less the means of blocks. With the sd s of the noise alone
     and that of the readings::
@@ -220,7 +228,7 @@ def _excess_of_tails(readings, smallest_step):
     Returns
     -------
     Excess or None
-        None where s is so few steps that the distribution is that of the steps.
+        None if s is so few steps that the distribution is that of the steps.
 
     """
     blocks = readings.reshape(-1, READINGS_PER_MEAN)
@@ -234,7 +242,7 @@ def _excess_of_tails(readings, smallest_step):
 
     # Torn reads correlate with the readings: the noise of means exceeds by more than the readings.
     # Without significant errors there are none.
-    if excess.sds > NAMED_SDS:
+    if excess.sds > NAMED_EXCESS_SDS:
         return Excess(excess_of_means(excess.ratio, noise_steps), excess.sds)
     return excess
 

@@ -124,7 +124,7 @@ def excess_of_torn_reads(readings: np.ndarray, step: float) -> Excess:
     return Excess(ratio, float(share / share_sd))
 
 
-def _counts(readings, step):
+def _counts(readings: np.ndarray, step: float) -> np.ndarray | None:
     """Return the readings in whole steps from zero, or None where they are not on such a grid."""
     # The step from all differences: that of single precision is known to 1e-4 only.
     difference = readings - readings[0]
@@ -139,8 +139,8 @@ def _counts(readings, step):
     return counts.astype(np.int64)
 
 
-def _pages(page, counts):
-    """Return the `_Pages` of readings in steps, whose pages are `page`."""
+def _pages(page: np.ndarray, counts: np.ndarray) -> _Pages:
+    """Return the pages of readings in steps, `counts`, each of which is in the page `page`."""
     _, index = np.unique(page, return_inverse=True)
     n = len(counts)
     deviation = counts - counts.mean()
@@ -166,15 +166,16 @@ def _pages(page, counts):
     )
 
 
-def _torn_share(pages):
+def _torn_share(pages: _Pages) -> float:
     """Return the share of torn reads, by bisection, at least 0."""
 
-    def missing(share):
+    def missing(share: float) -> float:
         """Return the share of neighbours in one page that `share` does not explain."""
         correlation = pages.correlation - share * pages.page_correlation
         return pages.same - share - (1.0 - share) * pages.same_without_tearing(correlation)
 
-    low, high = 0.0, 0.5
+    low = 0.0
+    high = 0.5
     if missing(low) <= 0.0:
         return 0.0
     for _ in range(HALVINGS):
