@@ -725,8 +725,10 @@ def _longest(figures):
     )
 
 
-def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HORIZON) -> list[str]:
-    """Return the parameters of filters, continuous and at each rate."""
+def filter_lines(
+    figures: NoiseFigures, rates: Sequence[float], horizon: float = HORIZON
+) -> list[str]:
+    """Return the lines with the parameters of filters, continuous and at each rate, Hz."""
     found = []
     for sensor in figures.sensors:
         densities = figures.densities(sensor, horizon)
