@@ -75,6 +75,7 @@ _FORM = list_of(text(*TERMS, code='not_a_text'))
 
 
 def _of_axes(each: Requirement) -> Requirement:
+    """Require a list with one item for each axis."""
     return list_of(each, len(AXES))
 
 
@@ -158,7 +159,8 @@ def noise_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
     return document
 
 
-def _sensor_section(sensor, axes):
+def _sensor_section(sensor: str, axes: Sequence[AxisFigures]) -> dict[str, Any]:
+    """Return the section of a sensor: each key has a list with one item for each axis."""
     section = _entries(sensor, [axis.terms for axis in axes])
     section['slow_part'] = [list(axis.form) for axis in axes]
     section['also_possible'] = [list(map(list, axis.others)) for axis in axes]
@@ -178,7 +180,7 @@ def _sensor_section(sensor, axes):
     return section
 
 
-def _entries(sensor, terms_of_axes):
+def _entries(sensor: str, terms_of_axes: Sequence[Mapping[str, Term]]) -> dict[str, Any]:
     """Return name -> entry of each term that an axis has, in the order of `TERMS`."""
     entries: dict[str, Any] = {}
     for name in TERMS:
@@ -188,13 +190,14 @@ def _entries(sensor, terms_of_axes):
     return entries
 
 
-def _entry(terms, unit):
+def _entry(terms: Sequence[Term | None], unit: str) -> dict[str, Any]:
     """
-    Return value, interval, status, reason and unit of three axes.
+    Return the entry of one term: value, interval, status and reason of each axis, and the unit.
 
-    None where an axis has no such figure.
+    `terms`: that of each axis; None where an axis has no such figure.
     """
-    values, intervals = [], []
+    values = []
+    intervals = []
     for term in terms:
         has_value = term is not None and term.value is not None
         values.append(float(term.value) if has_value else None)
@@ -208,7 +211,8 @@ def _entry(terms, unit):
     }
 
 
-def _trends(sensor, axes):
+def _trends(sensor: str, axes: Sequence[AxisFigures]) -> dict[str, Any]:
+    """Return name -> value, sd and unit of each trend that was subtracted, by axis."""
     # Name -> trend of each axis, in the order of the first axis that has it.
     trends_of: dict[str, list[Any]] = {}
     for index, axis in enumerate(axes):
@@ -228,15 +232,15 @@ def _trends(sensor, axes):
     return entries
 
 
-def _for_filters(figures, sensor, horizon):
+def _for_filters(figures: NoiseFigures, sensor: str, horizon: float) -> dict[str, Any]:
     """Return the parameters of most filters, continuous and at the rate of the recording."""
-    found = figures.densities(sensor, horizon)
+    densities = figures.densities(sensor, horizon)
     return {
-        'white_noise': found.white,
-        'random_walk': finite(found.walk),
-        'random_walk_is': found.basis,
-        'sample_sd': found.sample_sd(figures.rate),
-        'bias_step_sd': finite(found.step_sd(figures.rate)),
+        'white_noise': densities.white,
+        'random_walk': finite(densities.walk),
+        'random_walk_is': densities.basis,
+        'sample_sd': densities.sample_sd(figures.rate),
+        'bias_step_sd': finite(densities.step_sd(figures.rate)),
     }
 
 
@@ -255,10 +259,10 @@ def noise_from_text(text: str) -> NoiseFigures:
 
 def noise_from_mapping(document: Mapping[str, Any]) -> NoiseFigures:
     """Return the figures in the mapping of noise.yaml; raises as `noise_from_text`."""
-    found = str(document.get('format'))
-    if found != NOISE_FORMAT:
+    received = str(document.get('format'))
+    if received != NOISE_FORMAT:
         raise DocumentError(
-            f"a noise document must have 'format: {NOISE_FORMAT}', got '{found}'; give a file"
+            f"a noise document must have 'format: {NOISE_FORMAT}', got '{received}'; give a file"
             " written by 'imu_calibration noise'",
             code='document_format',
         )
@@ -288,12 +292,13 @@ def noise_from_mapping(document: Mapping[str, Any]) -> NoiseFigures:
     )
 
 
-def _axis(section, k, deviation):
-    terms = {
-        name: _term(name, section[name], k)
-        for name in TERMS
-        if name in section and section[name]['interval95'][k] is not None
-    }
+def _axis(section: Mapping[str, Any], k: int, deviation: Sequence[float]) -> AxisFigures:
+    """Return the figures of axis k in the section of a sensor, with its Allan deviations."""
+    # A term without an interval does not exist on this axis.
+    terms = {}
+    for name in TERMS:
+        if name in section and section[name]['interval95'][k] is not None:
+            terms[name] = _term(name, section[name], k)
     form = section['slow_part'][k]
     time_constant = [TIME_KEY] if GAUSS_MARKOV in form else []
     for needed in (WHITE.name, RANDOM_WALK.name, *form, *time_constant):
@@ -302,44 +307,44 @@ def _axis(section, k, deviation):
                 f"every axis must have '{needed}', it is missing; write the noise document again",
                 code='part_missing',
             )
-    alternatives = {
-        name: _term(name, entry, k)
-        for name, entry in (section.get('alternatives') or {}).items()
-        if entry['interval95'][k] is not None
-    }
-    trends = tuple(
-        AxisTrend(
-            name,
-            float(entry['value'][k]),
-            float(entry['sd'][k]),
-            float(entry.get('time_constant', [0, 0, 0])[k]),
-        )
-        for name, entry in (section.get('taken_out') or {}).items()
-        if entry['value'][k] is not None
-    )
-    record_for = {
-        name: values[k]
-        for name, values in (section.get('record_for') or {}).items()
-        if name in terms and terms[name].status != DETERMINED
-    }
+    alternatives = {}
+    for name, entry in (section.get('alternatives') or {}).items():
+        if entry['interval95'][k] is not None:
+            alternatives[name] = _term(name, entry, k)
+
+    trends = []
+    for name, entry in (section.get('taken_out') or {}).items():
+        if entry['value'][k] is not None:
+            value = float(entry['value'][k])
+            sd = float(entry['sd'][k])
+            time = float(entry.get('time_constant', [0, 0, 0])[k])
+            trends.append(AxisTrend(name, value, sd, time))
+
+    # The recording time that would determine a figure.
+    record_for = {}
+    for name, values in (section.get('record_for') or {}).items():
+        if name in terms and terms[name].status != DETERMINED:
+            record_for[name] = values[k]
+
     oscillation = (section.get('oscillation') or [None] * 3)[k]
     return AxisFigures(
         terms,
         tuple(form),
-        tuple(tuple(form) for form in section['also_possible'][k]),
+        tuple(tuple(other) for other in section['also_possible'][k]),
         alternatives,
         float(section['shortest_averaging_time'][k]),
         float(section['excess'][k]),
         None if oscillation is None else (float(oscillation[0]), float(oscillation[1])),
         float((section.get('scatter_between_rests') or [0.0] * 3)[k]),
-        trends=trends,
+        trends=tuple(trends),
         record_for=record_for,
         sample_sd=float(section['sample_sd'][k]),
         deviation=tuple(map(float, deviation)),
     )
 
 
-def _term(name, entry, k):
+def _term(name: str, entry: Mapping[str, Any], k: int) -> Term:
+    """Return the figure of axis k in an entry of `_entry`; raises DocumentError."""
     value = entry['value'][k]
     status = entry['status'][k]
     lower, upper = entry['interval95'][k]
@@ -382,12 +387,13 @@ def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]
         worst = {}
         for sensor in figures.sensors:
             axes = figures.sensor(sensor)
-            worst[sensor] = max(_of_axis(axis, sensor, seconds) for axis in axes)
+            worst[sensor] = max(_position_sd_of_axis(axis, sensor, seconds) for axis in axes)
         budget.append((seconds, worst))
     return budget
 
 
-def _of_axis(axis: AxisFigures, sensor: str, seconds: float) -> float:
+def _position_sd_of_axis(axis: AxisFigures, sensor: str, seconds: float) -> float:
+    """Return the standard deviation of the position by all processes of an axis, m."""
     processes = axis.processes()
     shares = position_sd(
         [process for process, _ in processes],
@@ -498,7 +504,8 @@ def rows(figures: NoiseFigures) -> list[FigureRow]:
     return found
 
 
-def _row(sensor, letter, axis, term):
+def _row(sensor: str, letter: str, axis: AxisFigures, term: Term) -> FigureRow:
+    """Return the row of a figure, in a unit for people; a bound where it has no value."""
     factor, unit = for_people(NOISE_UNITS[sensor][term.name], NOISE_QUANTITY)
     lower, upper = (end * factor for end in term.interval)
     if term.value is None:
@@ -520,24 +527,25 @@ def _row(sensor, letter, axis, term):
     )
 
 
-def _digits(value, width):
+def _digits(value: float, width: float) -> str:
     """Return a value with the digits that an interval of this width supports."""
     if not np.isfinite(width) or width <= 0 or not 0 < value < np.inf:
         return '0' if value == 0 else _bounded(value)
     return significant(value, int(np.clip(np.ceil(np.log10(value / width)) + 2, 2, 6)))
 
 
-def _bounded(value):
+def _bounded(value: float) -> str:
+    """Return a figure as text; one that is not finite has no bound."""
     return significant(value) if np.isfinite(value) else NO_BOUND
 
 
-def _note(axis, term):
+def _note(axis: AxisFigures, term: Term) -> str:
+    """Return why a figure is not determined, and the recording time that determines it."""
     parts = [term.reason] if term.reason else []
     if term.name in axis.record_for:
         seconds = axis.record_for[term.name]
-        parts.append(
-            'needs more than two days' if seconds is None else f'needs {duration(seconds)}'
-        )
+        time = 'more than two days' if seconds is None else duration(seconds)
+        parts.append(f'needs {time}')
     return '; '.join(parts)
 
 
@@ -616,36 +624,35 @@ def lines(figures: NoiseFigures) -> list[str]:
             'slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for'
             ' this recording; values of a second recording can lie outside'
         )
-    longest = _longest(figures)
-    runs = [
-        f'{significant(float(np.linalg.norm(list(shares.values()))), 2)} m after'
-        f' {duration(seconds)}'
-        for seconds, shares in position_budget(figures)
-    ]
-    return [
-        *found,
-        *([longest] if longest else []),
-        f'error of dead reckoning from rest by noise only: {", ".join(runs)}',
-    ]
+    recording_time = _recording_time(figures)
+    if recording_time:
+        found.append(recording_time)
+
+    # The error of dead reckoning: the sensors are independent.
+    runs = []
+    for seconds, shares in position_budget(figures):
+        sd = float(np.linalg.norm(list(shares.values())))
+        runs.append(f'{significant(sd, 2)} m after {duration(seconds)}')
+    found.append(f'error of dead reckoning from rest by noise only: {", ".join(runs)}')
+    return found
 
 
-def _rest_line(recording):
-    left = {}
+def _rest_line(recording: Mapping[str, Any]) -> str:
+    """Return the time at rest that was used, and what of it was left out."""
+    line = f'at rest: {duration(recording["seconds_at_rest"])}'
+    if recording['parts'] != 1:
+        longest = duration(recording['longest_part'])
+        line += f' in {recording["parts"]} parts, the longest {longest}'
+    left_out = []
     for name, seconds in recording['left_out'].items():
         if seconds >= 0.05:
-            left[name.replace('_', ' ')] = seconds
-    said = ', '.join(f'{seconds:.1f} s of {name}' for name, seconds in left.items())
-    parts = (
-        ''
-        if recording['parts'] == 1
-        else f' in {recording["parts"]} parts, the longest {duration(recording["longest_part"])}'
-    )
-    return f'at rest: {duration(recording["seconds_at_rest"])}{parts}' + (
-        f'; left out: {said}' if said else ''
-    )
+            left_out.append(f'{seconds:.1f} s of {name.replace("_", " ")}')
+    if left_out:
+        line += f'; left out: {", ".join(left_out)}'
+    return line
 
 
-def _fault_lines(recording):
+def _fault_lines(recording: Mapping[str, Any]) -> list[str]:
     """Return a line for each sensor or axis with readings that are not noise of the sensor."""
     found = []
     for name, entry in (recording.get('faults') or {}).items():
@@ -660,7 +667,8 @@ def _fault_lines(recording):
     return found
 
 
-def _axis_lines(name, sensor, axis):
+def _axis_lines(name: str, sensor: str, axis: AxisFigures) -> list[str]:
+    """Return the notes on one axis: trends, other forms, misfit of the curve, scatter of rests."""
     found = []
     for trend in axis.trends:
         factor, unit = for_people(NOISE_UNITS[sensor][trend.name], NOISE_QUANTITY)
@@ -683,14 +691,12 @@ def _axis_lines(name, sensor, axis):
     return found
 
 
-def _hump(sensor, axis):
+def _hump(sensor: str, axis: AxisFigures) -> str:
     """Return the line of the periodogram at the hump of a curve, or ''."""
     if axis.oscillation is None:
         return ''
-    (frequency, amplitude), (factor, unit) = (
-        axis.oscillation,
-        for_people(UNITS[sensor], NOISE_QUANTITY),
-    )
+    frequency, amplitude = axis.oscillation
+    factor, unit = for_people(UNITS[sensor], NOISE_QUANTITY)
     return (
         f', with an oscillation of {significant(amplitude * factor, 2)} {unit} at'
         f' {significant(frequency, 3)} Hz'
@@ -699,16 +705,13 @@ def _hump(sensor, axis):
 
 def said(form: tuple[str, ...]) -> str:
     """Return a form as text."""
-    return (
-        ' and '.join(
-            name.replace('_', ' ').replace('gauss markov', 'a Gauss–Markov process')
-            for name in form
-        )
-        or 'white noise alone'
-    )
+    if not form:
+        return 'white noise alone'
+    names = [name.replace('_', ' ') for name in form]
+    return ' and '.join(names).replace('gauss markov', 'a Gauss–Markov process')
 
 
-def _longest(figures):
+def _recording_time(figures: NoiseFigures) -> str:
     """Return the recording time that determines all required figures, or ''."""
     needed = []
     for axis in _all_axes(figures):
@@ -716,13 +719,9 @@ def _longest(figures):
         needed += [axis.record_for[name] for name in names if name in axis.record_for]
     if not needed:
         return ''
-    known = [seconds for seconds in needed if seconds is not None]
-    most = max(known) if len(known) == len(needed) else None
-    return (
-        'to determine all of them: record '
-        + ('more than two days' if most is None else duration(most))
-        + ' at rest'
-    )
+    # None: more than the longest time that is tried.
+    time = 'more than two days' if None in needed else duration(max(needed))
+    return f'to determine all of them: record {time} at rest'
 
 
 def filter_lines(

@@ -464,6 +464,7 @@ def _sensor_unit(sensor, entry, place):
 
 
 def _number_or_none(value):
+    """Return a `Number`, or None for None."""
     return None if value is None else _number(value)
 
 

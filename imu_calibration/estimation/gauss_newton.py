@@ -1,6 +1,5 @@
 """Gauss-Newton iteration, for the least squares of any reference."""
 
-from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -27,6 +26,16 @@ class LeastSquares(Protocol[StateT, StepT]):
         """Return whether a step, which led to a state, is small enough to be the last one."""
 
 
+class DampedLeastSquares(Protocol[StateT, StepT]):
+    """A sum of squares of which a part of a step may be taken."""
+
+    def after(self, state: StateT, step: StepT, share: float) -> StateT:
+        """Return the state after a share of a step."""
+
+    def cost(self, state: StateT) -> float:
+        """Return the sum of squares of a state."""
+
+
 def gauss_newton(problem: LeastSquares[StateT, StepT], state: StateT, *, n_steps: int) -> StateT:
     """
     Return the state of least cost, after at most `n_steps` steps from a state.
@@ -42,33 +51,18 @@ def gauss_newton(problem: LeastSquares[StateT, StepT], state: StateT, *, n_steps
 
 
 def halved(
-    state: StateT,
-    moved: Callable[[float], StateT],
-    cost: Callable[[StateT], float],
-    *,
-    n_halvings: int,
+    problem: DampedLeastSquares[StateT, StepT], state: StateT, step: StepT, *, n_halvings: int
 ) -> StateT:
     """
     Return the state after the longest share of a step that does not raise the cost.
 
-    The shares are 1, 1/2, 1/4 and so on; the state itself is returned if each raises the cost.
-
-    Parameters
-    ----------
-    state
-        Before the step.
-    moved : callable
-        Returns the state after a share of the step.
-    cost : callable
-        Returns the sum of squares of a state.
-    n_halvings : int
-        Largest number of halvings.
-
+    The shares are 1, 1/2, 1/4 and so on, halved at most `n_halvings` times; the state itself is
+    returned if each raises the cost.
     """
-    limit = cost(state) * (1 + RISE) + RISE
+    limit = problem.cost(state) * (1 + RISE) + RISE
     for number in range(n_halvings + 1):
-        shorter = moved(0.5**number)
-        if cost(shorter) <= limit:
+        shorter = problem.after(state, step, 0.5**number)
+        if problem.cost(shorter) <= limit:
             return shorter
     return state
 

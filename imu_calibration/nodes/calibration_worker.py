@@ -297,6 +297,7 @@ class CalibrationWorker(threading.Thread):
 
     @property
     def _diagnosis_period(self) -> float:
+        """Time between diagnoses, s."""
         return self.live.diagnosis_period
 
     def ask(self, what: str | Callable[[], tuple[bool, str]]) -> Future:

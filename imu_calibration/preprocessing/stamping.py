@@ -673,6 +673,7 @@ class SampleTimes:
         return ready
 
     def _add_to_buffer(self, part: ImuSamples) -> None:
+        """Keep samples until the class of their stamps is known."""
         if self._buffered is not None:
             part = ImuSamples.concatenate([self._buffered, part])
         self._buffered = part

@@ -295,6 +295,7 @@ class MotionChunks:
         self._temperature.forget_before(oldest_ns, keep_one=True)
 
     def _count(self, reason: str, number: int | np.integer) -> None:
+        """Add to the number of samples that were dropped for a reason."""
         self.counts += Counter({reason: int(number)})  # without zeros
 
     def _process_chunk(self, start_ns: int, final: bool) -> PhasedSamples | None:
@@ -481,4 +482,5 @@ class MotionChunks:
 
 
 def _ns(seconds: float) -> int:
+    """Return a time in whole ns."""
     return int(round(seconds * 1e9))

@@ -206,7 +206,8 @@ class StreamCheck:
             self.counts['wrapped'] = self._wraps.dropped
         return passed
 
-    def _count(self, reason, number):
+    def _count(self, reason: str, number: int | np.integer) -> None:
+        """Add to the number of samples that were dropped for a reason."""
         self.counts += Counter({reason: int(number)})  # without zeros
 
     def _finite(self, samples: Any) -> Any:

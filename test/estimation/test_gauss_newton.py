@@ -18,12 +18,13 @@ class Arctangent:
         return -np.arctan(state) * (1 + state**2)
 
     def moved(self, state, step):
-        return halved(
-            state,
-            lambda share: state + share * step,
-            lambda each: np.arctan(each) ** 2,
-            n_halvings=self.n_halvings,
-        )
+        return halved(self, state, step, n_halvings=self.n_halvings)
+
+    def after(self, state, step, share):
+        return state + share * step
+
+    def cost(self, state):
+        return np.arctan(state) ** 2
 
     def is_last(self, state, step):
         return abs(step) < 1e-6

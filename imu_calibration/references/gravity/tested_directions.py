@@ -114,11 +114,11 @@ class _PlacementSquares(NormSquares):
 
     def moved(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Return the values after the longest share of a step that does not raise the errors."""
+        return halved(self, values, step, n_halvings=PLACEMENT_HALVINGS)
 
-        def after(share: float) -> np.ndarray:
-            return NormSquares.moved(self, values, share * step)
-
-        return halved(values, after, self.cost, n_halvings=PLACEMENT_HALVINGS)
+    def after(self, values: np.ndarray, step: np.ndarray, share: float) -> np.ndarray:
+        """Return the values after a share of a step."""
+        return super().moved(values, share * step)
 
     def is_last(self, values: np.ndarray, step: np.ndarray) -> bool:
         """Return whether a step is lost in rounding: the next ones would be the same."""

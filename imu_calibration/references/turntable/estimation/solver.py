@@ -149,10 +149,12 @@ class _WindowProblem:
 
     @property
     def prior_sd(self) -> np.ndarray:
+        """Prior standard deviations, shape (n_params,)."""
         return self.system.prior.sd
 
     @property
     def asked(self) -> np.ndarray:
+        """True for the parameters that are not fixed by the model, shape (n_params,)."""
         return ~fixed_parameters(self.system.model)
 
     def fitted(self, fit: _Fit) -> _Fit:
@@ -264,6 +266,7 @@ class _WeightedWindows:
 
     @property
     def design(self) -> np.ndarray:
+        """Columns of all rows, those of the prior last, shape (m + n_prior, n_params)."""
         return np.concatenate([self.data, self.system.prior.root])
 
     def scatter_term(self, covariance: np.ndarray) -> np.ndarray:
@@ -379,14 +382,17 @@ class _WindowSquares:
 
     def moved(self, point: _Point, step: _Step) -> _Point:
         """Return the point after the longest of the halved steps that does not raise the cost."""
+        return halved(self, point, step, n_halvings=MAX_HALVINGS)
 
-        def after(share: float) -> _Point:
-            """Return the point after a share of the step."""
-            values = point.values.copy()
-            values[self.free] += step.change * share
-            return self.at(values)
+    def after(self, point: _Point, step: _Step, share: float) -> _Point:
+        """Return the point after a share of a step."""
+        values = point.values.copy()
+        values[self.free] += step.change * share
+        return self.at(values)
 
-        return halved(point, after, lambda each: each.cost, n_halvings=MAX_HALVINGS)
+    def cost(self, point: _Point) -> float:
+        """Return the sum of squares of a point."""
+        return point.cost
 
     def is_last(self, point: _Point, step: _Step) -> bool:
         """Return whether a step is small; a large misfit limits the accuracy."""
