@@ -60,7 +60,7 @@ def solve_by_evidence(
         clipped=main_search.clipped_solution(),
     )
     solution = extension.applied(solved.solution)
-    return replace(solved, solution=solution, extension=extension, found=main_search)
+    return replace(solved, solution=solution, extension=extension, search=main_search)
 
 
 def _with_significant(
@@ -172,7 +172,7 @@ def ask_kept(
         moves=(*known.moves, *_moves(search, missing)),
         clipped=search.clipped_solution(),
     )
-    return replace(solved, solution=extension.applied(solution), extension=extension, found=search)
+    return replace(solved, solution=extension.applied(solution), extension=extension, search=search)
 
 
 def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str]]) -> ModelChanges:

@@ -142,5 +142,5 @@ def conclude(
         solution=solution,
         applied=applied,
         fits=fits,
-        found=solved.found,
+        search=solved.search,
     )

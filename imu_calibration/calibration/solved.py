@@ -19,7 +19,7 @@ class Solved(Generic[Estimate]):
     """What the reference gathered."""
     extension: ModelExtension = ModelExtension()
     """Effects that the search added; nothing without a search."""
-    found: Any = None
+    search: Any = None
     """Result of the search; None without one, or with too few data."""
 
     @property

@@ -57,7 +57,7 @@ def diagnose_recording(
     result = calibrate_by_evidence(
         recording, replace(options, as_asked=False), provenance=provenance
     )
-    if result.found is None:
+    if result.search is None:
         raise reference.too_few(result)
 
     # Causes, gains and alternatives of these effects, and the residual that none explains.

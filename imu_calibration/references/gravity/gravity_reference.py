@@ -82,7 +82,7 @@ class GravityReference:
         # Here, because its import is slow.
         from imu_calibration.references.gravity.diagnosis_of_poses import diagnosis_by_hand
 
-        return diagnosis_by_hand(result.found, result.solution)
+        return diagnosis_by_hand(result.search, result.solution)
 
     def traces(
         self, recording: PoseRecording, before: HandCalibration, after: HandCalibration

@@ -79,15 +79,15 @@ class DiagnosisQuestion:
         """
         try:
             evidence = self.snapshot.evidence()
-            if evidence.found is None:
+            if evidence.search is None:
                 spreads = self.snapshot.gathered.spreads
                 raise too_few_windows(sum(len(spread.windows) for spread in spreads))
-            found = evidence.found
+            search = evidence.search
             extension = evidence.extension
             calibrated = None if extension.changes.lacking else evidence.solution
             # Its columns of a wider model need much memory.
             del evidence
-            diagnosis = build_diagnosis(self.snapshot.table, found, calibrated=calibrated)
+            diagnosis = build_diagnosis(self.snapshot.table, search, calibrated=calibrated)
             return Answer(live_state_of(diagnosis), extension)
         except ImuCalibrationError as error:
             return Answer(LiveState(WAITING, str(error)))
