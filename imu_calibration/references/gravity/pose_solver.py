@@ -304,6 +304,7 @@ def without_outlying_poses(
     # The turn that begins in a pose.
     turn_of = {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
 
+    of_poses, of_drifts, of_turns = COMPONENTS
     outliers: dict[str, tuple[int, ...]] = {}  # kind -> numbers of poses or turns
     for component, kind in enumerate(COMPONENTS):
         of_kind = rows.component == component
@@ -312,18 +313,18 @@ def without_outlying_poses(
         for number in np.unique(pose[of_kind]).tolist():
             tested = of_kind & (pose == number)
             misfit = _misfit(residual[tested], basis[tested], LEAST_ERROR_SHARE)
-            p_values[turn_of[number] if kind == 'turn' else number] = _p_value(
+            p_values[turn_of[number] if kind == of_turns else number] = _p_value(
                 misfit, misfit_of_kind
             )
         most = max(1, int(MAX_POSE_OUTLIERS * len(p_values)))
         outlying = find_outliers(p_values, n_tests=len(p_values), most=most).numbers
         if outlying:
             outliers[kind] = outlying
-    if 'pose' in outliers:
-        poses = replace(poses, force_sem=_loosened(poses.force_sem, outliers['pose']))
-    if 'drift' in outliers:
-        poses = replace(poses, rate_sem=_loosened(poses.rate_sem, outliers['drift']))
-    turns = [turn for index, turn in enumerate(turns) if index not in outliers.get('turn', ())]
+    if of_poses in outliers:
+        poses = replace(poses, force_sem=_loosened(poses.force_sem, outliers[of_poses]))
+    if of_drifts in outliers:
+        poses = replace(poses, rate_sem=_loosened(poses.rate_sem, outliers[of_drifts]))
+    turns = [turn for index, turn in enumerate(turns) if index not in outliers.get(of_turns, ())]
     return poses, turns, {kind: len(numbers) for kind, numbers in outliers.items()}
 
 
