@@ -199,8 +199,8 @@ def _entry(terms: Sequence[Term | None], unit: str) -> dict[str, Any]:
     values = []
     intervals = []
     for term in terms:
-        has_value = term is not None and term.value is not None
-        values.append(float(term.value) if has_value else None)
+        value = None if term is None else term.value
+        values.append(None if value is None else float(value))
         intervals.append(None if term is None else list(map(finite, term.interval)))
     return {
         'value': values,
@@ -719,8 +719,9 @@ def _recording_time(figures: NoiseFigures) -> str:
         needed += [axis.record_for[name] for name in names if name in axis.record_for]
     if not needed:
         return ''
+    known = [seconds for seconds in needed if seconds is not None]
     # None: more than the longest time that is tried.
-    time = 'more than two days' if None in needed else duration(max(needed))
+    time = duration(max(known)) if len(known) == len(needed) else 'more than two days'
     return f'to determine all of them: record {time} at rest'
 
 

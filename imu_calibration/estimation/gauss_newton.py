@@ -8,6 +8,7 @@ from imu_calibration.estimation.scaled_solve import scaled_lstsq
 
 StateT = TypeVar('StateT')
 StepT = TypeVar('StepT')
+TakenStepT = TypeVar('TakenStepT', contravariant=True)
 
 RISE = 1e-12
 """Rise of a cost that is rounding, relative and absolute."""
@@ -26,10 +27,10 @@ class LeastSquares(Protocol[StateT, StepT]):
         """Return whether a step, which led to a state, is small enough to be the last one."""
 
 
-class DampedLeastSquares(Protocol[StateT, StepT]):
+class DampedLeastSquares(Protocol[StateT, TakenStepT]):
     """A sum of squares of which a part of a step may be taken."""
 
-    def after(self, state: StateT, step: StepT, share: float) -> StateT:
+    def after(self, state: StateT, step: TakenStepT, share: float) -> StateT:
         """Return the state after a share of a step."""
 
     def cost(self, state: StateT) -> float:

@@ -118,7 +118,7 @@ COVARIANCE = _of(
     (
         'a step that raises the cost is taken',
         'halved',
-        '_1(_2) <= _3',
+        'problem.cost(_1) <= _2',
         'True',
         'test_gauss_newton.py',
     ),
