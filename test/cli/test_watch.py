@@ -171,8 +171,11 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
             stderr=subprocess.DEVNULL,
         )
         for name, parameters in (
-            ('simulator_node', {'profile': 'quick', 'time_factor': 8.0}),
-            ('calibration_node', {'table_file': str(TABLE)}),
+            (
+                'simulator_node',
+                {'profile': 'quick', 'time_factor': 8.0, 'imu_rate': 25.0, 'joint_rate': 25.0},
+            ),
+            ('calibration_node', {'table_file': str(TABLE), 'diagnosis_period': 0.0}),
         )
     ]
     try:
@@ -189,15 +192,15 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
             command, env=environment, stdin=subprocess.DEVNULL, stdout=terminal, stderr=terminal
         ) as watching:
             os.close(terminal)
-            time.sleep(8)
-            for node in nodes:
-                node.terminate()
-            drawn = b''
+            drawn, running, deadline = b'', list(nodes), time.monotonic() + 60.0
             while True:
                 try:
                     drawn += os.read(screen_end, 65536)
                 except OSError:  # the other end is closed: it has ended
                     break
+                if b'accel.' in drawn or time.monotonic() > deadline:
+                    while running:
+                        running.pop().terminate()
             assert watching.wait(60) == 0
         assert (
             b'calibration_node has ended' in drawn
