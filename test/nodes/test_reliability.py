@@ -20,14 +20,16 @@ from ros.live_station import Publisher, Station
 from ros.soak import GROWTH_MB, soak
 
 pytestmark = pytest.mark.live
+RATE = 25.0
+"""Messages of a topic per second of the sessions."""
 SIGMA = 5.0
 """Errors of some thirty parameters stay below so many reported standard deviations."""
 
 
 @pytest.fixture(scope='module')
 def session():
-    """IMU, joints, true values, model at 50 Hz."""
-    return make_session(3, 50.0)
+    """IMU, joints, true values, model."""
+    return make_session(3, RATE)
 
 
 def beginning(session, seconds=80.0):
@@ -120,14 +122,15 @@ def check_bursts_and_foreign_frames(station, publisher, session, folder):
     """
     imu, joints, values, model = session
     burst = with_nan_burst(imu, 30.0)
+    first, last = int(40 * RATE), int(44 * RATE)
     foreign = replace(
-        imu.select(slice(2000, 2200)), force_s=imu.force_s[2000:2200] + 5.0, frame_id='other_link'
+        imu.select(slice(first, last)), force_s=imu.force_s[first:last] + 5.0, frame_id='other_link'
     )
     before = received(station)
-    parts = [burst.select(slice(0, 2200)), foreign, burst.select(slice(2200, None))]
-    cuts = [0, 2200, 2200, len(joints)]
-    for part, (first, last) in zip(parts, zip(cuts, cuts[1:])):
-        publisher.send(part, joints.select(slice(first, last)))
+    parts = [burst.select(slice(0, last)), foreign, burst.select(slice(last, None))]
+    cuts = [0, last, last, len(joints)]
+    for part, ends in zip(parts, zip(cuts, cuts[1:])):
+        publisher.send(part, joints.select(slice(*ends)))
     station.until(
         lambda: received(station) == [before[0] + len(imu), before[1] + len(joints)],
         'every message of the frame',
@@ -136,7 +139,7 @@ def check_bursts_and_foreign_frames(station, publisher, session, folder):
     assert live.statistics['dropped']["Imu message of another frame than 'imu_link'"] == len(
         foreign
     )
-    assert live.statistics['dropped']['imu not finite'] == 100
+    assert live.statistics['dropped']['imu not finite'] == 2.0 * RATE
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
     station.until(
         lambda: any('imu_link' in message for _, level, message in station.history if level == 1),
@@ -161,9 +164,10 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     send_all(station, publisher, *halves[0])
     send_all(station, publisher, *halves[1])
     last = halves[1][0].stamp_ns[-1]
-    still = (np.repeat(values[-1:], 250, 0) for values in (imu.force_s, imu.rate_s))
-    alone = ImuSamples(last + 20_000_000 * np.arange(1, 251), *still, 'imu_link')
-    publisher.send(alone, joints.select(slice(0, 0)), per_second=80)
+    n = int(8 * RATE)
+    still = (np.repeat(values[-1:], n, 0) for values in (imu.force_s, imu.rate_s))
+    alone = ImuSamples(last + int(1e9 / RATE) * np.arange(1, n + 1), *still, 'imu_link')
+    publisher.send(alone, joints.select(slice(0, 0)), per_second=50)
     station.until(
         lambda: any('JointState' in message for _, level, message in station.history if level == 1),
         'a warning',
@@ -233,7 +237,7 @@ def test_signals_in_mid_session_leave_whole_files_and_exit_code_zero(station, se
 
 @pytest.mark.long
 def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp_path):
-    sessions = {'left': beginning(session), 'right': beginning(make_session(4, 50.0))}
+    sessions = {'left': beginning(session), 'right': beginning(make_session(4, RATE))}
     sent, documents = {}, {}
     for side, (imu, joints, _, _) in sessions.items():
         station.calibration_node(tmp_path / side, namespace=f'/{side}')
