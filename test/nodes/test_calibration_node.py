@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from test_hand_calibration import GRAVITY, simulate
+from without_search import candidates_in_scripts
 
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.core.samples import ImuSamples
@@ -33,7 +34,9 @@ from ros.live_station import Station, taken
 
 pytestmark = pytest.mark.live
 RATE = 20.0
-SAMPLE_RATE = 50.0
+CANDIDATES = 'accel_quadratic+accel_scale_asymmetry+gyro_g_sensitivity'
+"""Effects that the search tests, in the node and in the verb."""
+SAMPLE_RATE = 25.0
 
 
 @pytest.fixture(scope='module')
@@ -172,7 +175,7 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     physics.write_bag(session, tmp_path / 'bag')
     (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
     table = Table.from_mapping(session.table)
-    with open_recording(tmp_path / 'bag') as recording:
+    with open_recording(tmp_path / 'bag') as recording, candidates_in_scripts(CANDIDATES):
         offline = diagnose_recording(
             recording.blocks(table.joint_names), TableReference(table), OPTIONS
         )
@@ -182,7 +185,10 @@ def test_a_hidden_effect_is_named_live(tmp_path):
         documents = station.watch_documents()
         station.watch_diagnostics()
         station.calibration_node(
-            tmp_path, table_file=tmp_path / 'table.yaml', diagnosis_period=60.0
+            tmp_path,
+            table_file=tmp_path / 'table.yaml',
+            diagnosis_period=60.0,
+            candidates=CANDIDATES,
         )
         station.until(
             lambda: values_of(station, 'diagnosis').get('outcome') == 'waiting',
@@ -235,7 +241,7 @@ def test_two_imus_on_one_topic_are_refused(tmp_path, by_hand):
         imu, joints = simulate(2, n_poses=8, still=1.5)[0], None
     else:
         imu, joints, _, _ = make_session(3, SAMPLE_RATE)
-        imu = imu.select(slice(0, 1500))
+        imu = imu.select(slice(0, int(30 * SAMPLE_RATE)))
         joints = joints.select(joints.stamp_ns <= imu.stamp_ns[-1])
     second = replace(
         imu,

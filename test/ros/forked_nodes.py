@@ -5,6 +5,7 @@ Parameters, signals, exit codes and output are those of a process of its own, wh
 the import of a node, or the end of the interpreter after its main function, is tested.
 """
 
+import contextlib
 import importlib
 import multiprocessing
 import os
@@ -12,8 +13,12 @@ import signal
 import subprocess
 import sys
 
+from without_search import candidates_in_scripts
+
 from examples.processes import NodeProcesses, node_command
 
+CANDIDATES = 'IMU_CALIBRATION_TEST_CANDIDATES'
+"""Environment variable of a node: the candidates of its search for effects on a table."""
 PRELOADED = (
     'imu_calibration.references.turntable.live_diagnosis',
     'imu_calibration.calibration.live',
@@ -56,7 +61,9 @@ def _run(command, folder, environment, output):
             os.dup2(opened, number)
     _, _, module, *arguments = command
     sys.argv = [module, *arguments]
-    sys.exit(importlib.import_module(module).main())
+    candidates = environment.get(CANDIDATES)
+    with candidates_in_scripts(candidates) if candidates else contextlib.nullcontext():
+        sys.exit(importlib.import_module(module).main())
 
 
 class ForkedNode:
@@ -99,9 +106,24 @@ class ForkedNode:
 class ForkedNodes(NodeProcesses):
     """Forked processes of one DDS domain."""
 
-    def start(self, name, parameters=None, output=None, **options):
-        """Start a node and return its ForkedNode; `output` is a file for its output."""
+    def start(self, name, parameters=None, output=None, candidates='', **options):
+        """
+        Start a node and return its ForkedNode.
+
+        Parameters
+        ----------
+        name : str
+        parameters : dict, optional
+        output : file, optional
+            For its output.
+        candidates : str
+            Effects of the catalogue that its search on a table tests; '': all of them.
+        **options
+            As for `node_command`.
+
+        """
         command = node_command(name, parameters, **options)
-        process = ForkedNode(command, self.environment, output.name if output else None)
+        environment = self.environment | ({CANDIDATES: candidates} if candidates else {})
+        process = ForkedNode(command, environment, output.name if output else None)
         self.running.append(process)
         return process

@@ -82,9 +82,15 @@ class Station:
         return self.processes.start(name, parameters, output=self.output, **options)
 
     def calibration_node(self, folder, **parameters):
-        """Start calibration_node with a place to save in `folder`."""
+        """
+        Start calibration_node with a place to save in `folder`.
+
+        `parameters` may also hold namespace, remappings and candidates, as for `start`.
+        """
         options = {
-            key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters
+            key: parameters.pop(key)
+            for key in ('namespace', 'remappings', 'candidates')
+            if key in parameters
         }
         fixed = {
             'table_file': TABLE,
