@@ -16,6 +16,7 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,8 @@ class Length:
     """Largest number of motions that separate causes; 0: no diagnosis."""
     planned_seconds: float
     """Simulated seconds that the planner has."""
+    models: Mapping[str, str]
+    """Parameters of calibration_node and planner_node: their models of the sensors."""
 
     @property
     def simulator(self) -> dict[str, Any]:
@@ -67,9 +70,16 @@ class Length:
         }
 
 
-COMPLETE = Length(4.0, 100.0, 'soft_spring', separations=2, planned_seconds=900.0)
-SMALLEST = Length(12.0, 50.0, '', separations=0, planned_seconds=20.0)
-"""The same nodes and steps without a fault and its diagnosis."""
+COMPLETE = Length(4.0, 100.0, 'soft_spring', separations=2, planned_seconds=900.0, models={})
+SMALLEST = Length(
+    12.0,
+    25.0,
+    '',
+    separations=0,
+    planned_seconds=20.0,
+    models={'accelerometer_model': 'bias+matrix', 'gyroscope_model': 'bias+matrix'},
+)
+"""The same nodes and steps without a fault and its diagnosis, with fewer parameters."""
 START = 1_800_000_000.0
 PATIENCE = 240.0
 
@@ -201,7 +211,12 @@ def run(domain_id, folder, output, *, length=COMPLETE):
         )
         calibration_node = processes.start(
             'calibration_node',
-            {'table_file': TABLE, 'save_file': folder / 'live.yaml', 'diagnosis_period': 3600.0},
+            {
+                'table_file': TABLE,
+                'save_file': folder / 'live.yaml',
+                'diagnosis_period': 3600.0,
+                **length.models,
+            },
         )
         planner = processes.start(
             'planner_node',
@@ -212,6 +227,7 @@ def run(domain_id, folder, output, *, length=COMPLETE):
                 'first_speed': 0.6,
                 'stall_patience': 15.0,
                 'silence': 5.0,
+                **length.models,
             },
         )
         watcher = Watcher(processes)
