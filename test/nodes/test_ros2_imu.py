@@ -32,7 +32,7 @@ bad = node.create_publisher(Imu, 'bad/imu/data_raw', qos_profile_sensor_data)
 other = node.create_publisher(MagneticField, 'strange/imu/data', 10)
 depth = QoSProfile(depth=5)
 listener = node.create_subscription(Imu, 'bad/imu/data_raw', lambda message: None, depth)
-counter, STEP_NS = [0], 5_000_000
+counter, STEP_NS = [0], 20_000_000
 start_ns = node.get_clock().now().nanoseconds
 def publish_due():   # a sensor's clock runs on while a busy machine lets its driver wait
     while start_ns + counter[0] * STEP_NS <= node.get_clock().now().nanoseconds:
@@ -53,7 +53,7 @@ def publish():
         message.angular_velocity_covariance[8] = variance
         message.orientation_covariance[0] = -1.0
         publisher.publish(message)
-node.create_timer(0.005, publish_due)
+node.create_timer(0.02, publish_due)
 print('ready', flush=True)
 rclpy.spin(node)
 """
