@@ -104,7 +104,7 @@ CAUSES = {'heat': HiddenHeat, 'cable': CableTwist, 'losses': LateWithLosses, 'be
 
 @lru_cache(maxsize=None)
 def world(kind, seed, gyroscope_model='bias+matrix'):
-    """Return (pair of sessions, Table, solution of the first one, options)."""
+    """Return (pair of sessions, Table, recordings of the first one, options)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(misfit_worlds, 'CAUSES', CAUSES)
         pair = misfit_worlds.make_pair(kind, seed, imu_rate=50.0, joint_rate=50.0)
@@ -117,17 +117,26 @@ def world(kind, seed, gyroscope_model='bias+matrix'):
         gyroscope_model=gyroscope_model,
         reference_model='none',
     )
-    solved = TableReference(table).gather([source(pair.first)], options).solved(options)
-    return pair, table, solved, options
+    return pair, table, TableReference(table).gather([source(pair.first)], options), options
+
+
+@lru_cache(maxsize=None)
+def solved_world(kind, seed, gyroscope_model='bias+matrix'):
+    """Return (solution of the first session, options)."""
+    *_, recordings, options = world(kind, seed, gyroscope_model)
+    return recordings.solved(options), options
 
 
 def source(session):
     return [session.block]
 
 
-def calibrated(kind, seed, **changes):
-    _, table, solved, options = world(kind, seed)
-    return conclude(with_changes(solved, **changes), options).calibration
+@lru_cache(maxsize=None)
+def concluded(kind, seed, is_unexplained=False):
+    """Return the result of the first session, with residuals that are unexplained or none."""
+    solved, options = solved_world(kind, seed)
+    changes = {'unexplained': UNEXPLAINED} if is_unexplained else {}
+    return conclude(with_changes(solved, **changes), options)
 
 
 def with_changes(solved, **changes):
@@ -156,6 +165,13 @@ def plain_values(session, table):
     return model, values
 
 
+@lru_cache(maxsize=None)
+def errors_of_plain_values(kind, seed):
+    """Return the errors in the second session with the values of `plain_values`."""
+    calibration = concluded(kind, seed, is_unexplained=True).calibration
+    return errors_on_second(kind, seed, with_plain_values(calibration, kind, seed))
+
+
 def errors_on_second(kind, seed, calibration):
     pair, table, *_ = world(kind, seed)
     proof = errors_on_table([source(pair.second)], table, calibration).proof
@@ -171,16 +187,15 @@ def with_plain_values(calibration, kind, seed):
 
 @pytest.mark.parametrize(('kind', 'seed'), [('losses', 615), ('heat', 501), ('cable', 604)])
 def test_applied_values_are_no_worse_than_least_squares_in_a_second_session(kind, seed):
-    calibration = calibrated(kind, seed, unexplained=UNEXPLAINED)
-    plain = with_plain_values(calibration, kind, seed)
-    ratio = errors_on_second(kind, seed, calibration) / errors_on_second(kind, seed, plain)
+    calibration = concluded(kind, seed, is_unexplained=True).calibration
+    ratio = errors_on_second(kind, seed, calibration) / errors_of_plain_values(kind, seed)
     assert calibration.statistics['least_squares']
     assert np.all(ratio < 1.05)
 
 
 def test_a_drift_with_an_uncertain_time_constant_is_applied_at_its_mean():
     # The hidden heat of motors resembles a warm-up; its value at the end was 13 % worse.
-    _, table, solved, options = world('heat', 611, 'bias+matrix+gyro_bias_drift')
+    solved, options = solved_world('heat', 611, 'bias+matrix+gyro_bias_drift')
     calibration = conclude(solved, options).calibration
     plain = with_plain_values(calibration, 'heat', 611)
     ratio = errors_on_second('heat', 611, calibration) / errors_on_second('heat', 611, plain)
@@ -221,7 +236,9 @@ def test_a_solution_has_to_predict_held_out_data_better(
 
 def test_a_sensor_with_an_effect_that_is_found_but_not_applied_is_tested():
     # A soft mount is a product of forces of implausible size; the size effect took a part of it.
-    calibration = calibrated('bent', 604, implausible={'gyro_force_squared': 0.9})
+    solved, options = solved_world('bent', 604)
+    changed = with_changes(solved, implausible={'gyro_force_squared': 0.9})
+    calibration = conclude(changed, options).calibration
     assert list(calibration.statistics['least_squares']) == ['gyroscope']
 
 
@@ -241,7 +258,7 @@ def test_an_effect_that_is_not_applied_remains_in_the_sensors_that_it_acts_on(ef
 
 def test_least_squares_with_the_same_effects_predict_other_regimes_equally_well():
     # Without them the solution was applied by its folds alone.
-    _, _, solved, _ = world('cable', 604)
+    solved, _ = solved_world('cable', 604)
     held_out = solved.data.held_out(solved.solution)
     values = solved.solution.values
     estimate = plain_fit.compared_fit(held_out, 'gyroscope', values).estimate
@@ -250,15 +267,12 @@ def test_least_squares_with_the_same_effects_predict_other_regimes_equally_well(
     assert len(elsewhere) == 2 and all(fit.is_close for fit in elsewhere)
 
 
-@pytest.mark.parametrize(('changed_at', 'sensors'), [(12.0, set(SENSORS)), (None, set())])
-def test_after_a_change_at_one_moment_the_residual_is_unexplained(changed_at, sensors):
+def test_after_a_change_at_one_moment_the_residual_is_unexplained():
     # A belt that slipped was found; the search was that of the longer part (1.08 before).
-    _, _, solved, options = world('cable', 604)
-    changes = ModelChanges(changed_at=changed_at)
-    searched = replace(solved, extension=ModelExtension(changes=changes))
-    statistics = conclude(searched, options).calibration.statistics
-    assert set(statistics.get('least_squares', ())) == sensors
-    assert statistics.get('changed_at') == changed_at
+    solved, options = solved_world('cable', 604)
+    statistics = conclude(with_changes(solved, changed_at=12.0), options).calibration.statistics
+    assert set(statistics['least_squares']) == set(SENSORS)
+    assert statistics['changed_at'] == 12.0
 
 
 def formula(name, column, unit):
@@ -276,23 +290,21 @@ def formula(name, column, unit):
     ],
 )
 def test_a_formula_is_applied_where_a_second_session_confirms_it(kind, seed, column, unit, helps):
-    pair, table, solved, options = world(kind, seed)
+    *_, recordings, options = world(kind, seed)
     effect = formula('bend', column, unit)
-    result = conclude(with_changes(solved, unexplained=UNEXPLAINED), options)
-    recordings = TableReference(table).gather([source(pair.first)], options)
+    result = concluded(kind, seed, is_unexplained=True)
     extension = ProposedExtension(result, SimpleNamespace(unexplained={}), options)
     extended = _with_proposals(recordings, extension, [effect])
     applied = helpful_formulas([effect], extended, result.calibration)
     assert applied == [effect] * helps
-    plain = with_plain_values(result.calibration, kind, seed)
-    ratio = errors_on_second(kind, seed, extended) / errors_on_second(kind, seed, plain)
+    ratio = errors_on_second(kind, seed, extended) / errors_of_plain_values(kind, seed)
     assert ratio[1] < (0.5 if helps else 1.05)
 
 
 def test_the_solution_is_applied_unless_a_residual_is_unexplained():
-    solution = calibrated('cable', 604)
-    assert 'least_squares' not in solution.statistics
-    fitted = calibrated('cable', 604, unexplained=UNEXPLAINED)
+    solution = concluded('cable', 604).calibration
+    assert not {'least_squares', 'changed_at'} & set(solution.statistics)
+    fitted = concluded('cable', 604, is_unexplained=True).calibration
     gyroscope = fitted.statistics['least_squares']['gyroscope']
     assert gyroscope['error'] < 0.95 * gyroscope['error_of_model']
     assert fitted.proof['gyroscope'].after < solution.proof['gyroscope'].after
