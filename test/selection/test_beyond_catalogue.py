@@ -40,6 +40,7 @@ from worlds.beyond_catalogue import row_of
 from worlds.candidates import with_candidates
 from worlds.diagnosing import diagnose
 from worlds.hiding import record
+from worlds.misfit_coverage import COARSE
 from worlds.physics_beyond import Beyond
 
 FEW = (
@@ -48,15 +49,16 @@ FEW = (
     'accel_thermal_bias_2+gyro_thermal_bias_2+gyro_thermal_scale+time_offset+'
     'load_compliance'
 )
+OF_RATES = 'gyro_g_sensitivity+gyro_quadratic+gyro_thermal_scale'
+"""Candidates beside a formula that is known."""
 
 
 @lru_cache(maxsize=None)
 def recorded(kind=None, seed=5):
     """Return (recording, cause) of a session."""
     cause = Beyond(kind, seed) if kind else None
-    return record(
-        seed, None, through_bag=False, profile='quick', **({'cause': cause} if cause else {})
-    ), cause
+    recording = record(seed, None, through_bag=False, profile='quick', cause=cause)
+    return recording, cause
 
 
 @lru_cache(maxsize=None)
@@ -156,7 +158,7 @@ def test_a_recording_without_noise_is_judged_too():
 
     No sample is taken for exact, and nothing is divided by nothing.
     """
-    recording = record(5, None, 'none', through_bag=False, profile='quick')
+    recording = record(5, None, 'none', through_bag=False, profile='quick', **COARSE)
     found = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
     assert not found.findings and not found.unexplained['accelerometer'].significant
     assert found.unexplained['gyroscope'].proposal is None
@@ -244,6 +246,7 @@ def test_shares_are_of_the_locked_windows():
     assert low <= share_removed(before, after) <= high
 
 
+@pytest.mark.long
 def test_the_place_is_found():
     cause = Beyond('cable_in_an_arc', 6)
     row, known = row_of(6, 'cable_in_an_arc', 'white', cause, candidates=FEW)
@@ -295,6 +298,8 @@ def test_a_mount_that_bends_is_named_in_both_sensors():
         3,
         {'load_compliance': 0.5 * arcmin_per_g * np.random.default_rng(3).normal(size=(3, 3))},
         through_bag=False,
+        profile='quick',
+        **COARSE,
     )
     found = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
     assert [finding.effect for finding in found.findings] == ['load_compliance']
@@ -318,8 +323,7 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
         'white',
         cause=Beyond('scale_under_load', 5),
         profile='quick',
-        imu_rate=50.0,
-        joint_rate=50.0,
+        **COARSE,
     )
     physics.write_bag(session, tmp_path / 'bag')
     from imu_calibration.core import documents
@@ -363,7 +367,7 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
             '--output',
             str(tmp_path / 'again'),
             '--candidates',
-            FEW,
+            OF_RATES,
         ]
     ) in (0, 3)
     again = json.loads((tmp_path / 'again' / 'diagnosis.json').read_text())
@@ -378,7 +382,7 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
             '--output',
             str(tmp_path / 'named'),
             '--candidates',
-            FEW,
+            OF_RATES,
         ]
     ) in (0, 3)
     assert [
@@ -422,15 +426,20 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
     What is there stays beside another cause.
     """
     settling = Beyond('gyro_scale_settling', 141)
-    row, _ = row_of(141, 'gyro_scale_settling', 'realistic', settling, candidates=FEW)
+    row, _ = row_of(141, 'gyro_scale_settling', 'realistic', settling, candidates=FEW, **COARSE)
     assert row['found'] == [] and row['family'], row
     warm = Beyond('sticks_when_warm', 81013)
-    row, _ = row_of(81013, 'sticks_when_warm', 'realistic', warm, candidates=FEW)
+    row, _ = row_of(81013, 'sticks_when_warm', 'realistic', warm, candidates=FEW, **COARSE)
     assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.999, (
         'a step when it is warm looks like a curve of the temperature'
     )
     recording = record(
-        5, {'gyro_g_sensitivity': None}, through_bag=False, cause=Beyond('gyro_cubic', 5, 0.3)
+        5,
+        {'gyro_g_sensitivity': None},
+        through_bag=False,
+        cause=Beyond('gyro_cubic', 5, 0.3),
+        profile='quick',
+        **COARSE,
     )
     found = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
     assert [finding.effect for finding in found.findings] == [
@@ -446,8 +455,7 @@ def test_a_formula_of_the_session_is_not_written_into_a_model_for_other_sessions
         'white',
         cause=Beyond('gyro_scale_settling', 5),
         profile='quick',
-        imu_rate=50.0,
-        joint_rate=50.0,
+        **COARSE,
     )
     physics.write_bag(session, tmp_path / 'bag')
     from imu_calibration.core import documents
