@@ -68,7 +68,7 @@ def test_live_a_requested_warm_up_is_that_of_the_recording(session, calibration)
 @pytest.mark.parametrize('constant', [60.0])
 def test_by_hand_a_requested_warm_up_has_its_time_constant(constant):
     """The iteration left the prior for thousands of seconds, with amplitudes of the wrong sign."""
-    samples, *_ = hold_and_turn(21, n_poses=24, rate_hz=50.0)
+    samples, *_ = hold_and_turn(21, n_poses=16, rate_hz=50.0)
     time, amplitudes = (
         1e-9 * (samples.stamp_ns - samples.stamp_ns[0]),
         np.array([0.01, -0.02, 0.015]),

@@ -23,6 +23,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.outcome import parameter_count
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.estimation.solution import (
     DRIFT,
     EXCESS_REMEDY,
@@ -49,6 +50,7 @@ from imu_calibration.references.turntable.standard_motions import MOTIONS, motio
 from imu_calibration.references.turntable.table_coverage import table_coverage
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
+from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY
 from worlds.person import Person
 
@@ -132,8 +134,9 @@ def test_what_is_foretold_takes_off_what_is_missing():
 
 def by_the_picture(person, most=40):
     """(seconds planned, Coverage in the end) of a person who looks at nothing but the picture."""
+    options = CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW))
     live = LiveByHand(
-        CalibrationOptions(), LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0
+        options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0
     )
     planned = live.coverage().seconds
     live.push(SampleBlock(person.hold()))

@@ -33,6 +33,8 @@ from worlds.hiding import Sizes, record
 FOLLOWING = 'accel_thermal_bias+accel_thermal_scale+accel_bias_drift+gyro_thermal_bias'
 """Candidates whose columns change with the temperature or the time."""
 CANDIDATES = FEW + '+accel_size_effect+lever_arm+encoder_harmonic+gyro_saturation'
+THERMAL = 'accel_quadratic+accel_thermal_bias+gyro_thermal_scale'
+"""Candidates of which two need a temperature."""
 SEED, QUICK = 3, {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
@@ -101,6 +103,7 @@ def test_a_single_component_of_a_drift_keeps_its_time_constant(sizes):
     assert components_of(['gyro_bias_drift']) == [('gyro_bias_drift', k) for k in range(3)]
 
 
+@pytest.mark.long
 def test_cause_outside_the_catalogue_is_unexplained_and_not_named():
     recording = record(SEED, {'angle_bias_accel': None}, 'realistic', through_bag=False, **QUICK)
     diagnosis = diagnose(recording.windows, recording.table, recording.model)
@@ -170,7 +173,7 @@ def test_a_bias_that_follows_the_thermometer_is_named_beside_a_wander_and_a_wand
         ({'accel_thermal_bias': np.array([2.0e-3, -1.5e-3, 1.2e-3])}, {'accel_thermal_bias'}),
         (None, set()),
     ):
-        recording = record(110, hidden, 'wander_15', through_bag=False)
+        recording = record(110, hidden, 'wander_15', through_bag=False, **QUICK)
         diagnosis = diagnose(
             recording.windows, recording.table, recording.model, candidates=FOLLOWING
         )
@@ -240,7 +243,9 @@ def test_gain_is_measured_on_windows_that_took_no_part(sizes):
 def test_effects_without_their_data_are_not_testable():
     options = QUICK | {'profile': 'static_only', 'temperature': None}
     recording = record(SEED, None, 'white', through_bag=False, **options)
-    document = diagnosis_mapping(diagnose(recording.windows, recording.table, recording.model))
+    document = diagnosis_mapping(
+        diagnose(recording.windows, recording.table, recording.model, candidates=THERMAL)
+    )
     lacking = {entry['effect']: entry for entry in document['not_testable']}
     assert {'accel_thermal_bias', 'gyro_thermal_scale'} <= set(lacking)
     assert all(entry['why'] and entry['needs'] for entry in lacking.values())

@@ -1,6 +1,7 @@
 """Effects of the sensor model in a recording whose clock also needs an effect."""
 
 import numpy as np
+import pytest
 
 import imu_calibration as imu
 from imu_calibration.kinematics.table import Table
@@ -15,6 +16,7 @@ ZERO = np.radians(0.31)
 """Of the encoder of the middle joint."""
 
 
+@pytest.mark.long
 def test_a_delay_and_a_zero_do_not_cost_the_effects_that_are_in_the_model():
     """
     The standard deviations without the delay contain its misfit.

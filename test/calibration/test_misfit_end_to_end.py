@@ -13,6 +13,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.candidates import FEW
+from worlds.misfit_coverage import COARSE
 from worlds.misfit_worlds import make_pair
 
 WORSE = 1.05
@@ -25,7 +26,7 @@ WORSE = 1.05
     [
         ('driver_lag', {'table': 'shaft', 'profile': 'sweeps'}),
         ('motor_ripple', {'table': 'shaft', 'profile': 'sweeps'}),
-        ('backlash', {}),
+        ('backlash', COARSE),
     ],
     ids=lambda value: value if isinstance(value, str) else value.get('table', 'gimbals'),
 )

@@ -193,6 +193,7 @@ def test_applied_values_are_no_worse_than_least_squares_in_a_second_session(kind
     assert np.all(ratio < 1.05)
 
 
+@pytest.mark.long
 def test_a_drift_with_an_uncertain_time_constant_is_applied_at_its_mean():
     # The hidden heat of motors resembles a warm-up; its value at the end was 13 % worse.
     solved, options = solved_world('heat', 611, 'bias+matrix+gyro_bias_drift')
