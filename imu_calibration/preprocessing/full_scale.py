@@ -30,25 +30,28 @@ MAX_TURN_SECONDS = 30.0
 """s; the gyroscope's wander adds up in longer turns."""
 
 
-def believed_factor(missed: Callable[[float], float]) -> float:
+def believed_factor(missed_angle: Callable[[float], float]) -> float:
     """
     Return the factor of the measured rates over true ones that the rotation of gravity shows.
 
-    It is 1 where the rates explain the rotation without a factor.
+    It is 1 where the rates explain the rotation without a factor, or no factor explains it.
 
     Parameters
     ----------
-    missed : callable
+    missed_angle : callable
         Factor -> typical angle, rad, between gravity after a turn and its prediction from gravity
         before it, by the integral of the rates divided by the factor.
 
     """
-    angle_of_one = missed(1.0)
+    angle_of_one = missed_angle(1.0)
     if angle_of_one < MIN_MISSED_ANGLE:
         return 1.0
-    angles = [missed(factor) for factor in FACTORS]
+    angles = [missed_angle(factor) for factor in FACTORS]
     best = int(np.argmin(angles))
-    return nearest_power(FACTORS[best]) if angles[best] < MAX_ANGLE_SHARE * angle_of_one else 1.0
+    if angles[best] >= MAX_ANGLE_SHARE * angle_of_one:
+        return 1.0
+    # Full-scale ranges differ by powers of two, and the scale of the sensor adds a few per cent.
+    return nearest_power(FACTORS[best])
 
 
 def nearest_power(factor: float) -> float:
@@ -70,7 +73,7 @@ class _Turn:
 
     def missed_angle(self, factor: float) -> float:
         """Return the angle from gravity to its prediction with rates divided by `factor`, rad."""
-        # Gravity turns the other way in the sensor's axes.
+        # In axes that turn with the sensor, gravity rotates with the negative rate.
         turned = self.before
         for step in rotation(-(self.rotations / factor)):
             turned = step @ turned
@@ -79,10 +82,10 @@ class _Turn:
 
 def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     """
-    Return the `believed_factor` of a recording; None when there are too few turns between rests.
+    Return the factor of the measured rates over true ones, from turns between rests.
 
-    The mean rates of the chunks are added up from rest to rest; turns within a chunk commute well
-    enough for a factor.
+    None when there are too few turns. The mean rates of the chunks are integrated from rest to
+    rest; rotations within a chunk commute well enough for a factor.
     """
     if rest is None or len(rest.ranges) <= LEAST_TURNS:
         return None
@@ -91,13 +94,17 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     usual_duration = np.median(chunks.duration)
     is_whole = _whole_chunks(chunks)
     turns = []
-    for k, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
+    for k, (first_rest, next_rest) in enumerate(zip(rest.ranges, rest.ranges[1:])):
+        # The chunks between both rests.
+        start = first_rest[1]
+        stop = next_rest[0]
         if stop <= start:
             continue
         span = chunks.time[stop] - chunks.time[start - 1]
         has_gap = span >= 1.5 * usual_duration * (stop - start + 1)
         if has_gap or not is_whole[start:stop].all() or span >= MAX_TURN_SECONDS:
             continue
+        # A small turn does not distinguish factors.
         if up[k] @ up[k + 1] < np.cos(LEAST_ANGLE):
             rate = chunks.mean[start:stop, 3:] - rest.rate
             rotations = rate * chunks.duration[start:stop, None]
@@ -140,35 +147,42 @@ class Extremes:
         self.n_jumps = 0
         """Samples of these after a value that is smaller by more than `JUMP`."""
         # Value -> samples, of the `COUNTED_OUTPUTS` largest values below the largest.
-        self._below: dict[float, int] = {}
-        self._last = np.inf
+        self._count_below: dict[float, int] = {}
+        self._last_value = np.inf
 
     def push(self, values: np.ndarray) -> None:
-        """Process the next values, shape (n,)."""
-        before = self._last
-        self._last = values[-1]
+        """
+        Process the next values, shape (n,).
+
+        Only positive values count: the end of a range is far from zero.
+        """
+        value_before_all = self._last_value
+        self._last_value = values[-1]
         largest = values.max()
         if largest <= 0 or largest < NEAR_LARGEST_SHARE * self.level:
             return
+        # A new largest value: the previous one becomes one of those below it.
         if largest > self.level:
             if np.isfinite(self.level):
-                self._below[self.level] = self.count
+                self._count_below[self.level] = self.count
             self.level = float(largest)
             self.count = 0
             self.n_jumps = 0
         near = values[values > NEAR_LARGEST_SHARE * self.level]
-        below = near < self.level
-        self.count += len(near) - int(np.count_nonzero(below))
-        near = near[below]
+        is_below = near < self.level
+        self.count += len(near) - int(np.count_nonzero(is_below))
         if largest == self.level:
-            at = np.flatnonzero(values == largest)
-            value_before = np.where(at > 0, values[at - 1], before)
+            at_largest = np.flatnonzero(values == largest)
+            value_before = np.where(at_largest > 0, values[at_largest - 1], value_before_all)
             self.n_jumps += int(np.count_nonzero(value_before < (1 - JUMP) * largest))
+
+        # Count the largest of the values below, in bounded memory.
+        near = near[is_below]
         if len(near) > MAX_NEAR_OUTPUTS:
             near = np.partition(near, len(near) - MAX_NEAR_OUTPUTS)[-MAX_NEAR_OUTPUTS:]
         for value, count in zip(*np.unique(near, return_counts=True)):
-            self._below[float(value)] = self._below.get(float(value), 0) + int(count)
-        self._below = dict(sorted(self._below.items(), reverse=True)[:COUNTED_OUTPUTS])
+            self._count_below[float(value)] = self._count_below.get(float(value), 0) + int(count)
+        self._count_below = dict(sorted(self._count_below.items(), reverse=True)[:COUNTED_OUTPUTS])
 
     @property
     def jumped(self) -> bool:
@@ -186,8 +200,9 @@ class Extremes:
 
         Their number must be far above that of neighbouring values.
         """
-        near = [value for value in self._below if value > NEAR_LARGEST_SHARE * self.level]
-        counts = [self._below[value] for value in near[:10]]
+        near = [value for value in self._count_below if value > NEAR_LARGEST_SHARE * self.level]
+        # The ten next values; the dictionary is sorted, the largest first.
+        counts = [self._count_below[value] for value in near[:10]]
         mean_count = sum(counts) / len(counts) if counts else 1.0
         return self.count if self.count >= max(MIN_CLIPPED_SAMPLES, PILE * mean_count) else 0
 

@@ -132,8 +132,10 @@ class RecordingEvidence:
         return at_end
 
     @cached_property
-    def length(self) -> Any:
-        """Length of the specific force at rest, else its median length; None without samples."""
+    def force_length(self) -> Any:
+        """
+        Length of the specific force at rest, else its median length, m/s^2; None without samples.
+        """
         if self.rest is not None:
             return self.rest.length
         if not len(self.chunks):

@@ -55,12 +55,15 @@ MAX_GYRO_RATE = 100.0
 """rad/s, 5700 deg/s: above the range of nearly all gyroscopes."""
 FASTEST_DEG = 5000.0
 """Numbers above it are no deg/s either."""
-CLIP_FORCE = 1.15
-"""Times gravity; outputs without visible noise pile up at gravity without being clipped."""
-FINE = 8.0
+LEAST_END_PER_GRAVITY = 1.15
+"""
+Least end of the range of an accelerometer without visible noise, over gravity: its outputs pile up
+at gravity without being clipped.
+"""
+VISIBLE_NOISE_STEPS = 8.0
 """Noise that spans this many steps of the converter is visible."""
-CLIP_RATE = 10.0
-"""Times the range of the noise."""
+LEAST_END_PER_NOISE = 10.0
+"""Least end of the range of a sensor over the range of its noise."""
 LEAST_RANGE = 0.4
 """rad/s, 23 deg/s: a largest rate below it is not the end of the range of a gyroscope."""
 MOST_BIAS = {'accelerometer': 0.25 * STANDARD_GRAVITY, 'gyroscope': 60 * DEG}
@@ -73,7 +76,7 @@ MIN_CONVERTER_STEP = 1e-6
 
 def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Specific force is in m/s^2."""
-    length = evidence.length
+    length = evidence.force_length
     if length is None or 'accelerometer' in evidence.absent or not evidence.n_changed[:3].any():
         return  # outputs that never change are no unit: see the check of frozen outputs
     where = 'at rest' if evidence.rest is not None else 'in the middle'
@@ -248,7 +251,7 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 f'{observed}probably converted from deg/s twice; convert them once',
                 f'counts:{DEG:.7g}/(rad/s)',
             )
-        elif _full_scale(evidence) is not None:
+        elif _full_scale_factor(evidence) is not None:
             return
         elif scale_range(ratio) is IMPOSSIBLE:
             yield wrong_rate_unit(f'{observed}counts or volts?; {convert}')
@@ -285,7 +288,7 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
     Gravity turns from rest to rest by the integral of the rates.
     """
-    factor = _full_scale(evidence)
+    factor = _full_scale_factor(evidence)
     if factor is None:
         return
     observed = (
@@ -310,11 +313,14 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         )
 
 
-def _full_scale(evidence):
-    """Return the factor of the rates if a wrong full-scale range may explain it, else None."""
+def _full_scale_factor(evidence):
+    """
+    Return measured over true rates if a wrong full-scale range may explain the ratio, else None.
+    """
     factor = evidence.rate_factor
     if factor is None and evidence.turning is not None:
-        # Without turns between rests: powers of two only.
+        # Without turns between rests the ratio is less accurate. Ranges differ by powers of two, so
+        # that only these are accepted.
         factor = nearest_power(1.0 / evidence.turning.factor)
         if np.log2(factor) % 1 != 0:
             return None
@@ -359,68 +365,89 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """No output piles up at the end of its range."""
+    """
+    No output piles up at the end of its range.
+
+    The finding of a sensor has the number of clipped readings of each axis, at both ends together.
+    """
     for sensor, part, unit in CHANNELS:
-        # Axes with visible noise, and the least end of a range.
-        has_noise = evidence.quiet_range[part] > FINE * evidence.resolution[part]
-        least_end = CLIP_RATE * evidence.quiet_range[part]
-        if sensor == 'accelerometer':
-            least_end = np.where(has_noise, least_end, CLIP_FORCE * (evidence.length or 0.0))
-        else:
-            least_end = np.maximum(least_end, LEAST_RANGE)
-        frozen = _frozen_readings(evidence, sensor)
-        counts = []
-        total = 0
-        level = 0.0
+        has_noise = evidence.quiet_range[part] > VISIBLE_NOISE_STEPS * evidence.resolution[part]
+        least_end = _least_end(evidence, sensor, has_noise)
+        frozen_readings = _frozen_readings(evidence, sensor)
+        axis_counts = []
+        n_of_sensor = 0
+        range_end = 0.0
         for axis, ends in enumerate(evidence.ends[part]):
-            count = 0
+            n_of_axis = 0
+            # The largest readings upwards, and those downwards with the other sign.
             for sign, end in zip((1, -1), ends):
                 # Without visible noise the largest reading must have been reached by large steps.
                 if end.level <= least_end[axis] or not (has_noise[axis] or end.jumped):
                     continue
-                n_clipped = _n_clipped(end, sign * frozen[:, axis], evidence.chunks.size)
+                n_clipped = _n_clipped(end, sign * frozen_readings[:, axis], evidence.chunks.size)
                 if n_clipped:
-                    count += n_clipped
-                    level = max(level, end.level)
-            if count:
-                counts.append(f'{"xyz"[axis]} {count}')
-                total = total + count
-        if counts:
-            customary = f' ({level / STANDARD_GRAVITY:.1f} g)'
+                    n_of_axis += n_clipped
+                    range_end = max(range_end, end.level)
+            if n_of_axis:
+                axis_counts.append(f'{"xyz"[axis]} {n_of_axis}')
+                n_of_sensor += n_of_axis
+        if axis_counts:
+            customary = f' ({range_end / STANDARD_GRAVITY:.1f} g)'
             if unit == 'rad/s':
-                customary = f' ({level / DEG:.0f} deg/s)'
+                customary = f' ({range_end / DEG:.0f} deg/s)'
             yield CheckFinding(
                 'clipping',
                 WARNING,
-                f'the {sensor} clips at {level:.4g} {unit}{customary}: {", ".join(counts)} readings'
-                ' at the end of the range; larger values are lost, move less or choose a wider'
-                ' range',
-                samples=total,
+                f'the {sensor} clips at {range_end:.4g} {unit}{customary}: {", ".join(axis_counts)}'
+                ' readings at the end of the range; larger values are lost, move less or choose a'
+                ' wider range',
+                samples=n_of_sensor,
             )
 
 
+def _least_end(evidence, sensor, has_noise):
+    """
+    Return the reading of each axis above which its range may end, m/s^2 or rad/s, shape (3,).
+
+    `has_noise` are the axes with visible noise, bool, shape (3,).
+    """
+    least_end = LEAST_END_PER_NOISE * evidence.quiet_range[SENSOR_COLUMNS[sensor]]
+    if sensor == 'gyroscope':
+        return np.maximum(least_end, LEAST_RANGE)
+    rest_force = evidence.force_length or 0.0
+    return np.where(has_noise, least_end, LEAST_END_PER_GRAVITY * rest_force)
+
+
 def _frozen_readings(evidence, sensor):
-    """Return the readings of the chunks in which a sensor is frozen, shape (n, 3)."""
+    """
+    Return the reading that a sensor repeats in each chunk of samples in which it is frozen.
+
+    The readings of the three axes have the shape (n_frozen_chunks, 3).
+    """
     return evidence.chunks.mean[evidence.frozen[sensor]][:, SENSOR_COLUMNS[sensor]]
 
 
-def _n_clipped(end, frozen, size):
+def _n_clipped(end, frozen_readings, chunk_size):
     """
-    Return how many readings are at an end of the range, without those of frozen stretches.
+    Return how many readings of an axis are clipped at an end of its range.
+
+    A sensor that is frozen at its largest reading repeats it without being clipped: a pile of this
+    reading that the frozen chunks explain counts as 0.
 
     Parameters
     ----------
     end : Extremes
-        Largest readings of an axis.
-    frozen : array, shape (n,)
-        Readings of the frozen chunks, with the sign of the end.
-    size : int
+        Largest readings of the axis in one direction.
+    frozen_readings : array, shape (n_frozen_chunks,)
+        Readings of the frozen chunks, with the sign of that direction.
+    chunk_size : int
         Samples of a chunk.
 
     """
-    n_frozen = size * int(np.isclose(frozen, end.level, rtol=1e-9).sum())
-    # A frozen stretch may begin and end within further chunks.
-    return end.n_clipped if not n_frozen or end.n_clipped > n_frozen + 2 * size else 0
+    frozen_at_end = np.isclose(frozen_readings, end.level, rtol=1e-9)
+    n_frozen = chunk_size * int(frozen_at_end.sum())
+    # A frozen stretch may begin within one chunk and end within another.
+    return end.n_clipped if not n_frozen or end.n_clipped > n_frozen + 2 * chunk_size else 0
 
 
 def _is_force(length):
@@ -431,7 +458,7 @@ def _is_force(length):
 def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The biases are such as sensors have."""
     rest = evidence.rest
-    if rest is None or rest.bias is None or not _is_force(evidence.length):
+    if rest is None or rest.bias is None or not _is_force(evidence.force_length):
         # With few attitudes, a steady spin about the vertical is not distinguishable from rest
         return
     biases = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
@@ -454,7 +481,7 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The accelerometer reads local gravity within 2 per cent."""
     rest = evidence.rest
-    if rest is None or 'accelerometer' in evidence.absent or not _is_force(evidence.length):
+    if rest is None or 'accelerometer' in evidence.absent or not _is_force(evidence.force_length):
         return
     error = rest.length / evidence.gravity - 1
     source = 'one stretch'

@@ -377,22 +377,25 @@ class WanderLimit:
         means, in which drift cancels.
         """
         period = _period(samples)
-        length = int(round(PIECE_SECONDS / period)) if period > 0 else 0
-        n_means = len(samples) // length if length else 0
+        size = int(round(PIECE_SECONDS / period)) if period > 0 else 0  # samples of a mean
+        n_means = len(samples) // size if size else 0
         if n_means < MIN_NOISE_PIECES:
             return
-        means = samples.force_s[: n_means * length].reshape(n_means, length, 3).mean(axis=1)
+        means = samples.force_s[: n_means * size].reshape(n_means, size, 3).mean(axis=1)
         variance = np.median(np.diff(means, axis=0).var(axis=0) / 2)
-        self._densities.append(float(np.sqrt(variance * length * period)))
+        self._densities.append(float(np.sqrt(variance * size * period)))
 
     def n_windows(self, samples: PhasedSamples) -> int:
         """
-        Return the number of windows into which motion is cut; one if no rest has occurred yet.
+        Return the number of windows into which samples of motion are cut, at least 1.
+
+        It is 1 before the first rest, and where the errors of the reference exceed the noise.
         """
         if not self._densities or len(samples) < 3:
             return 1
         density = float(np.median(self._densities))
-        # Error of the reference as a density: gravity turns by rate * jitter between samples.
+        # Error of the reference as a density: gravity turns by rate * jitter between samples. The
+        # second differences of independent errors of stamps have six times their variance.
         jitter = np.diff(samples.time, 2).std() / np.sqrt(6)
         rms_rate = np.sqrt((samples.rate_s**2).sum(axis=1).mean())
         jitter_density = STANDARD_GRAVITY * rms_rate * jitter * np.sqrt(_period(samples))
@@ -452,9 +455,10 @@ class WindowCutter:
         # `settling` counts from them.
         self._not_resting_time = -np.inf
         self._not_steady_time = -np.inf
-        # Step 3. Samples and use of the newest run of one use, which may continue.
+        # Step 3. The newest run of samples of one use, which may continue: (samples, index of the
+        # use in `_USES`); and the longest window with motion.
         self._open_run: tuple[PhasedSamples, int] | None = None
-        self._wander = WanderLimit()
+        self._wander_limit = WanderLimit()
 
     def change(self, settings: WindowSettings, short_rest: float) -> None:
         """Use other settings from now on."""
@@ -512,7 +516,7 @@ class WindowCutter:
         for k, (start, stop) in enumerate(zip(starts, stops, strict=True)):
             if run_phase[k] == MOVING:
                 continue
-            # The begin of this run is decided already, because it was long enough.
+            # The samples before belong to the same run, which was long enough.
             if phase_before[k] == run_phase[k]:
                 continue
             needed = self._short_rest
@@ -583,18 +587,18 @@ class WindowCutter:
 
     def _close(self, samples: PhasedSamples, use: int) -> list[Window]:
         """
-        Return the windows of a complete run of one use, cut into equal pieces.
+        Return the windows of a complete run of samples with the same `use`, an index of `_USES`.
 
-        The pieces are of at most the longest length.
+        The run is cut into equal pieces, none of which exceeds the longest length.
         """
-        pieces = max(1, ceil((samples.time[-1] - samples.time[0]) / self._longest(use)))
+        n_pieces = max(1, ceil((samples.time[-1] - samples.time[0]) / self._longest(use)))
         windows = []
-        for part in _equal_parts(samples, pieces):
+        for part in _equal_parts(samples, n_pieces):
             windows += self._finished(part, use)
         return windows
 
     def _shortest(self, use: int) -> float:
-        """Return the shortest length of a window of a use, s."""
+        """Return the shortest length of a window with this `use`, an index of `_USES`, s."""
         if use == _STATIC:
             return self._settings.static_minimum
         if use == _SPIN:
@@ -604,24 +608,34 @@ class WindowCutter:
         return 0.0
 
     def _longest(self, use: int) -> float:
-        """Return the longest length of a window of a use, s."""
+        """Return the longest length of a window with this `use`, an index of `_USES`, s."""
         # Halves of a window slightly above the longest length must not be below the shortest.
         return max(self._settings.window_maximum, 2 * self._shortest(use))
 
     def _finished(self, samples: PhasedSamples, use: int) -> list[Window]:
-        """Count the samples of a piece of one use and return its windows, if it has any."""
+        """
+        Count the samples of a complete piece and return its windows: one, several for motion.
+
+        An unused piece, or one that is too short for a window, has none unless those are kept.
+        `use` is the index of its use in `_USES`.
+        """
         n = len(samples)
-        length = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
-        if length < self._shortest(use) or (use <= _DYNAMIC and n < _MIN_WINDOW_SAMPLES):
+        # The last sample lasts a period too.
+        seconds = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
+        # The first uses, up to _DYNAMIC, are the kinds of windows.
+        has_too_few = use <= _DYNAMIC and n < _MIN_WINDOW_SAMPLES
+        if seconds < self._shortest(use) or has_too_few:
             use = _REST_TOO_SHORT if use == _STATIC else _TOO_SHORT
         self.counts[_USES[use]] += n
         if use > _DYNAMIC:
             if not self._keep_unused:
                 return []
             return [make_window(samples, WindowKind.UNUSED, _USES[use])]
+
+        # Rests show the noise, which limits the length of windows with motion.
         if use == _STATIC:
-            self._wander.add_rest(samples)
-        n_windows = self._wander.n_windows(samples) if use == _DYNAMIC else 1
+            self._wander_limit.add_rest(samples)
+        n_windows = self._wander_limit.n_windows(samples) if use == _DYNAMIC else 1
         return [make_window(part, _USES[use]) for part in _equal_parts(samples, n_windows)]
 
 
