@@ -16,7 +16,7 @@ SPIKE_REACH = 8
 """Samples on either side that the test uses; the same number is buffered."""
 SPIKE_NEIGHBOURS = 4
 """Samples on either side for the comparison of a reading."""
-LARGE = 8.0
+LARGE_SDS = 8.0
 """Deviations below this many noise sds are not tested."""
 PREDICTION_SHARE = 0.2
 """
@@ -26,7 +26,7 @@ and fast twisting exceed it.
 SPIKE_SPREADS = 10.0
 """Factor on the spread of the eight neighbours without the two lowest and the two highest."""
 PREDICTION_MARGIN = 0.25
-"""The same in units of `LARGE` noise sds, for the noise of these predictions."""
+"""The same in units of `LARGE_SDS` noise sds, for the noise of these predictions."""
 SHARED = 1.5
 """
 The same for the differences of the four neighbours, of which the noise is 0.4 of this unit: more in
@@ -52,7 +52,7 @@ class SpikeFilter:
     The result does not depend on the division of the stream into pieces.
 
     A reading is a spike when its deviation from the cubic through the four nearest readings exceeds
-    `LARGE` sds of the noise and by far the differences of its neighbours. The cubic follows fast
+    `LARGE_SDS` sds of the noise, and by far the differences of its neighbours. The cubic follows
     motion; it must agree with the predictions from each side. Where one of the four is an outlier
     as well, the median of the nine readings around replaces the cubic (Hampel's test). The noise is
     estimated from medians of second differences, over the chunk of samples before or the samples
@@ -63,21 +63,21 @@ class SpikeFilter:
     def __init__(self) -> None:
         self.dropped = 0
         """Samples with a spike so far."""
-        self._begin()
+        self._reset()
 
-    def _begin(self):
-        """Begin a stream."""
+    def _reset(self):
+        """Discard all samples and the noise: the next sample begins a stream."""
         # Samples without a decision.
         self._buffered: Any = None
         # Readings, (n, 6), of these and of decided samples before them, which are needed as
         # neighbours; and the number of the first of these rows in the stream.
-        self._values = np.zeros((0, 6))
+        self._readings = np.zeros((0, 6))
         self._first_row = 0
         # Noise sd of the newest chunks of `NOISE_SAMPLES`, (n, 6), the number of chunks until now,
         # and the smallest step of each column until now.
-        self._noise = np.zeros((1, 6))
+        self._noise_sds = np.zeros((1, 6))
         self._n_chunks = 0
-        self._step = np.full(6, np.inf)
+        self._smallest_step = np.full(6, np.inf)
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return a list of the ImuSamples with a decision; the last `SPIKE_REACH` are buffered."""
@@ -93,16 +93,16 @@ class SpikeFilter:
                 self._buffered = type(part).concatenate([self._buffered, part])
             else:
                 self._buffered = part
-            self._values = np.vstack([self._values, np.hstack([part.force_s, part.rate_s])])
-            # Not before the first chunk has a noise.
-            if self._first_row + len(self._values) > NOISE_SAMPLES:
+            self._readings = np.vstack([self._readings, np.hstack([part.force_s, part.rate_s])])
+            # Not before the noise of the first chunk can be estimated.
+            if self._first_row + len(self._readings) > NOISE_SAMPLES:
                 passed += self._decide(max(len(self._buffered) - SPIKE_REACH, 0))
         return passed
 
     def finish(self) -> list[ImuSamples]:
         """Return the buffered samples, and reset."""
         passed = [] if self._buffered is None else self._decide(len(self._buffered))
-        self._begin()
+        self._reset()
         return passed
 
     def _decide(self, count):
@@ -110,31 +110,40 @@ class SpikeFilter:
         if not count:
             return []
         samples = self._buffered.select(slice(0, count))
-        rows = len(self._values) - len(self._buffered) + np.arange(count)
+        # The buffered samples are the last rows of the readings.
+        rows = len(self._readings) - len(self._buffered) + np.arange(count)
         is_spike = self._spikes(rows)
         self.dropped += int(np.count_nonzero(is_spike))
         self._buffered = self._buffered.select(slice(count, None))
-        # Drop the rows that no later test needs. The first kept row has no second difference.
+        # Drop the rows that no later test needs, in whole chunks, and their noise.
         n_old_chunks = max((rows[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0)
-        self._values = self._values[n_old_chunks * NOISE_SAMPLES :]
+        self._readings = self._readings[n_old_chunks * NOISE_SAMPLES :]
         self._first_row += n_old_chunks * NOISE_SAMPLES
-        self._noise = self._noise[-2 - (len(self._values) + SPIKE_REACH) // NOISE_SAMPLES :]
+        self._noise_sds = self._noise_sds[
+            -2 - (len(self._readings) + SPIKE_REACH) // NOISE_SAMPLES :
+        ]
         return [samples.select(~is_spike) if is_spike.any() else samples]
 
     def _spikes(self, rows):
-        """Return which of some rows of the values, shape (n,), have a spike."""
-        values = self._values
+        """
+        Return which samples have a spike in one of their six readings, bool, shape (n,).
+
+        `rows` are their indices in the stored readings, shape (n,).
+        """
+        values = self._readings
         if len(values) < 2 * SPIKE_REACH + 1:
             return np.zeros(len(rows), bool)
         second = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
         second = np.vstack([second[:1], second, second[-1:]])
         self._add_noise(second)
 
-        # Candidates exceed the noise of the chunk before; the last row of `_noise` is the newest.
+        # Candidates exceed the noise of the chunk before; the last of the noise sds is the newest.
         chunk = np.maximum((self._first_row + rows) // NOISE_SAMPLES - 1, 0)
-        n_noise = len(self._noise)
-        limit = LARGE * self._noise[np.clip(chunk - self._n_chunks + n_noise, 0, n_noise - 1)]
-        candidate, column = np.nonzero(second[rows] > _CANDIDATE / LARGE * limit)
+        n_noise = len(self._noise_sds)
+        noise_row = np.clip(chunk - self._n_chunks + n_noise, 0, n_noise - 1)
+        limit = LARGE_SDS * self._noise_sds[noise_row]
+        # Each candidate is one reading: an index into `rows`, and a column.
+        candidate, column = np.nonzero(second[rows] > _CANDIDATE / LARGE_SDS * limit)
         is_spike = np.zeros(len(rows), bool)
         if not len(candidate):
             return is_spike
@@ -149,7 +158,7 @@ class SpikeFilter:
         # spike affects three second differences, two in six.
         first = np.clip(row - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
         window = first[:, None] + np.arange(2 * SPIKE_REACH + 1)
-        shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column[:, None]], axis=1)
+        shaking = LARGE_SDS * _NORMAL * np.median(second[window[:, 1:-1], column[:, None]], axis=1)
         limit = np.maximum(limit[candidate, column], shaking)
 
         # The nine readings around each candidate, and its place among them.
@@ -170,20 +179,20 @@ class SpikeFilter:
         count = (len(second) - 1 - start) // NOISE_SAMPLES if len(second) > NOISE_SAMPLES else 0
         if self._n_chunks == 0 and count == 0:  # a stream that ended before
             chunks = second[None]
-            values = self._values[None]
+            values = self._readings[None]
         else:
             rows = slice(start, start + count * NOISE_SAMPLES)
             chunks = second[rows].reshape(count, NOISE_SAMPLES, 6)
-            values = self._values[rows].reshape(count, NOISE_SAMPLES, 6)
+            values = self._readings[rows].reshape(count, NOISE_SAMPLES, 6)
         if not len(chunks):
             return
         # Smallest step until each chunk, (n_chunks, 6), infinite before the first change.
         change = np.abs(np.diff(values, axis=1))
         steps = np.where(change > 0, change, np.inf).min(axis=1)
-        steps = np.minimum.accumulate(np.vstack([self._step, steps]))[1:]
+        steps = np.minimum.accumulate(np.vstack([self._smallest_step, steps]))[1:]
         # A constant output (clipped, frozen, coarse) has no noise estimate: the previous one is
         # kept.
-        estimates = np.vstack([self._noise[-1:], _NORMAL * _median(chunks)])
+        estimates = np.vstack([self._noise_sds[-1:], _NORMAL * _median(chunks)])
         number = np.arange(len(estimates))[:, None]
         last_known = np.maximum.accumulate(np.where(estimates > 0, number, 0))
         estimates = np.take_along_axis(estimates, last_known, axis=0)[1:]
@@ -191,9 +200,9 @@ class SpikeFilter:
             np.maximum(estimates, np.where(np.isfinite(steps), steps, 0.0)),
             NOISE_ROUNDING * np.abs(_median(values)),
         )
-        self._noise = np.vstack([self._noise, noise])
+        self._noise_sds = np.vstack([self._noise_sds, noise])
         self._n_chunks += len(noise)
-        self._step = steps[-1]
+        self._smallest_step = steps[-1]
 
 
 def _median(values):
@@ -219,7 +228,7 @@ def _is_knock(neighbours, limit):
     neighbours : array, shape (m, 4, 6)
         Readings a, b, c, d.
     limit : array, shape (m, 6)
-        `LARGE` noise sds.
+        `LARGE_SDS` noise sds.
 
     """
     deviation = np.abs(np.einsum('mkc,k->mc', neighbours, [-1.0, 2.0, -2.0, 1.0]))
@@ -241,7 +250,7 @@ def _contradicted(around, place, limit):
     place : array of int, shape (m,)
         Index of the reading among them: the middle except at the ends of the stream.
     limit : array, shape (m,)
-        `LARGE` noise sds.
+        `LARGE_SDS` noise sds.
 
     """
     a, b, x, c, d = around[:, SPIKE_NEIGHBOURS - 2 : SPIKE_NEIGHBOURS + 3].T

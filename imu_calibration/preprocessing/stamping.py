@@ -318,10 +318,14 @@ class TimesInOrder:
 
     def __init__(self) -> None:
         self._latest: np.ndarray = np.full(2, np.iinfo(np.int64).min)
-        """The highest recorded stamp and the highest time, ns."""
+        """Highest recorded stamp and highest time of all samples so far, ns, shape (2,)."""
 
     def passes(self, stamp_ns: np.ndarray) -> bool:
-        """Take stamps that are used unchanged; return whether the first is after every time."""
+        """
+        Return whether stamps that are used unchanged begin after every time; then record them.
+
+        `stamp_ns` are in order.
+        """
         if stamp_ns[0] <= self._latest[1]:
             return False
         self._latest[:] = stamp_ns.max()
@@ -341,12 +345,14 @@ class TimesInOrder:
         times = np.concatenate([self._latest[1:], times_ns])
         earlier_stamp = np.maximum.accumulate(stamp)[:-1]
         earlier_time = np.maximum.accumulate(times)[:-1]
-        # Indices into `stamp` and `times` of the samples that are moved.
+        # Samples that were recorded after all earlier ones, but without a later time. Indices into
+        # `stamp` and `times`, which begin with the latest earlier sample.
         moved = np.flatnonzero((stamp_ns > earlier_stamp) & (times_ns <= earlier_time)) + 1
         if len(moved):
+            # Each run of successive ones is spread evenly behind the latest time before it.
             for run in np.split(moved, np.flatnonzero(np.diff(moved) > 1) + 1):
                 before = times[: run[0]].max()
-                # At the recorded distances, but before the next time.
+                # The mean recorded step, or a smaller one that ends before the next time.
                 step = (stamp[run[-1]] - stamp[run[0] - 1]) / len(run)
                 if run[-1] + 1 < len(times):
                     step = min(step, (times[run[-1] + 1] - before) / (len(run) + 1))
@@ -367,7 +373,7 @@ LOST_PERIOD_SHARE = 0.6
 Samples were lost at a long step if the clock is ahead by more than this share of a period after it,
 relative to before.
 """
-FOLLOW = 0.05
+SAME_PERIOD_SHARE = 0.05
 """
 A period that has changed by more than this share is another one; smaller changes are averaged.
 """
@@ -393,13 +399,13 @@ class CountedClock:
 
     def __init__(self, line: StampLine):
         self._period = line.period_ns
-        self._arrivals = line.arrivals
+        self._are_arrivals = line.arrivals
         # Samples were lost if the clock is ahead by more than this after a long step, ns.
         self._loss_margin = LOST_PERIOD_SHARE * line.period_ns
         self._loss_margin += 0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns)
         # Stamps that are in no block yet, and times that are not returned yet, ns.
-        self._raw = np.zeros(0, np.int64)
-        self._times = [np.zeros(0, np.int64)]
+        self._waiting_ns = np.zeros(0, np.int64)
+        self._ready_ns = [np.zeros(0, np.int64)]
         self._begin()
 
     def _begin(self) -> None:
@@ -409,18 +415,20 @@ class CountedClock:
         # Number of the next sample, and numbers and stamps of the newest samples, (2, n), at most
         # `LOSS_REACH`.
         self._next_number = 0.0
-        self._before = np.zeros((2, 0))
-        # Numbers and stamps of the newest block, whose times need the point of the next one.
-        self._block: np.ndarray | None = None
-        self._block_stamp = np.zeros(0)
-        # Points of the clock: (number of a sample, its time), of the newest blocks.
+        self._newest_samples = np.zeros((2, 0))
+        # Numbers and stamps of the samples of the newest block; their times need the point of the
+        # next block.
+        self._block_numbers: np.ndarray | None = None
+        self._block_stamps = np.zeros(0)
+        # Points of the clock, one for each of the newest blocks: (mean number of its samples, the
+        # time of this number, ns).
         self._points: list[tuple[float, float]] = []
         # Last computed time; empty before the first.
         self._last_time = np.zeros(0)
 
     def push(self, stamp_ns: np.ndarray) -> None:
         """Add stamps in the order of arrival."""
-        self._raw = np.concatenate([self._raw, stamp_ns])
+        self._waiting_ns = np.concatenate([self._waiting_ns, stamp_ns])
 
     def take(self, final: bool = False) -> np.ndarray:
         """
@@ -428,20 +436,23 @@ class CountedClock:
 
         They are in the order of the stamps.
         """
-        while len(self._raw) >= CLOCK_BLOCK + LOSS_REACH or (final and len(self._raw)):
+        # A block needs the next stamps too, which decide whether samples were lost.
+        n_needed = 1 if final else CLOCK_BLOCK + LOSS_REACH
+        while len(self._waiting_ns) >= n_needed:
             # A block and the stamps ahead of it end at a pause.
-            pauses = np.flatnonzero(np.diff(self._raw[: CLOCK_BLOCK + LOSS_REACH]) > PAUSE_NS)
-            end = int(pauses[0]) + 1 if len(pauses) else len(self._raw)
+            steps = np.diff(self._waiting_ns[: CLOCK_BLOCK + LOSS_REACH])
+            pauses = np.flatnonzero(steps > PAUSE_NS)
+            end = int(pauses[0]) + 1 if len(pauses) else len(self._waiting_ns)
             block_end = min(CLOCK_BLOCK, end)
             ahead_end = min(CLOCK_BLOCK + LOSS_REACH, end)
-            self._add_block(self._raw[:block_end], self._raw[block_end:ahead_end])
-            self._raw = self._raw[block_end:]
+            self._add_block(self._waiting_ns[:block_end], self._waiting_ns[block_end:ahead_end])
+            self._waiting_ns = self._waiting_ns[block_end:]
             if len(pauses) and end <= CLOCK_BLOCK:
                 self._finish()
         if final:
             self._finish()
-        times = np.concatenate(self._times)
-        self._times = [np.zeros(0, np.int64)]
+        times = np.concatenate(self._ready_ns)
+        self._ready_ns = [np.zeros(0, np.int64)]
         return times
 
     def _add_block(self, stamp_ns: np.ndarray, ahead_ns: np.ndarray) -> None:
@@ -455,19 +466,19 @@ class CountedClock:
         stamp = (np.concatenate([stamp_ns, ahead_ns]) - self._origin_ns).astype(float)
         number = self._numbers(stamp, len(stamp_ns))
         stamp = stamp[: len(stamp_ns)]
-        self._before = np.hstack([self._before, [number, stamp]])[:, -LOSS_REACH:]
+        self._newest_samples = np.hstack([self._newest_samples, [number, stamp]])[:, -LOSS_REACH:]
         self._next_number = number[-1] + 1
         # A shorter block has no point, because its few samples may all be late.
         if len(number) >= CLOCK_BLOCK // 2 or not self._points:
             offsets = stamp - self._period * number
-            offset = offsets.min() if self._arrivals else offsets.mean()
+            offset = offsets.min() if self._are_arrivals else offsets.mean()
             mean_number = float(number.mean())
             self._points.append((mean_number, float(offset + self._period * mean_number)))
-        if self._block is not None:
-            self._add_times(self._block)
+        if self._block_numbers is not None:
+            self._add_times(self._block_numbers)
             self._update_period()
-        self._block = number
-        self._block_stamp = stamp
+        self._block_numbers = number
+        self._block_stamps = stamp
 
     def _numbers(self, stamp: np.ndarray, count: int) -> np.ndarray:
         """
@@ -477,17 +488,17 @@ class CountedClock:
         of ``stamp - period * number`` from the samples before to those from the step on, in
         periods: the earliest of times of arrival, otherwise the median, of `LOSS_REACH` samples.
         """
-        central = np.min if self._arrivals else np.median
+        central = np.min if self._are_arrivals else np.median
         number = self._next_number + np.arange(len(stamp))
-        stamp_before = self._before[1, -1] if self._before.shape[1] else stamp[0]
+        stamp_before = self._newest_samples[1, -1] if self._newest_samples.shape[1] else stamp[0]
         step = np.diff(stamp, prepend=stamp_before)
         for k in np.flatnonzero(step[:count] > MAX_REGULAR_STEP * self._period):
-            offset_before = np.concatenate(
-                [
-                    self._before[1] - self._period * self._before[0],
-                    stamp[:k] - self._period * number[:k],
-                ]
-            )[-LOSS_REACH:]
+            # Offsets of the stamps from the clock before the long step: of earlier blocks, then of
+            # this one.
+            earlier_number, earlier_stamp = self._newest_samples
+            earlier_offset = earlier_stamp - self._period * earlier_number
+            offset_before = np.append(earlier_offset, stamp[:k] - self._period * number[:k])
+            offset_before = offset_before[-LOSS_REACH:]
             if not len(offset_before):
                 continue
             after = slice(k, k + LOSS_REACH)
@@ -504,21 +515,24 @@ class CountedClock:
         period. In parts where the stamps fit a clock better, these are used.
         """
         points = np.array(self._points)
-        block_length = (CLOCK_BLOCK, CLOCK_BLOCK * self._period)
+        block_length = (CLOCK_BLOCK, CLOCK_BLOCK * self._period)  # samples, ns
         points = np.vstack([points[0] - block_length, points, points[-1] + block_length])
         computed = np.interp(number, points[:, 0], points[:, 1])
         is_recorded = np.zeros(len(computed), bool)
-        for part in misfits(self._block_stamp, computed, self._period, arrivals=self._arrivals):
+        for part in misfits(
+            self._block_stamps, computed, self._period, arrivals=self._are_arrivals
+        ):
             is_recorded[part] = True
-        times = np.where(is_recorded, self._block_stamp, computed)
+        times = np.where(is_recorded, self._block_stamps, computed)
         # A computed part may overlap a recorded one, or this block the one before.
         overlaps = bool(np.any(np.diff(np.append(self._last_time, times)) <= 0))
         if overlaps:
-            times = self._block_stamp
+            times = self._block_stamps
+        # Recorded times are not on the lines, which begin again with the newest point.
         if is_recorded.any() or overlaps:
             self._points = self._points[-1:]
         self._last_time = times[-1:]
-        self._times.append((self._origin_ns or 0) + np.rint(times).astype(np.int64))
+        self._ready_ns.append((self._origin_ns or 0) + np.rint(times).astype(np.int64))
 
     def _update_period(self) -> None:
         """Update the period from the last two points, and keep only these."""
@@ -526,7 +540,7 @@ class CountedClock:
             return
         (n0, t0), (n1, t1) = self._points[-2:]
         period = (t1 - t0) / (n1 - n0)
-        if abs(period - self._period) > FOLLOW * self._period:
+        if abs(period - self._period) > SAME_PERIOD_SHARE * self._period:
             self._period = period
         else:
             self._period = self._period + NEW_WEIGHT * (period - self._period)
@@ -534,12 +548,12 @@ class CountedClock:
 
     def _finish(self) -> None:
         """Compute the remaining times, and reset."""
-        if self._block is not None:
-            self._add_times(self._block)
+        if self._block_numbers is not None:
+            self._add_times(self._block_numbers)
         self._begin()
 
 
-RARE = 4
+BLOCKS_PER_REVIEW = 4
 """Counted stamps are reviewed once in this number of blocks."""
 STAMP_HISTORY = 4 * LAG
 """Number of stamps for the decision between counted and irregular."""
@@ -567,23 +581,23 @@ class SampleTimes:
         # Newest line of each use of the stamps.
         self._line_of_use: dict[Stamping, StampLine] = {}
         # The newest sample, as samples of length one; None before the first.
-        self._last: Any = None
+        self._last_sample: Any = None
         self._begin()
 
     def _begin(self) -> None:
         """Begin a stretch of the stream; the line and the counts remain."""
-        # Whether the stamps of this stretch are not classified yet; its samples are buffered.
-        self._learning = True
-        # `CountedClock` that computes times; None while stamps are used unchanged.
-        self._clock: Any = None
+        # Whether the use of the stamps is not known yet; the samples are buffered until then.
+        self._is_unclassified = True
+        # `CountedClock` that computes the times; None while stamps are used unchanged.
+        self._counted_clock: Any = None
         # Samples whose times are not determined yet.
         self._buffered: Any = None
-        # Newest stamps, the number of them since the last full block, and of blocks since a review
-        # of counted stamps.
-        self._history = np.zeros(0, np.int64)
-        self._n_in_block = 0
-        self._n_blocks = 0
-        self._order = TimesInOrder()
+        # Newest stamps, at most `STAMP_HISTORY`; the number of samples since the last full block of
+        # `CLOCK_BLOCK`, and of full blocks since the use of the stamps was reviewed.
+        self._stamps_ns = np.zeros(0, np.int64)
+        self._n_since_block = 0
+        self._n_since_review = 0
+        self._times_in_order = TimesInOrder()
 
     def push(self, samples: ImuSamples) -> ImuSamples | None:
         """
@@ -594,19 +608,20 @@ class SampleTimes:
         samples = self._without_repeated(samples)
         ready = []
         while len(samples):
-            part = samples.select(slice(0, CLOCK_BLOCK - self._n_in_block))
-            samples = samples.select(slice(CLOCK_BLOCK - self._n_in_block, None))
-            self._n_in_block = (self._n_in_block + len(part)) % CLOCK_BLOCK
-            self._history = np.concatenate([self._history, part.stamp_ns])[-STAMP_HISTORY:]
-            ready += self._take(part)
+            part = samples.select(slice(0, CLOCK_BLOCK - self._n_since_block))
+            samples = samples.select(slice(CLOCK_BLOCK - self._n_since_block, None))
+            self._n_since_block = (self._n_since_block + len(part)) % CLOCK_BLOCK
+            stamps_ns = np.concatenate([self._stamps_ns, part.stamp_ns])
+            self._stamps_ns = stamps_ns[-STAMP_HISTORY:]
+            ready += self._add_part(part)
         return _joined(ready)
 
     def finish(self) -> ImuSamples | None:
         """Return the buffered samples, and reset."""
-        if self._learning and self._buffered is not None:
+        if self._is_unclassified and self._buffered is not None:
             self._set_line(describe_stamps(self._buffered.stamp_ns))
-        if self._clock is not None:
-            ready = self._counted(final=True)
+        if self._counted_clock is not None:
+            ready = self._timed_by_clock(final=True)
         else:
             ready = [self._ordered(self._buffered)]
         self._begin()
@@ -614,29 +629,35 @@ class SampleTimes:
 
     def _pass_if_regular(self, samples: ImuSamples) -> bool:
         """
-        Return whether all steps agree with the known clock; then record the samples as passed.
+        Return whether the samples can pass unchanged; then record their stamps as passed.
 
-        This is the usual case, in which the samples need no further tests.
+        They can if the stamps are in use unchanged, and each step is about one period. This is the
+        usual case, in which the samples need no further tests.
         """
-        if self._learning or self._clock is not None or self.line is None or not len(samples):
+        if self._is_unclassified or self._counted_clock is not None:
             return False
-        # The complete block of the next review.
-        step = np.diff(np.concatenate([self._history[-self._n_in_block - 1 :], samples.stamp_ns]))
+        if self.line is None or not len(samples):
+            return False
+        # All steps since the last full block, because the next review is of a complete one.
+        n_recorded = self._n_since_block + 1
+        step = np.diff(np.concatenate([self._stamps_ns[-n_recorded:], samples.stamp_ns]))
         if not np.all(is_regular(step, self.line.period_ns)):
             return False
-        if not self._order.passes(samples.stamp_ns):
+        if not self._times_in_order.passes(samples.stamp_ns):
             return False
-        self._n_in_block = (self._n_in_block + len(samples)) % CLOCK_BLOCK
-        history = np.concatenate([self._history, samples.stamp_ns[-STAMP_HISTORY:]])
-        self._history = history[-STAMP_HISTORY:]
-        self._last = samples.select(slice(len(samples) - 1, None))
+        self._n_since_block = (self._n_since_block + len(samples)) % CLOCK_BLOCK
+        stamps_ns = np.concatenate([self._stamps_ns, samples.stamp_ns[-STAMP_HISTORY:]])
+        self._stamps_ns = stamps_ns[-STAMP_HISTORY:]
+        self._last_sample = samples.select(slice(len(samples) - 1, None))
         return True
 
     def _without_repeated(self, samples: ImuSamples) -> ImuSamples:
         """Return samples without those that repeat the stamp and the readings of the one before."""
-        joined = samples if self._last is None else ImuSamples.concatenate([self._last, samples])
+        joined = samples
+        if self._last_sample is not None:
+            joined = ImuSamples.concatenate([self._last_sample, samples])
         n_before = len(joined) - len(samples)
-        self._last = joined.select(slice(len(joined) - 1, None))
+        self._last_sample = joined.select(slice(len(joined) - 1, None))
         # Sample k + 1 has the stamp of sample k.
         k = np.flatnonzero(joined.stamp_ns[1:] == joined.stamp_ns[:-1])
         has_same_force = np.all(joined.force_s[k] == joined.force_s[k + 1], axis=1)
@@ -649,9 +670,13 @@ class SampleTimes:
         kept[repeated] = False
         return joined.select(kept)
 
-    def _take(self, part: ImuSamples) -> list:
-        """Add a block or a part of one; return the samples that are ready."""
-        if self._learning:
+    def _add_part(self, part: ImuSamples) -> list:
+        """
+        Add a part of a block of `CLOCK_BLOCK` samples; return the samples with their times.
+
+        After a complete block the use of the stamps may be reviewed.
+        """
+        if self._is_unclassified:
             self._add_to_buffer(part)
             stamp_ns = self._buffered.stamp_ns
             is_full = len(stamp_ns) >= STAMP_HISTORY
@@ -661,15 +686,18 @@ class SampleTimes:
                 line = describe_stamps(stamp_ns if is_full else stamp_ns[: MIN_PERIOD_STEPS + 1])
             if line is None and not is_full:
                 return []
-            self._learning = False
+            self._is_unclassified = False
             return self._set_line(line) + self._with_times(None)
 
         ready = self._with_times(part)
-        if not self._n_in_block:
-            self._n_blocks = (self._n_blocks + 1) % RARE
-            is_due = self._block_differs() if self._clock is None else not self._n_blocks
+        if not self._n_since_block:
+            self._n_since_review = (self._n_since_review + 1) % BLOCKS_PER_REVIEW
+            # Regular stamps are reviewed when their steps change, counted ones now and then.
+            is_due = not self._n_since_review
+            if self._counted_clock is None:
+                is_due = self._block_differs()
             if is_due:
-                ready += self._set_line(describe_stamps(self._history))
+                ready += self._set_line(describe_stamps(self._stamps_ns))
         return ready
 
     def _add_to_buffer(self, part: ImuSamples) -> None:
@@ -680,32 +708,32 @@ class SampleTimes:
 
     def _with_times(self, part: ImuSamples | None) -> list:
         """Return the buffered samples and `part`, unchanged or with times from the clock."""
-        if self._clock is None:
+        if self._counted_clock is None:
             buffered = self._buffered
             self._buffered = None
             if part is not None and self.line is not None and self.line.word == IRREGULAR:
                 self.n_irregular += len(part)
             return [self._ordered(buffered), self._ordered(part)]
         if part is not None:
-            self._clock.push(part.stamp_ns)
+            self._counted_clock.push(part.stamp_ns)
             self._add_to_buffer(part)
-        return self._counted()
+        return self._timed_by_clock()
 
-    def _counted(self, final: bool = False) -> list:
+    def _timed_by_clock(self, final: bool = False) -> list:
         """Return the first buffered samples whose times are determined, all with `final`."""
-        times = self._clock.take(final)
+        times = self._counted_clock.take(final)
         if not len(times):
             return []
         timed = self._buffered.select(slice(0, len(times)))
         self._buffered = self._buffered.select(slice(len(times), None))
         self.n_rebuilt += len(times)
-        return [replace(timed, stamp_ns=self._order.push(timed.stamp_ns, times))]
+        return [replace(timed, stamp_ns=self._times_in_order.push(timed.stamp_ns, times))]
 
     def _ordered(self, samples: ImuSamples | None) -> ImuSamples | None:
         """Return samples with their recorded stamps, later than the computed times before them."""
         if samples is None or not len(samples):
             return samples
-        times = self._order.push(samples.stamp_ns, samples.stamp_ns)
+        times = self._times_in_order.push(samples.stamp_ns, samples.stamp_ns)
         return replace(samples, stamp_ns=times)
 
     def odd_line(self, count: int) -> StampLine | None:
@@ -721,37 +749,41 @@ class SampleTimes:
         """Return whether the steps of the last block differ from the known clock."""
         if self.line is None:
             return True
-        step = np.diff(self._history[-CLOCK_BLOCK - 1 :])
+        step = np.diff(self._stamps_ns[-CLOCK_BLOCK - 1 :])
         n_irregular = np.count_nonzero(~is_regular(step, self.line.period_ns))
         return bool(n_irregular > MAX_IRREGULAR_SHARE * len(step))
 
     def _set_line(self, line: StampLine | None) -> list:
         """
-        Begin or end to compute times according to a line; return the samples that become ready.
+        Compute times from now on if stamps are counted according to a line, else use the stamps.
+
+        Return the samples whose times were to be computed with the line before.
         """
         if line is None:
             return []
-        before = self.line
+        line_before = self.line
         self.line = line
         self._line_of_use[line.word] = line
         ready = []
-        if self._clock is None:
+        if self._counted_clock is None:
             if line.word != COUNTED:
                 return []
         else:
             has_same_period = (
-                before is None
-                or abs(line.period_ns - before.period_ns) <= FOLLOW * before.period_ns
+                line_before is None
+                or abs(line.period_ns - line_before.period_ns)
+                <= SAME_PERIOD_SHARE * line_before.period_ns
             )
+            # The clock itself follows small changes of the period.
             if line.word == COUNTED and has_same_period:
                 return []
-            ready = self._counted(final=True)
-            self._clock = None
+            ready = self._timed_by_clock(final=True)
+            self._counted_clock = None
             if line.word != COUNTED:
                 return ready
-        self._clock = CountedClock(line)
+        self._counted_clock = CountedClock(line)
         if self._buffered is not None:
-            self._clock.push(self._buffered.stamp_ns)
+            self._counted_clock.push(self._buffered.stamp_ns)
         return ready
 
 

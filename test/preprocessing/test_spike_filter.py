@@ -103,7 +103,7 @@ def test_the_noise_of_a_chunk_does_not_depend_on_how_the_stream_is_cut(session, 
         filtered = SpikeFilter()
         for start in range(0, 3200, length):
             filtered.push(session.select(slice(start, min(start + length, 3200))))
-        noises.append(filtered._noise[-1])
+        noises.append(filtered._noise_sds[-1])
     np.testing.assert_array_equal(*noises)
 
 
