@@ -77,14 +77,14 @@ class ToneSearch:
         self._frequency = frequency
         self._column = column
         # Samples of a block, and its length, s.
-        self._block = max(int(1 / (PER_CYCLE * frequency * period)), 1)
-        self._step = self._block * period
+        self._block_size = max(int(1 / (PER_CYCLE * frequency * period)), 1)
+        self._block_seconds = self._block_size * period
         # Blocks of a segment; 0 if all rests are too short for a search.
-        self._size = 0
+        self._n_blocks = 0
         if longest * frequency >= FEWEST_CYCLES:
-            self._size = int(min(CYCLES / frequency, longest) / self._step)
+            self._n_blocks = int(min(CYCLES / frequency, longest) / self._block_seconds)
         # Sum of the periodograms of complete segments, their number, and samples of the next one.
-        self._power = np.zeros(self._size // 2 + 1)
+        self._power = np.zeros(self._n_blocks // 2 + 1)
         self._n_segments = 0
         self._samples = np.zeros(0)
 
@@ -92,15 +92,16 @@ class ToneSearch:
         """Add the next samples of a rest, shape (n, 6); missing ones are replaced by the mean."""
         from scipy.signal import periodogram  # here, because its import is slow
 
-        if not self._size or not present.any():
+        if not self._n_blocks or not present.any():
             return
         mean = values[present, self._column].mean()
         new = np.where(present, values[:, self._column], mean)
         self._samples = np.concatenate([self._samples, new])
-        length = self._block * self._size
-        while len(self._samples) >= length:
-            segment = self._samples[:length].reshape(self._size, self._block).mean(axis=1)
-            self._samples = self._samples[length:]
+        n_samples = self._block_size * self._n_blocks  # of a segment
+        while len(self._samples) >= n_samples:
+            samples = self._samples[:n_samples].reshape(self._n_blocks, self._block_size)
+            segment = samples.mean(axis=1)
+            self._samples = self._samples[n_samples:]
             _, power = periodogram(segment, window='hann', detrend='linear', scaling='spectrum')
             self._power += power
             self._n_segments += 1
@@ -113,11 +114,11 @@ class ToneSearch:
         """
         Return (frequency in Hz, amplitude) of the most significant line, None without one.
 
-        F test of an ordinate against the mean of the ordinates around it, times the number of
-        frequencies.
+        The test is an F test of one ordinate of the spectrum against the mean of those around it;
+        its probability is multiplied by the number of tested frequencies.
         """
         bins = np.arange(LINE_NEIGHBOUR_BINS, len(self._power) - LINE_NEIGHBOUR_BINS)
-        hertz = 1 / (max(self._size, 1) * self._step)
+        hertz = 1 / (max(self._n_blocks, 1) * self._block_seconds)
         bins = bins[(bins * hertz >= 0.5 * self._frequency) & (bins * hertz <= 2 * self._frequency)]
         if not self._n_segments or not len(bins):
             return None
@@ -139,7 +140,9 @@ class ToneSearch:
         frequency = float(power @ lobe / power.sum()) * hertz
         power_of_line = max(power.sum() - len(lobe) * around[best], 0.0) / self._n_segments
         squared_amplitude = power_of_line * 2 * HANN_INDEPENDENT_SHARE
-        return frequency, float(np.sqrt(squared_amplitude) / np.sinc(frequency * self._step))
+        return frequency, float(
+            np.sqrt(squared_amplitude) / np.sinc(frequency * self._block_seconds)
+        )
 
 
 LENGTHS = 60.0 * np.array(
@@ -169,7 +172,7 @@ class RecordingTimes:
     def __init__(self, period: float):
         self._period = period
         # Length of a recording, s -> covariance of its Allan variances, which is slow to compute.
-        self._scales: dict[float, ScaleCovariance] = {}
+        self._covariance_of_length: dict[float, ScaleCovariance] = {}
 
     def needed(
         self, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, index: int
@@ -201,18 +204,23 @@ class RecordingTimes:
         whiten = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))
         columns = whiten(design * coefficients)  # of relative changes of the coefficients
         information = columns.T @ columns
-        size = np.sqrt(np.diag(information))
-        inverse = np.linalg.pinv(information / np.outer(size, size), rcond=1e-12, hermitian=True)
-        return float(np.sqrt(inverse[index, index]) / size[index])
+        # With a unit diagonal, so that the inverse is accurate.
+        scale = np.sqrt(np.diag(information))
+        inverse = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+        return float(np.sqrt(inverse[index, index]) / scale[index])
 
     def _moments(self, seconds: float) -> Moments:
-        """Return moments of a recording of this length, with scales and without variances."""
-        if seconds not in self._scales:
+        """
+        Return `Moments` for the prediction: the sampling errors of a recording of this length, s.
+
+        The Allan variances in them are ones.
+        """
+        if seconds not in self._covariance_of_length:
             n = int(seconds / self._period)
             factors = averaging_factors(n, per_octave=1)
             factors = factors[factors * self._period >= SCALES_FROM]
-            self._scales[seconds] = ScaleCovariance(factors, [n], self._period)
-        scales = self._scales[seconds]
+            self._covariance_of_length[seconds] = ScaleCovariance(factors, [n], self._period)
+        scales = self._covariance_of_length[seconds]
         return Moments(scales, np.ones(len(scales.factors)), np.ones(len(scales.factors), bool))
 
 
@@ -501,10 +509,12 @@ def _record_for(axis: AxisNoise, times: RecordingTimes) -> dict[str, float | Non
     """
     needed = {}
     for name, term in axis.terms.items():
-        # White noise, a walk for filters, and the processes of the form, except correlation times.
-        wanted = name in (WHITE.name, RANDOM_WALK.name, *axis.form) and name in PROCESSES
-        if not wanted or term.status == DETERMINED or not np.isfinite(term.interval[1]):
+        # White noise, the random walk that filters need, and the processes of the form; correlation
+        # times are no processes.
+        is_needed = name in (WHITE.name, RANDOM_WALK.name, *axis.form) and name in PROCESSES
+        if not is_needed or term.status == DETERMINED or not np.isfinite(term.interval[1]):
             continue
+        # The fitted model, with this process if it is not part of it.
         processes = list(axis.fit.processes)
         coefficients = list(axis.fit.coefficients)
         if name not in axis.fit.names:
@@ -512,6 +522,7 @@ def _record_for(axis: AxisNoise, times: RecordingTimes) -> dict[str, float | Non
             coefficients.insert(0, 0.0)
         index = [process.name for process in processes].index(name)
         coefficients[index] = (term.value or term.interval[1]) ** 2
+        # Processes of zero size have no relative sd.
         positive = [j for j in range(len(processes)) if coefficients[j] > 0]
         needed[name] = times.needed(
             tuple(processes[j] for j in positive),

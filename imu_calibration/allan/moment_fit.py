@@ -134,10 +134,10 @@ class Moments:
 
     def covariance(self, design: np.ndarray, tensor: np.ndarray, values: np.ndarray) -> np.ndarray:
         """
-        Return the covariance of the variances used, shape (n_used, n_used).
+        Return the covariance of the Allan variances used, shape (n_used, n_used).
 
-        It is the sampling error for the coefficients `values`, and the variation of the level of
-        the curve between parts, which is common to all scales.
+        It is the sum of the sampling error of processes with the coefficients `values`, and of the
+        variation of the level of the curve between parts, which is common to all scales.
         """
         sampling = np.einsum('p,q,pqij->ij', values, values, tensor)
         if not self.scatter:
@@ -176,10 +176,11 @@ def fit_processes(
     fixed = fixed or {}
     free = np.array([k for k in range(len(processes)) if k not in fixed], int)
     values = _first_guess(design, target, moments) if start is None else np.array(start, float)
-    of_fixed = np.zeros(len(target))
+    fixed_variance = np.zeros(len(target))  # of the processes with fixed coefficients
     for k, value in fixed.items():
         values[k] = value
-        of_fixed = of_fixed + design[:, k] * value
+        fixed_variance = fixed_variance + design[:, k] * value
+    # The weights are those of coefficients above zero: no variance is exact.
     floor = FLOOR * np.min(target[:, None] / design, axis=0)
     for _ in range(MAX_WEIGHT_ROUNDS):
         covariance = moments.covariance(design, tensor, np.maximum(values, floor))
@@ -187,8 +188,8 @@ def fit_processes(
         new = values.copy()
         if len(free):
             columns = whitener(design[:, free])
-            size = np.linalg.norm(columns, axis=0)
-            new[free] = nnls(columns / size, whitener(target - of_fixed))[0] / size
+            norms = np.linalg.norm(columns, axis=0)
+            new[free] = nnls(columns / norms, whitener(target - fixed_variance))[0] / norms
         done = np.all(np.abs(new - values) <= 1e-7 * np.maximum(new, values))
         values = new
         if done:
@@ -208,23 +209,23 @@ class Whitener:
     def __init__(self, covariance: np.ndarray):
         self._sd = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(self._sd, self._sd)
-        self._factor = _cholesky(correlation + RIDGE * np.eye(len(correlation)))
+        self._cholesky_factor = _cholesky(correlation + RIDGE * np.eye(len(correlation)))
         # The inverse is accurate because of the ridge; a solve of this size waits for threads.
-        self._inverse = dtrtri(self._factor, lower=1)[0]
+        self._inverse_factor = dtrtri(self._cholesky_factor, lower=1)[0]
 
     @property
     def log_determinant(self) -> float:
         """Logarithm of the determinant of the covariance."""
-        return float(2 * np.log(np.diag(self._factor)).sum() + 2 * np.log(self._sd).sum())
+        return float(2 * np.log(np.diag(self._cholesky_factor)).sum() + 2 * np.log(self._sd).sum())
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Return a whitened vector, or whitened columns of a matrix."""
         scaled = rows / (self._sd if rows.ndim == 1 else self._sd[:, None])
-        return self._inverse @ scaled
+        return self._inverse_factor @ scaled
 
     def weights(self, whitened: np.ndarray) -> np.ndarray:
         """Return w with ``w @ vector = whitened @ self(vector)`` for every vector."""
-        return self._inverse.T @ whitened / self._sd
+        return self._inverse_factor.T @ whitened / self._sd
 
 
 def _cholesky(matrix: np.ndarray) -> np.ndarray:
@@ -256,14 +257,15 @@ def fit_with_time(
     With fixed weights the best time minimises the weighted sum of squares; the weights are updated
     until a time occurs again. `fixed` is that of `fit_processes`.
     """
+    # First weights: the relative errors of the variances increase with the averaging time.
     whitener = Whitener(np.diag((moments.target**2 * moments.scales.tau[moments.used])))
     fit = None
-    tried = set()
+    tried_times = set()
     while True:
         best = _best_time(moments, processes, whitener, fixed or {})
-        if fit is not None and best in tried:
+        if fit is not None and best in tried_times:
             return fit
-        tried.add(best)
+        tried_times.add(best)
         model = (*processes, gauss_markov(moments.times[best]))
         fit = fit_processes(moments, model, fixed, start=None if fit is None else fit.coefficients)
         whitener = Whitener(fit.covariance)
@@ -285,11 +287,11 @@ def _best_time(
     last = len(processes)  # index of the Gauss-Markov process
     columns = whitener(moments.design(processes))
     wander = whitener(moments.wander)
-    of_fixed = np.zeros(len(columns))
+    fixed_variance = np.zeros(len(columns))  # of the processes with fixed coefficients, whitened
     for k, value in fixed.items():
         if k < last:
-            of_fixed = of_fixed + columns[:, k] * value
-    target = whitener(moments.target) - of_fixed
+            fixed_variance = fixed_variance + columns[:, k] * value
+    target = whitener(moments.target) - fixed_variance
 
     # A target for each time, less a Gauss-Markov process with a fixed coefficient.
     wander_is_fixed = last in fixed

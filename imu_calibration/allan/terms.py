@@ -103,16 +103,17 @@ class Choice:
         return fits, weights
 
     def widened(self, name: str) -> 'Choice':
-        """Return a Choice with one fit: the best form with a further process."""
+        """Return a Choice with one fit: the best form with a further process, `name`."""
         fast = tuple(known for known in self.best.names if known == QUANTISATION.name)
         fit = fit_names(self.moments, (*fast, WHITE.name, name, *self.best.form))
         return Choice((replace(fit, cost=self.best.cost),), self.moments)
 
     def close(self, name: str) -> MomentFit | None:
         """
-        Return the best form with a process that explains the curve nearly as well, or None.
+        Return the best fit with a process that explains the curve nearly as well as the best form.
 
-        It may cost a correlation time more than `rivals`.
+        None if there is none. Its cost may exceed that of `rivals` by the price of a correlation
+        time.
         """
         for fit in self.fits:
             if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME:
@@ -134,7 +135,7 @@ def _is_special_case(form: tuple[str, ...], wider: tuple[str, ...]) -> bool:
 
 def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
     """
-    Fit every form, with quantisation if it is significant with the best form.
+    Return the fits of all forms, with quantisation noise if it is significant with the best form.
 
     `excess` is a factor on all covariances, for a curve that no form explains.
     """
@@ -146,10 +147,15 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
 
 
 def _all_forms(moments: Moments, fast: tuple[str, ...], excess: float) -> tuple[MomentFit, ...]:
-    """Return the fits of all forms, with some `fast` processes, in order of their cost."""
+    """
+    Return the fits of all forms that the averaging times can determine, the least cost first.
+
+    `fast` are the names of processes that each of them has in addition to white noise.
+    """
     n_scales = int(moments.used.sum())
     fits = []
     for form in FORMS:
+        # Two averaging times for each slow process, and some for white noise and the misfit.
         if len(fast) + 2 * len(form) + 3 <= n_scales:
             fits.append(fit_form(moments, form, fast, excess=excess))
     return tuple(sorted(fits, key=lambda fit: fit.cost))
@@ -159,12 +165,25 @@ def fit_form(
     moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0
 ) -> MomentFit:
     """
-    Fit white noise, `fast` processes and the slow processes of a form, and return it with its cost.
+    Return the fit of a noise model to the Allan variances of an axis, with the cost of the model.
 
-    The cost is that of `log_cost` and the prices of its parameters.
+    The cost is minus twice the log likelihood (`log_cost`) plus a price for each parameter.
+
+    Parameters
+    ----------
+    moments : Moments
+        Allan variances with their covariance.
+    form : tuple of str
+        Names of the slow processes of the model. White noise is always part of it.
+    fast : tuple of str
+        Names of further processes of short averaging times, such as quantisation.
+    excess : float
+        Factor on all covariances, for a curve that no model explains.
+
     """
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
+    # The correlation time of a Gauss-Markov process is a parameter with a price of its own.
     if GAUSS_MARKOV in form:
         fit = _at_likelier_time(moments, fit)
     cost = log_cost(moments, fit, excess)

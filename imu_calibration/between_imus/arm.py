@@ -100,15 +100,17 @@ class Fit:
 
     def weighted(self, index: np.ndarray | slice) -> np.ndarray:
         """
-        Return design' times the derivative of the weighted residual, (n, p, 3), of n windows.
+        Return ``design' (w - weight_fall r r')`` of the windows `index`, shape (n, p, 3).
 
-        With the weight w and the residual r of a window: ``d(w r)/dr = w - weight_fall r r'``.
+        The bracket is the derivative of the weighted residual ``w r`` of a window by its residual
+        r, with the weight w.
         """
         transposed = np.swapaxes(self.design[index], 1, 2)
         residual = self.residual[index]
-        along = np.einsum('npi,ni->np', transposed, residual) * self.weight_fall[index, None]
+        design_residual = np.einsum('npi,ni->np', transposed, residual)
+        design_residual = design_residual * self.weight_fall[index, None]
         weighted_design = transposed * self.weights[index, None, None]
-        return weighted_design - along[:, :, None] * residual[:, None, :]
+        return weighted_design - design_residual[:, :, None] * residual[:, None, :]
 
     def curvature(self, index: np.ndarray | slice) -> np.ndarray:
         """Return the contribution of the windows `index` to the Hessian, shape (p, p)."""
@@ -222,14 +224,14 @@ def _robust_fit(design: np.ndarray, target: np.ndarray, alpha_noise: float) -> _
     for _ in range(30):
         excess = 2 * alpha_noise * np.sum(weights - weight_fall * squares / 3)
         right_side = flat.T @ (target * weights[:, None]).ravel()
-        before = values
+        previous_values = values
         values = np.linalg.solve(_normal(design, weights, excess), right_side)
         squares = np.sum((target.ravel() - flat @ values).reshape(-1, 3) ** 2, axis=1)
         # The median of chi-square with three degrees of freedom.
         scale = np.median(squares) / 2.366 + 1e-300
         weights = (TAIL_DOF + 3) / (TAIL_DOF + squares / scale)
         weight_fall = 2 * weights**2 / ((TAIL_DOF + 3) * scale)
-        if np.all(np.abs(values - before) <= 1e-9 * np.abs(values)):
+        if np.all(np.abs(values - previous_values) <= 1e-9 * np.abs(values)):
             break
     return _RobustFit(values, weights, weight_fall, excess)
 
@@ -365,6 +367,7 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
     rotation = relative_rotation(a, b)
     delay = 0.0
     for _ in range(DELAY_ROUNDS):
+        # Windows shifted by the delay so far; the fit then has the remaining one.
         rows = _build_rows(a, b, rotation, delay)
         fit = _fit_arm(rows)
         remaining_delay = fit.values[-1]
@@ -376,9 +379,19 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
 
 def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: float) -> ArmRows:
     """
-    Return both sides of the equation, integrated over windows of strong motion without clipping.
+    Return both sides of the equation of the arm, as means over windows of strong motion.
 
-    The rates are `delay` seconds later on their clocks.
+    The equation is ``f_B - f_A = alpha x r + omega x (omega x r)`` with the arm r. Windows with
+    clipped samples are excluded.
+
+    Parameters
+    ----------
+    a, b : PairedImu
+        Readings of both IMUs.
+    rotation : RelativeRotation
+        Rotation and time offset of B relative to A.
+    delay : float
+        Delay of the rates relative to the specific forces, s: windows of rates are later by it.
 
     Raises
     ------
@@ -386,7 +399,7 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
         With too few windows.
 
     """
-    # Windows at the same true times on the clocks of both.
+    # Windows at the same true times, on the clock of each sensor.
     length = window_length(a, b)
     offset = rotation.offset
     centres = window_centres(a, b, offset=offset, length=length)
@@ -396,7 +409,7 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
     rate_b = make_windows(b.time, centres + offset + delay, length)
     clipped = force_a.touches(a.flagged) | force_b.touches(b.flagged)
     clipped |= rate_a.touches(a.flagged) | rate_b.touches(b.flagged)
-    free = ~clipped
+    unclipped = ~clipped
 
     # Windows of strong motion: angular acceleration alpha and products omega omega', from the mean
     # of both gyroscopes in the axes of a.
@@ -408,7 +421,7 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
     rate_squared = np.trace(products, axis1=1, axis2=2)
     strength = np.sqrt(alpha_squared + rate_squared**2)
     moving = strength > MOTION_SHARE * np.quantile(strength, 0.99)
-    used = free & moving
+    used = unclipped & moving
     if used.sum() < WINDOWS_LEAST:
         raise NotObservableError(
             f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got'
@@ -416,7 +429,8 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
             ' range of the gyroscopes'
         )
 
-    # The derivative of alpha, for the small column of the delay only.
+    # The derivative of alpha by differences of windows: accurate enough, because only the small
+    # column of the delay has it.
     lag = 0.1 * (centres[1] - centres[0])
     used_centres = centres[used] + delay
     alpha_later = make_windows(a.time, used_centres + lag, length).slope(a.rate)
@@ -436,7 +450,7 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
         force_slope=force_a.select(used).slope(a.force),
         force=force,
         alpha_noise=float(alpha_noise),
-        clipped_share=float(np.mean(~free[moving])),
+        clipped_share=float(np.mean(clipped[moving])),
         length=length,
     )
 

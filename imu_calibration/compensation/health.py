@@ -73,6 +73,14 @@ class Stop:
         return self.end - self.start
 
 
+# Columns of a block (`StopDetector`): start, end, samples, means of force, rate and k further
+# columns, variances of force and rate.
+_START, _END, _N_SAMPLES = 0, 1, 2
+_FORCE_RATE_MEANS = slice(3, 9)
+_RATE_MEANS = slice(6, 9)
+_VARIANCES = slice(-6, None)
+
+
 class StopDetector:
     """
     Processes readings in pieces of any length; the result does not depend on the division.
@@ -89,14 +97,13 @@ class StopDetector:
 
     def __init__(self, noise_sd: np.ndarray):
         self._noise_sd = np.asarray(noise_sd, float)
-        self._most_variance = (MOST_SHAKE + 4 * self._noise_sd) ** 2
+        self._max_variance = (MOST_SHAKE + 4 * self._noise_sd) ** 2
         """Largest variance of the samples in a block at rest, shape (6,)."""
         self._incomplete: np.ndarray = np.zeros((0, 1))
         """Samples of the block that is not complete yet, as the argument of `push`."""
         self._blocks: list[np.ndarray] = []
         """
-        The last `N_BLOCKS` blocks: start, end, samples, means of the columns, variances of force
-        and rate; shape (3 + 6 + k + 6,) each.
+        The last `N_BLOCKS` blocks, shape (3 + 6 + k + 6,) each, with the columns above.
         """
         self._still_blocks: list[np.ndarray] = []
         """All blocks of the present stop, as `_blocks`; empty while the IMU moves."""
@@ -116,14 +123,14 @@ class StopDetector:
         rows = np.concatenate([self._incomplete, rows]) if len(self._incomplete) else rows
         while len(rows) and rows[-1, 0] - rows[0, 0] >= HEALTH_BLOCK_SECONDS:
             n = max(int(np.searchsorted(rows[:, 0], rows[0, 0] + HEALTH_BLOCK_SECONDS)), 1)
-            self._take_block(rows[:n])
+            self._add_block(rows[:n])
             rows = rows[n:]
         self._incomplete = rows
         return self._stop
 
-    def _take_block(self, rows: np.ndarray) -> None:
+    def _add_block(self, rows: np.ndarray) -> None:
         """Process the samples of one block, or restart after a gap; rows as of `push`."""
-        if self._blocks and rows[0, 0] - self._blocks[-1][1] > HEALTH_BLOCK_SECONDS:
+        if self._blocks and rows[0, 0] - self._blocks[-1][_END] > HEALTH_BLOCK_SECONDS:
             self._blocks = []
             self._still_blocks = []
         block = np.concatenate(
@@ -138,7 +145,7 @@ class StopDetector:
             self._still_blocks = []
         elif not self._still_blocks:
             self._still_blocks = list(self._blocks)  # a stop begins
-        elif block[1] - self._still_blocks[0][0] <= MAX_STOP_SECONDS:
+        elif block[_END] - self._still_blocks[0][_START] <= MAX_STOP_SECONDS:
             self._still_blocks.append(block)
         else:
             self._still_blocks = [block]  # a long rest counts as several
@@ -146,25 +153,25 @@ class StopDetector:
 
     def _is_calm(self, block: np.ndarray) -> bool:
         """Return whether rate and variances of a block, by itself, are those of a rest."""
-        rate = block[6:9]
+        rate = block[_RATE_MEANS]
         if rate @ rate >= MOST_RATE**2:
             return False
-        variance = block[-6:]
-        return bool((variance <= self._most_variance).all())
+        variance = block[_VARIANCES]
+        return bool((variance <= self._max_variance).all())
 
     def _do_blocks_agree(self) -> bool:
         """Return whether the means of the last `N_BLOCKS` blocks are equal within their noise."""
         if len(self._blocks) < N_BLOCKS:
             return False
         blocks = np.array(self._blocks)
-        n_samples = blocks[:, 2]
-        means = blocks[:, 3:9]
-        variance = blocks[:, -6:].max(axis=0)
+        n_samples = blocks[:, _N_SAMPLES]
+        means = blocks[:, _FORCE_RATE_MEANS]
+        variance = blocks[:, _VARIANCES].max(axis=0)
         # Vibration of the robot is noise for the means as well.
         sample_sd = np.maximum(self._noise_sd, np.sqrt(variance))
         allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * sample_sd / np.sqrt(n_samples.min())
         is_change_small = (np.ptp(means, axis=0) <= allowed).all()
-        return bool(is_change_small and (variance <= self._most_variance).all())
+        return bool(is_change_small and (variance <= self._max_variance).all())
 
 
 def _stop_from(blocks: np.ndarray) -> Stop:
@@ -172,12 +179,13 @@ def _stop_from(blocks: np.ndarray) -> Stop:
     half = len(blocks) // 2
     early_blocks = blocks[: half or None]  # one block is both halves
     late_blocks = blocks[half:]
-    early = np.average(early_blocks[:, 3:], axis=0, weights=early_blocks[:, 2])
-    late = np.average(late_blocks[:, 3:], axis=0, weights=late_blocks[:, 2])
+    # Means and variances over each half: (force, rate, further columns, variances).
+    early = np.average(early_blocks[:, 3:], axis=0, weights=early_blocks[:, _N_SAMPLES])
+    late = np.average(late_blocks[:, 3:], axis=0, weights=late_blocks[:, _N_SAMPLES])
     return Stop(
-        start=float(blocks[0, 0]),
-        end=float(blocks[-1, 1]),
-        n_samples=int(late_blocks[:, 2].sum()),
+        start=float(blocks[0, _START]),
+        end=float(blocks[-1, _END]),
+        n_samples=int(late_blocks[:, _N_SAMPLES].sum()),
         mean=late[:6],
         further_mean=late[6:-6],
         shake_sd=np.sqrt(late[-6:]),
@@ -208,19 +216,19 @@ class GyroBiasUpdate:
 
     def __init__(self, prior_sd: np.ndarray, time: float):
         prior = np.asarray(prior_sd, float) ** 2
-        self._time = time
+        self._correlation_time = time
         self._stop_start = float('nan')
         """Start of the last stop, which identifies it, s."""
         self.n_stops = 0
         """Number of stops."""
-        self._before = _BiasState(np.zeros(3), prior, prior, np.zeros(3))
+        self._before_stop = _BiasState(np.zeros(3), prior, prior, np.zeros(3))
         """Bias before the last stop."""
-        self._latest = self._before
+        self._latest = self._before_stop
         """Bias after the last measurement."""
 
     def predict(self, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Return (bias, its variance) at `now`, s; rad/s and its square, each shape (3,)."""
-        state = self._latest.after(now, self._time)
+        state = self._latest.after(now, self._correlation_time)
         return state.bias, state.variance
 
     def measure(self, start: float, now: float, *, rate: np.ndarray, variance: np.ndarray) -> None:
@@ -241,17 +249,17 @@ class GyroBiasUpdate:
         """
         if start != self._stop_start:
             self._stop_start = start
-            self._before = self._latest
+            self._before_stop = self._latest
             self.n_stops += 1
         rate_variance = variance + EARTH_RATE**2 / 3  # about axes that are unknown here
-        predicted = self._before.after(now, self._time)
+        predicted = self._before_stop.after(now, self._correlation_time)
 
         # The stationary variance is at least the mean square of the measured rates. The prediction
         # had a larger one too, before it was measured.
         square_sum = predicted.square_sum + rate**2
         weight = predicted.weight + 1
-        stationary = np.maximum(self._before.stationary, square_sum / weight)
-        prior = predicted.variance + np.maximum(stationary - self._before.stationary, 0)
+        stationary = np.maximum(self._before_stop.stationary, square_sum / weight)
+        prior = predicted.variance + np.maximum(stationary - self._before_stop.stationary, 0)
 
         gain = prior / (prior + rate_variance)
         self._latest = _BiasState(
@@ -379,20 +387,22 @@ class CalibrationHealth:
             noise_sds.append(np.sqrt(mat_ts**2 @ np.square(white_sd)))
             drift_variances += [float(np.max(bias_sd)) ** 2] * 3
         self.noise_sd = np.concatenate(noise_sds)
-        of_parameters = Uncertainty(calibration, transfer).at().parameters
-        self._known = of_parameters + np.diag(drift_variances)
+        parameter_covariance = Uncertainty(calibration, transfer).at().parameters
+        self._known_covariance = parameter_covariance + np.diag(drift_variances)
         """Covariance of corrected (force, rate) at rest from parameters and drift, shape (6, 6)."""
 
         # Gravity at the place of calibration differs from that here, unless it is given.
         stated = options.gravity or calibration.conditions.get('gravity')
         self._gravity = float(stated or STANDARD_GRAVITY)
-        self._place = 0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE
+        self._gravity_site_share = (
+            0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE
+        )
 
         self.update = None
         if options.update:
-            bias_sd = np.sqrt(np.diag(self._known)[3:])
+            bias_sd = np.sqrt(np.diag(self._known_covariance)[3:])
             self.update = GyroBiasUpdate(bias_sd, options.bias_time)
-        self._judged_start: float | None = None
+        self._start_of_judged: float | None = None
         """Start of the last judged stop, which identifies it, s."""
         self._last: _JudgedStop | None = None
         """The last judged stop; replaced as one object, so that another thread may read it."""
@@ -410,8 +420,8 @@ class CalibrationHealth:
         """
         if stop.seconds < MIN_STOP_SECONDS or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
             return  # too short, or a slow and steady turn
-        if self._judged_start != stop.start:
-            self._judged_start = stop.start
+        if self._start_of_judged != stop.start:
+            self._start_of_judged = stop.start
             self.n_stops += 1
         # A mean with a trend is not rest: motion that decays is an error of the mean of about its
         # change.
@@ -443,7 +453,7 @@ class CalibrationHealth:
         """
         stop = judged.stop
         bias_update = judged.bias_update
-        covariance = self._known + np.diag(judged.mean_variance)
+        covariance = self._known_covariance + np.diag(judged.mean_variance)
         rate = stop.mean[3:]
         rate_off = np.maximum(np.abs(rate) - EARTH_RATE, 0) / np.sqrt(np.diag(covariance)[3:])
         axis = int(np.argmax(rate_off))
@@ -451,7 +461,7 @@ class CalibrationHealth:
         vertical = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
         gravity_sd = float(np.sqrt(vertical @ covariance[:3, :3] @ vertical))
         gravity_error = abs(length - self._gravity)
-        force_off = max(gravity_error - self._place * self._gravity, 0) / gravity_sd
+        force_off = max(gravity_error - self._gravity_site_share * self._gravity, 0) / gravity_sd
         values = {
             'stops': judged.n_stops,
             'seconds of the last stop': f'{stop.seconds:.1f}',

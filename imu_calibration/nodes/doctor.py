@@ -154,15 +154,15 @@ class _Stream:
         for _ in BlockCleaner(watchers=[preflight]).all_of([self.gatherer.flush()]):
             pass  # the preflight reads the blocks on the way
         findings = (
-            *self._publishers(),
-            *self._listeners(),
+            *self._publisher_faults(),
+            *self._subscriber_findings(),
             *check_messages(self.heads.evidence()),
             *preflight.findings,
         )
         return StreamFindings(self.topic, self.input.source(), findings)
 
-    def _publishers(self) -> Iterator[CheckFinding]:
-        """Yield faults of the publishers: another type, several of them, silence."""
+    def _publisher_faults(self) -> Iterator[CheckFinding]:
+        """Yield faults of the publishers: another type, several of them, no messages."""
         for other in self.input.others:
             yield CheckFinding(
                 'type',
@@ -186,8 +186,12 @@ class _Stream:
                 ' driver',
             )
 
-    def _listeners(self) -> Iterator[CheckFinding]:
-        """Yield subscribers that no publisher can serve, or without one the offered QoS."""
+    def _subscriber_findings(self) -> Iterator[CheckFinding]:
+        """
+        Yield a refusal for each subscriber that a publisher cannot serve because of its QoS.
+
+        If all are served, yield whether the messages are published reliably.
+        """
         n_unserved = 0
         for listener in self.node.get_subscriptions_info_by_topic(self.topic):
             for publisher in self.input.publishers:

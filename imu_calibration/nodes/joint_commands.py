@@ -222,9 +222,9 @@ class OtherDrivers:
     def __init__(self, node: Node, command: TopicCommand | ActionCommand):
         self._node = node
         self._command = command
-        self._active: set[bytes] = set()
+        self._active_goals: set[bytes] = set()
         """Goals of all clients that the controller had accepted at its last status."""
-        self._status = node.create_subscription(
+        self._status_subscription = node.create_subscription(
             GoalStatusArray,
             f'{command.action_name}/_action/status',
             self._take,
@@ -233,14 +233,18 @@ class OtherDrivers:
 
     def _take(self, message: Any) -> None:
         """Record the active goals of a GoalStatusArray."""
-        self._active = {
+        self._active_goals = {
             bytes(goal.goal_info.goal_id.uuid)
             for goal in message.status_list
             if goal.status in _ACTIVE
         }
 
-    def found(self) -> str:
-        """Return a line that names the other driver, '' for none."""
+    def obstacle(self) -> str:
+        """
+        Return the refusal that names another node that commands the joints, '' for none.
+
+        It publishes to the topic of commands, or has a goal at the controller.
+        """
         topic = self._command.topic_name
         publishers = sorted(map(node_of, self._node.get_publishers_info_by_topic(topic)))
         own_name = self._node.get_fully_qualified_name()
@@ -252,8 +256,8 @@ class OtherDrivers:
                 ' (after a crash its name remains for half a minute)'
             )
         # The last status of a controller that has ended is not valid any more.
-        if self._active - self._command.goals and self._node.count_publishers(
-            self._status.topic_name
+        if self._active_goals - self._command.goals and self._node.count_publishers(
+            self._status_subscription.topic_name
         ):
             return (
                 f'{self._command.action_name} must have no active goal, another client has one;'

@@ -238,7 +238,7 @@ class PlannerNode(Node):
                 self._send,
                 self._stop_joints,
                 self._say,
-                self._others.found,
+                self._others.obstacle,
             ),
             lock=self._lock,
         )
@@ -514,7 +514,7 @@ class PlannerNode(Node):
                 f'{self._command.name} has no subscriber: start the controller, or remap'
                 ' joint_trajectory'
             )
-        other_driver = self._others.found()
+        other_driver = self._others.obstacle()
         if other_driver:
             return False, other_driver
         if not self._calibration_clients['solve'].service_is_ready():

@@ -166,6 +166,7 @@ class PlannerWorker(threading.Thread):
         self._wait_for_rest()
         if self.driver.state is DriveState.MEASURING:
             self._measure()
+        # The campaign may require model errors before it can choose a motion.
         decision = self._decide()
         while decision is not None and decision.diagnose:
             self.doing = Activity.DIAGNOSING
@@ -269,10 +270,18 @@ class PlannerWorker(threading.Thread):
 
 def findings_from(values: dict[str, str]) -> list[Suspect]:
     """
-    Return the model errors from the values of calibration_node's status 'diagnosis'.
+    Return the model errors that calibration_node has detected, the strongest first.
 
-    The strongest is the first. Their keys are the effect with its collinear mates, and the sizes of
-    each of these effects by parameter.
+    Each is an effect with the effects that are collinear with it, and the size of every parameter
+    of all of these.
+
+    Parameters
+    ----------
+    values : dict
+        Key -> value of the node's status 'diagnosis'. For an effect E with the collinear mates
+        M1 and M2, ``MATES_KEY + E`` -> 'M1 M2', and ``SIZE_KEY + effect.parameter`` -> size of each
+        of the three.
+
     """
     if values.get('outcome') != FOUND:
         return []
@@ -281,12 +290,19 @@ def findings_from(values: dict[str, str]) -> list[Suspect]:
         if not key.startswith(MATES_KEY):
             continue
         effect = key.removeprefix(MATES_KEY)
-        mates = value.split()
+        mates = tuple(value.split())
         sizes = {}
         for name in (effect, *mates):
-            prefix = f'{SIZE_KEY}{name}.'
-            for size_key, size in values.items():
-                if size_key.startswith(prefix):
-                    sizes[size_key.removeprefix(prefix)] = float(size)
-        suspects.append(Suspect(effect, tuple(mates), sizes))
+            sizes |= _sizes_of(name, values)
+        suspects.append(Suspect(effect, mates, sizes))
     return suspects
+
+
+def _sizes_of(effect: str, values: dict[str, str]) -> dict[str, float]:
+    """Return parameter of an effect -> its size, from the values of the status 'diagnosis'."""
+    prefix = f'{SIZE_KEY}{effect}.'
+    sizes = {}
+    for key, size in values.items():
+        if key.startswith(prefix):
+            sizes[key.removeprefix(prefix)] = float(size)
+    return sizes
