@@ -91,24 +91,25 @@ def still_parts(
 
     """
     frozen = np.logical_or(*frozen_chunks(chunks, resolution).values())
-    seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0
+    seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0  # of a chunk
     usual_rate = _at_the_usual_rate(chunks, period)
     # Rest is relative to the quietest tenth of the chunks, which frozen chunks would all be.
     live = chunks.select(~frozen)
     still = np.zeros(len(chunks), bool)
     still[~frozen] = _without_unusual(live, still_chunks(live) & usual_rate[~frozen])
+    # Without the time in which the IMU settles after a motion, and as long before one.
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
-    inner = shrunk_mask(still, margin)
+    settled = shrunk_mask(still, margin)
     parts = []
     seconds_short = 0.0
-    for first, last in runs_of(inner, np.diff(chunks.time) > BRIDGE):
+    for first, last in runs_of(settled, np.diff(chunks.time) > BRIDGE):
         part = _part(chunks, first, last)
         if part.seconds >= MIN_STILL_SECONDS:
             parts.append(part)
         else:
             seconds_short += part.seconds
     seconds_left_out = {
-        'motion': float(np.sum(~inner & usual_rate & ~frozen)) * seconds,
+        'motion': float(np.sum(~settled & usual_rate & ~frozen)) * seconds,
         'short_rests': seconds_short,
         'other_sampling_rate': float(np.sum(~usual_rate & ~frozen)) * seconds,
         'frozen_output': float(np.sum(frozen)) * seconds,
@@ -193,12 +194,12 @@ def _at_step(mean: np.ndarray, still: np.ndarray, width: int) -> np.ndarray:
         return at_step
     margin = max(width // 8, 1)
     for column in difference.T:
-        size = np.where(comparable, column, 0.0)
-        usual = 1.4826 * np.median(column[comparable])
-        if not usual > 0:
+        step_size = np.where(comparable, column, 0.0)
+        usual_size = 1.4826 * np.median(column[comparable])
+        if not usual_size > 0:
             continue
-        peaks = size > OUTLIER * usual
-        peaks &= size == maximum_filter1d(size, 2 * width + 1)
+        peaks = step_size > OUTLIER * usual_size
+        peaks &= step_size == maximum_filter1d(step_size, 2 * width + 1)
         for peak in np.flatnonzero(peaks):
             at_step[peak + width - margin : peak + width + margin] = True
     return at_step

@@ -140,19 +140,21 @@ class TrendSearch:
         # Time between blocks, s, shape (n, n).
         self._lag = blocks.time[:, None] - blocks.time[None, :]
 
-        # Covariance of the blocks by a random walk, and its mean variance about the mean block.
+        # Covariance of the blocks by a random walk, and its mean variance about the mean block, to
+        # which the variance ratios are relative.
         walk = mean_covariance(RANDOM_WALK, self._lag, blocks.seconds)
         centred = walk - walk.mean(axis=0) - walk.mean(axis=1)[:, None] + walk.mean()
         scale = float(np.trace(centred)) / len(walk)
 
-        # Unit white noise and, for each ratio, the change of a random walk since the first block:
-        # inverse factors, shape (n_ratios, n, n), and logarithms of the determinants.
+        # For each variance ratio the covariance of unit white noise and the change of a random walk
+        # since the first block: its whitening, the inverse Cholesky factor, shape (n_ratios, n, n),
+        # and the logarithm of its determinant, shape (n_ratios,).
         change = walk - walk[:1] - walk[:, :1] + walk[0, 0]
         factors = np.linalg.cholesky(
             np.eye(len(walk)) + WALK_VARIANCE_RATIOS[:, None, None] / scale * change
         )
-        self._inverses = np.linalg.inv(factors)
-        self._logs = _log_determinants(factors)
+        self._whitenings = np.linalg.inv(factors)
+        self._log_determinant_of_ratio = _log_determinants(factors)
 
     @property
     def usable(self) -> bool:
@@ -173,6 +175,7 @@ class TrendSearch:
             by_temperature = self._most_significant(axis, chosen, [TEMPERATURE_TREND])
             if by_temperature is not None:
                 chosen.append(by_temperature)
+        # Forward selection of trends with time, beside that with the temperature.
         while True:
             trend = self._most_significant(axis, chosen, [TURN_ON_TREND, RAMP_TREND])
             if trend is None:
@@ -228,23 +231,30 @@ class TrendSearch:
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """
         Return (coefficients of the trends, their sds, index of the likeliest variance ratio).
+
+        By generalised least squares for each ratio. With the covariance C, the design X of p
+        columns and the weighted sum r of squared residuals, the likeliest ratio has the least::
+
+            ln det C + ln det X' C^-1 X + (n - p) ln r
+
         """
         design = np.column_stack([self._constants, self.columns(trends)])
         target = self.blocks.mean[:, axis]
-        size = np.linalg.norm(design, axis=0)
-        basis, triangle = np.linalg.qr(self._inverses @ (design / size))
-        white = self._inverses @ target
-        along = np.einsum('rnk,rn->rk', basis, white)
+        norms = np.linalg.norm(design, axis=0)
+        basis, triangle = np.linalg.qr(self._whitenings @ (design / norms))
+        white = self._whitenings @ target
+        projected = np.einsum('rnk,rn->rk', basis, white)
         total = np.sum(white**2, axis=1)
         freedom = len(target) - design.shape[1]
         # The residual of an axis with constant readings is a rounding error.
         squares = np.maximum(
-            total - np.sum(along**2, axis=1), np.finfo(float).eps * total + np.finfo(float).tiny
+            total - np.sum(projected**2, axis=1), np.finfo(float).eps * total + np.finfo(float).tiny
         )
-        best = int(np.argmin(self._logs + _log_determinants(triangle) + freedom * np.log(squares)))
+        log_determinants = self._log_determinant_of_ratio + _log_determinants(triangle)
+        best = int(np.argmin(log_determinants + freedom * np.log(squares)))
         root = np.linalg.inv(triangle[best])
-        values = root @ along[best] / size
-        sd = np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / size
+        values = root @ projected[best] / norms
+        sd = np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / norms
         return values[-len(trends) :], sd[-len(trends) :], best
 
     def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
@@ -258,9 +268,9 @@ class TrendSearch:
             return KeptShare()
         pairs = [(trend.name, trend.time) for trend in trends]
         _, _, ratio = self.regress(axis, pairs)
-        inverse = self._inverses[ratio]
+        whitening = self._whitenings[ratio]
         design = np.column_stack([self._constants, self.columns(pairs)])
-        remaining = np.eye(len(design)) - design @ np.linalg.pinv(inverse @ design) @ inverse
+        remaining = np.eye(len(design)) - design @ np.linalg.pinv(whitening @ design) @ whitening
         # Blocks per mean, two per octave.
         counts = np.unique(
             np.rint(2.0 ** np.arange(0, np.log2(max(len(design) / 2, 1)) + 0.01, 0.5)).astype(int)
@@ -288,9 +298,9 @@ class TrendSearch:
             difference = self._differences(count)
             if len(difference):
                 detrended = difference @ remaining
-                after = np.einsum('ij,jk,ik->', detrended, covariance, detrended)
-                before = np.einsum('ij,jk,ik->', difference, covariance, difference)
-                shares[k] = after / before
+                remaining_trace = np.einsum('ij,jk,ik->', detrended, covariance, detrended)
+                trace = np.einsum('ij,jk,ik->', difference, covariance, difference)
+                shares[k] = remaining_trace / trace
         return np.clip(shares, 0.02, 1.0)
 
     def _differences(self, count: int) -> np.ndarray:

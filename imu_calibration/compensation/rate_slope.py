@@ -66,7 +66,7 @@ Seconds between the oldest and the newest reading from which the size of the der
 before the kind of the stamps is known: below the first one the noise is larger than any motion,
 above the second one the motion changes.
 """
-ROUGH = 0.02
+ROUGH_SLOPE_SECONDS = 0.02
 """
 Seconds over which the rate is compared where there is no derivative: the longest delay that a
 derivative may have.
@@ -222,7 +222,7 @@ class RateSlope:
         """Class of the stamps; None while they are too few."""
         self._stamps: deque[int] = deque(maxlen=REVIEWED_STAMPS)
         """Newest stamps in the order of arrival, ns."""
-        self._until_review = stamping.MIN_PERIOD_STEPS + 1
+        self._n_until_review = stamping.MIN_PERIOD_STEPS + 1
         """Samples until the stamps are classified again."""
         self._is_unreviewed = True
         """Whether no review has followed the last change of the derivative."""
@@ -236,7 +236,7 @@ class RateSlope:
         """Window of the derivative in use; None without one."""
         self._newest_ns: int | None = None
         """Stamp of the newest sample."""
-        self._reading: tuple = NO_SLOPE
+        self._newest_rate: tuple = NO_SLOPE
         """Rate of the newest sample, rad/s."""
         self._slope: tuple = NO_SLOPE
         """Derivative after the newest sample, rad/s^2."""
@@ -245,17 +245,17 @@ class RateSlope:
         Newest derivatives, `UNKNOWN` where the window was not full, rad/s^2; without a derivative
         the newest rates, rad/s.
         """
-        self._earlier_size: SlopeError | None = None
+        self._size_before: SlopeError | None = None
         """Size of the derivative before the last change of the stamps."""
 
         # Counted samples.
-        self._most_step_ns = 0.0
+        self._max_step_ns = 0.0
         """Longest step between stamps without a lost sample; 0: samples are not counted."""
         self._n_counted = 0
         """Number of the newest counted sample, lost samples included."""
-        self._pending: list[tuple] = []
+        self._undecided_rates: list[tuple] = []
         """Rates since a long step, which may be of lost samples or a late stamp, rad/s."""
-        self._pending_ns = 0
+        self._undecided_ns = 0
         """Time from the stamp before `_pending` to the newest one."""
 
         # Counters for the user of the derivative.
@@ -282,16 +282,16 @@ class RateSlope:
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple:
         """Return the derivative (x, y, z) after one more sample, per second."""
-        if stamp_ns == self._newest_ns and (x, y, z) == self._reading:  # the same message again
+        if stamp_ns == self._newest_ns and (x, y, z) == self._newest_rate:  # the same message again
             return self._slope
         step_ns = 0 if self._newest_ns is None else stamp_ns - self._newest_ns
         self._newest_ns = stamp_ns
-        self._reading = (x, y, z)
+        self._newest_rate = (x, y, z)
         self._stamps.append(stamp_ns)
 
         # The class of the stamps, which may change the derivative in use.
-        self._until_review -= 1
-        if not self._until_review:
+        self._n_until_review -= 1
+        if not self._n_until_review:
             self._review()
         if self.line is None and self._begins_equally():
             period_ns = (stamp_ns - self._stamps[0]) / (len(self._stamps) - 1)
@@ -307,7 +307,7 @@ class RateSlope:
             return NO_SLOPE
 
         n_used_before = self._tracker.n_used
-        if self._most_step_ns:
+        if self._max_step_ns:
             slope = self._push_counted(self._tracker, step_ns, (x, y, z))
         else:
             slope = self._tracker.push(stamp_ns, x, y, z)
@@ -374,17 +374,17 @@ class RateSlope:
         """
         is_first = self.line is None and bool(self._stamps)
         self.line = line
-        self._pending = []
+        self._undecided_rates = []
         self._n_agreeing = 0
-        self._most_step_ns = 0.0
+        self._max_step_ns = 0.0
         if line.word == COUNTED:
             scatter_ns = line.high_ns - line.low_ns
-            self._most_step_ns = scatter_ns + stamping.MAX_REGULAR_STEP * line.period_ns
+            self._max_step_ns = scatter_ns + stamping.MAX_REGULAR_STEP * line.period_ns
 
         # The same window with another time of its newest sample: the number of the counted sample,
         # or the stamp before the newest, which is not in the window yet.
         if isinstance(self._tracker, StampedDerivative) and self._is_kept_for(line):
-            if self._most_step_ns:
+            if self._max_step_ns:
                 self._tracker.rebase(round(self._n_counted * 1e9 * self._tracker.period))
             else:
                 self._tracker.rebase(self._stamps[-2])
@@ -392,9 +392,9 @@ class RateSlope:
 
         # The size of the derivative, before the past that shows it is discarded.
         if is_first:
-            self._earlier_size = self._size_at_start()
+            self._size_before = self._size_at_start()
         else:
-            self._earlier_size = self._size(np.array(self._recent).reshape(-1, 3))
+            self._size_before = self._size(np.array(self._recent).reshape(-1, 3))
 
         # A new window.
         stamps = list(self._stamps)[:-1]  # the newest sample is added by `push`
@@ -416,7 +416,7 @@ class RateSlope:
 
         # The first readings were stored before there was a derivative and fill its window. Counted
         # samples need the number of lost ones, which these stamps do not show yet.
-        if is_first and self._tracker is not None and not self._most_step_ns:
+        if is_first and self._tracker is not None and not self._max_step_ns:
             for stamp_ns, reading in zip(stamps[-len(readings) :], readings[-len(stamps) :]):
                 slope = self._tracker.push(stamp_ns, *reading)
                 self._recent.append(
@@ -436,18 +436,18 @@ class RateSlope:
         """Use the class of stamps and the recent derivatives of another RateSlope."""
         if before.line is not None:
             self.settle(before.line)
-            self._earlier_size = before._earlier_size
+            self._size_before = before._size_before
             self._recent.extend(list(before._recent))
 
     def follow(self, before: 'RateSlope') -> None:
         """Continue from the latest sample of another RateSlope, after `prepare`."""
         self._stamps = before._stamps
-        self._until_review = before._until_review
+        self._n_until_review = before._n_until_review
         self._n_counted = before._n_counted
-        self._newest_ns, self._reading = before._newest_ns, before._reading
+        self._newest_ns, self._newest_rate = before._newest_ns, before._newest_rate
         self._n_agreeing = before._n_agreeing
-        self._pending_ns = before._pending_ns
-        self._pending = before._pending
+        self._undecided_ns = before._undecided_ns
+        self._undecided_rates = before._undecided_rates
         if self._tracker is not None and isinstance(before._tracker, type(self._tracker)):
             self._tracker.seed(before._tracker)  # type: ignore[arg-type]
 
@@ -457,9 +457,9 @@ class RateSlope:
 
         The error of a delayed derivative is the change of the true one in that time, estimated a
         delay later: ``alpha(t + delay) - alpha(t)``. Without a derivative the error is its
-        size: that before the gap, or that of the rate over `ROUGH` seconds; also after a change of
-        the stamps, until there is new motion. Before any motion it is `POSSIBLE`, unless the rates
-        exclude a motion (`MotionEvidence`).
+        size: that before the gap, or that from the rate over `ROUGH_SLOPE_SECONDS`; also after a
+        change of the stamps, until there is new motion. Before any motion it is `POSSIBLE`, unless
+        the rates exclude a motion (`MotionEvidence`).
         """
         error = self._error()
         return replace(error, evidence=self._evidence())
@@ -468,7 +468,7 @@ class RateSlope:
         """Return the newest rate and its recent slopes; None without a slope to test."""
         if self._newest_ns is None:
             return None
-        rate = np.array(self._reading) - self._bias
+        rate = np.array(self._newest_rate) - self._bias
         if self.line is None:
             # The only slope is the one over all readings.
             first = self._slope_at_start()
@@ -505,8 +505,8 @@ class RateSlope:
         if self.line is None:
             return self._size_at_start()
         if self.derivative is None or self._tracker is None:
-            if len(recent) < stamping.MIN_PERIOD_STEPS and self._earlier_size is not None:
-                return self._earlier_size
+            if len(recent) < stamping.MIN_PERIOD_STEPS and self._size_before is not None:
+                return self._size_before
             return self._size(recent)
         n_used = self._tracker.n_used
         if not n_used:
@@ -578,23 +578,23 @@ class RateSlope:
 
     def _size(self, recent: np.ndarray) -> SlopeError:
         """
-        Return the size of the derivative from `_recent`, shape (n, 3).
+        Return the size of the derivative: the mean square of recent ones.
 
-        These are derivatives, or where there is none rates, whose differences over `ROUGH` seconds
-        give it.
+        `recent` are recent derivatives, shape (n, 3), `UNKNOWN` among them; without a derivative in
+        use recent rates, whose differences over `ROUGH_SLOPE_SECONDS` take its place.
         """
         if self.derivative is not None:
             slopes = _without_unknown(recent)
             if len(slopes):
                 weights = self.derivative.weights
                 return SlopeError(_mean_square(slopes), float(weights @ weights))
-            return self._earlier_size or SlopeError(POSSIBLE**2 * np.eye(3))
+            return self._size_before or SlopeError(POSSIBLE**2 * np.eye(3))
         step = np.diff(np.array(list(self._stamps)[-len(recent) :], np.int64))
         step = step[np.abs(step) <= PAUSE_NS]
         period = max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
         if len(recent) < 3 or not period:
             return SlopeError(POSSIBLE**2 * np.eye(3))
-        lag = int(min(max(round(ROUGH / period), 1), len(recent) - 2))
+        lag = int(min(max(round(ROUGH_SLOPE_SECONDS / period), 1), len(recent) - 2))
         slopes = (recent[lag:] - recent[:-lag]) / (lag * period)
         return SlopeError(_mean_square(slopes), 2.0 / (lag * period) ** 2)
 
@@ -608,21 +608,22 @@ class RateSlope:
         late. The derivative is kept until a later stamp decides; the window is restarted when half
         a window of samples has not decided, or at once where the step exceeds a window.
         """
-        self._pending_ns = step_ns + (self._pending_ns if self._pending else 0)
-        self._pending.append(reading)
-        most_ns = self._most_step_ns + 1e9 * tracker.period * (len(self._pending) - 1)
-        none_lost = -RESET_NS < step_ns and self._pending_ns <= most_ns
+        self._undecided_ns = step_ns + (self._undecided_ns if self._undecided_rates else 0)
+        self._undecided_rates.append(reading)
+        most_ns = self._max_step_ns + 1e9 * tracker.period * (len(self._undecided_rates) - 1)
+        none_lost = -RESET_NS < step_ns and self._undecided_ns <= most_ns
         if not none_lost:
-            is_within_window = self._pending_ns <= most_ns + 1e9 * tracker.period * tracker.taps
+            # A later stamp may still show that this one was late.
+            is_within_window = self._undecided_ns <= most_ns + 1e9 * tracker.period * tracker.taps
             is_undecided = step_ns > 0 and is_within_window
-            if is_undecided and 2 * len(self._pending) <= tracker.taps:
+            if is_undecided and 2 * len(self._undecided_rates) <= tracker.taps:
                 return self._slope
-            self._n_counted += tracker.taps  # a gap of a window restarts it
+            self._n_counted += tracker.taps  # numbers with a gap of a window restart the derivative
         slope = self._slope
-        for x, y, z in self._pending:
+        for x, y, z in self._undecided_rates:
             self._n_counted += 1
             slope = tracker.push(round(self._n_counted * 1e9 * tracker.period), x, y, z)
-        self._pending = []
+        self._undecided_rates = []
         return slope
 
     def _review(self) -> None:
@@ -636,10 +637,10 @@ class RateSlope:
         stamps = np.array(self._stamps, np.int64)
         last_block = stamps[-CLOCK_BLOCK - 1 :]
         if self.line is None:
-            self._until_review = stamping.MIN_PERIOD_STEPS
+            self._n_until_review = stamping.MIN_PERIOD_STEPS
             line = describe_stamps(stamps)
         else:
-            self._until_review = CLOCK_BLOCK
+            self._n_until_review = CLOCK_BLOCK
             if self.line.word == REGULAR and _has_clock_steps(last_block, self.line.period_ns):
                 return
             line = None
@@ -665,7 +666,7 @@ class RateSlope:
         self._n_agreeing = 0
         if self.line is None or line.word != self.line.word or not self._is_kept_for(line):
             self.settle(line)
-        self._until_review = CLOCK_BLOCK
+        self._n_until_review = CLOCK_BLOCK
 
     def _end_of_regular(self, stamp_ns: np.ndarray, values: np.ndarray, start: int) -> int:
         """
@@ -688,7 +689,7 @@ class RateSlope:
             stop = int(repeated[0])
 
         # A review reads the stamps of its sample and of the CLOCK_BLOCK samples before.
-        reviewed = np.arange(self._until_review - 1, stop, CLOCK_BLOCK)
+        reviewed = np.arange(self._n_until_review - 1, stop, CLOCK_BLOCK)
         first_stamp = reviewed + len(earlier) - CLOCK_BLOCK
         may_change = first_stamp < 0  # too few stamps
         indices = first_stamp[~may_change, None] + np.arange(CLOCK_BLOCK + 1)
@@ -714,9 +715,9 @@ class RateSlope:
         """
         self._stamps.extend(stamp_ns[-REVIEWED_STAMPS:].tolist())
         self._newest_ns = int(stamp_ns[-1])
-        self._reading = tuple(reading.tolist())
+        self._newest_rate = tuple(reading.tolist())
         self._slope = tuple(slopes[-1].tolist())
-        self._until_review = (self._until_review - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
+        self._n_until_review = (self._n_until_review - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
         self._recent.extend(map(tuple, recent[-(self._recent.maxlen or len(recent)) :].tolist()))
 
 

@@ -329,7 +329,8 @@ def _path_to_sensor(constants: _Constants, motion: JointMotion) -> _Path:
     A joint at rest is part of the displacement to the next moving joint, or to the sensor.
     """
     steps = []
-    # Since the last joint that moves: rotation, and offset in the frame before that rotation.
+    # Constant displacement since the last moving joint: rotation, and offset in the frame before
+    # that rotation.
     matrix = np.eye(3)
     offset = np.zeros(3)
     for link in constants.links:
@@ -522,9 +523,9 @@ def _lean(
     lean = np.zeros((3, 3, len(angle)))  # v, v', v''; coordinate; sample
     if joint.wobble:
         z = wobble_at(joint.wobble, angle, rate, acceleration=acceleration)
-        along_first = np.einsum('dn,k->dkn', z.real, step.across[0])
-        along_second = np.einsum('dn,k->dkn', z.imag, step.across[1])
-        lean += along_first + along_second
+        about_first = np.einsum('dn,k->dkn', z.real, step.across[0])
+        about_second = np.einsum('dn,k->dkn', z.imag, step.across[1])
+        lean += about_first + about_second
     if joint.sag:
         up = columns[:, UP]
         omega = columns[:, RATE]

@@ -253,7 +253,7 @@ def limits_of(table: Table) -> MotionLimits:
     upper = np.full(len(names), np.inf)
     fastest = np.full((2, len(names)), np.inf)  # speed, acceleration
     origins = [[DEFAULT_ORIGIN] * 3 for _ in names]  # of range, speed, acceleration
-    # A joint's own entry is last, so that a follower does not determine its type.
+    # A joint that is read comes after its followers, so that none of them determines its type.
     for joint in sorted(table.joints, key=lambda joint: joint.mimic is None):
         column = names.index(joint.source)
         limits = joint.limits
@@ -266,17 +266,18 @@ def limits_of(table: Table) -> MotionLimits:
             factor = joint.mimic.multiplier
             offset = joint.mimic.offset
 
-        # The smallest common range.
+        # The smallest common range. A follower with the factor 0 does not move.
         if factor and limits.lower is not None and limits.upper is not None:
-            ends = sorted(((limits.lower - offset) / factor, (limits.upper - offset) / factor))
-            if ends[0] > lower[column] or ends[1] < upper[column]:
+            # A negative factor exchanges the ends.
+            low, high = sorted(((limits.lower - offset) / factor, (limits.upper - offset) / factor))
+            if low > lower[column] or high < upper[column]:
                 origins[column][0] = _origin(joint, 'lower')
-            lower[column] = max(lower[column], ends[0])
-            upper[column] = min(upper[column], ends[1])
+            lower[column] = max(lower[column], low)
+            upper[column] = min(upper[column], high)
         elif limits.endless and joint.mimic is None and not np.isfinite(lower[column]):
             origins[column][0] = _origin(joint, 'endless')
 
-        # The lowest speed and acceleration.
+        # The lowest speed and acceleration; `origins` has them after the range.
         stated = {'speed': limits.speed, 'acceleration': limits.acceleration}
         for row, (key, value) in enumerate(stated.items()):
             if value is None or not factor:

@@ -53,9 +53,10 @@ class BandVariance:
         variance = []
         for axis, value in enumerate(force):
             for stage in range(_STAGES):
-                before = inputs[stage][axis]
+                # High pass y_k = a y_(k-1) + (1 + a) / 2 (x_k - x_(k-1)); y is the next input x.
+                input_before = inputs[stage][axis]
                 inputs[stage][axis] = value
-                value = keep * inputs[stage + 1][axis] + gain * (value - before)
+                value = keep * inputs[stage + 1][axis] + gain * (value - input_before)
             inputs[_STAGES][axis] = value
             variance.append(forget * self.now[axis] + (1.0 - forget) * value * value)
         self.now = tuple(variance)

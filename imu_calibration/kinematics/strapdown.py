@@ -96,7 +96,8 @@ def integrate_turn(
     step = np.diff(time)
     slopes = _slope_weights(time)
     vectors = _rotation_vectors(rate, step, slopes)
-    # From the end of each step k to the first sample, and to the last one.
+    # Rotations into the sensor frame at the first sample (i), and at the last one (j), from that at
+    # the end of each step k.
     mat_ik = rotations_from_quaternions(_prefix_product(vectors).T)
     mat_ji = mat_ik[-1].T.copy()
     to_last = (mat_ji @ mat_ik.transpose(1, 2, 0).reshape(3, -1)).reshape(3, 3, -1)

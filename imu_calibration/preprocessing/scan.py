@@ -274,16 +274,20 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
 
 
 def _stretches(still: np.ndarray) -> np.ndarray:
-    """Return (start, stop) of the runs of chunks at rest; of at least two chunks if there are."""
+    """
+    Return (start, stop) of each run of chunks at rest, shape (n, 2).
+
+    Runs of one chunk are left out unless all have one: a short pause of a motion is no rest.
+    """
     runs = runs_of(still)
-    long = runs[np.ptp(runs, axis=1) >= 2]
-    return long if len(long) else runs
+    long_runs_only = runs[np.ptp(runs, axis=1) >= 2]
+    return long_runs_only if len(long_runs_only) else runs
 
 
 SENSOR_COLUMNS = {'accelerometer': slice(0, 3), 'gyroscope': slice(3, 6)}
 """Sensor -> its columns in (force x, y, z, rate x, y, z)."""
-LONG = 4
-"""Chunks, one second."""
+LONG_RUN_CHUNKS = 4
+"""Chunks of a long run, at least: one second."""
 MIN_NOISE_STEPS = 2.0
 """
 A sensor with a noise at rest of at least this many converter steps in a chunk is not constant on
@@ -308,13 +312,13 @@ class FrozenPart:
 
 
 def long_runs(flags: np.ndarray) -> np.ndarray:
-    """Return (start, stop) of the runs of at least `LONG` true flags, shape (n, 2)."""
+    """Return (start, stop) of the runs of at least `LONG_RUN_CHUNKS` true flags, shape (n, 2)."""
     runs = runs_of(flags)
-    return runs[np.ptp(runs, axis=1) >= LONG]
+    return runs[np.ptp(runs, axis=1) >= LONG_RUN_CHUNKS]
 
 
 def in_long_runs(flags: np.ndarray) -> np.ndarray:
-    """Return the flags without runs of fewer than `LONG`."""
+    """Return the flags without runs of fewer than `LONG_RUN_CHUNKS`."""
     kept = np.zeros(len(flags), bool)
     for start, stop in long_runs(flags):
         kept[start:stop] = True
@@ -344,6 +348,7 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
             flags = np.zeros(len(chunks), bool)
         constant[sensor] = flags
     frozen = {sensor: in_long_runs(flags) for sensor, flags in constant.items()}
+    # The noise at rest, from chunks in which neither sensor is constant.
     rest = None
     if np.logical_or(*frozen.values()).any():
         rest = find_rest(chunks.select(~np.logical_or(*constant.values())))
@@ -431,13 +436,14 @@ def frozen_joints(
     chunk_start = chunks.time - chunks.duration / 2
     chunk_stop = chunks.time + chunks.duration / 2
     joints_rest = np.zeros(len(chunks), bool)
-    for start, stop in (still_ns - chunks.first_ns) * 1e-9:
+    for start, stop in (still_ns - chunks.first_ns) * 1e-9:  # s, as the times of the chunks
         joints_rest |= (chunk_start >= start) & (chunk_stop <= stop)
     if not joints_rest.any():
         return []
     rates = chunks.mean[:, 3:]
     usual_rate = np.median(rates[joints_rest], axis=0)
     contradicts = joints_rest & (np.linalg.norm(rates - rate_at_rest, axis=1) > MIN_TURN_RATE)
+    # Spins about the vertical are as steady as rests, and `rate_at_rest` may be that of a spin.
     contradicts_usual = joints_rest & (np.linalg.norm(rates - usual_rate, axis=1) > MIN_TURN_RATE)
     if np.count_nonzero(contradicts_usual) < np.count_nonzero(contradicts):
         contradicts = contradicts_usual
@@ -466,8 +472,8 @@ class StandingJoints:
 
     def __init__(self) -> None:
         # First and last stamp of the complete long stretches, (n, 2), and of the newest stretch.
-        self._complete = np.zeros((0, 2), np.int64)
-        self._open = np.zeros((1, 2), np.int64)
+        self._complete_stretches = np.zeros((0, 2), np.int64)
+        self._newest_stretch = np.zeros((1, 2), np.int64)
         # Positions of the last sample.
         self._last = np.zeros(0)
 
@@ -477,21 +483,22 @@ class StandingJoints:
         """
         if len(self._last) != position.shape[1]:
             self._last = np.full(position.shape[1], np.nan)  # differs from any position
-        before = np.concatenate([self._last[None], position[:-1]])
-        starts = np.flatnonzero(np.any(position != before, axis=1))
-        # A stretch ends with the stamp before the next start; `stamp_before[k]` is that of k - 1.
-        stamp_before = np.append(self._open[0, 1], stamp_ns)
-        first_ns = np.append(self._open[0, 0], stamp_ns[starts])
+        position_before = np.concatenate([self._last[None], position[:-1]])
+        starts = np.flatnonzero(np.any(position != position_before, axis=1))
+        # A stretch ends with the sample before the next start; `stamp_before[k]` is the stamp of
+        # sample k - 1.
+        stamp_before = np.append(self._newest_stretch[0, 1], stamp_ns)
+        first_ns = np.append(self._newest_stretch[0, 0], stamp_ns[starts])
         last_ns = stamp_before[np.append(starts, len(stamp_ns))]
         stretches = np.column_stack([first_ns, last_ns])
-        complete = np.concatenate([self._complete, self._long(stretches[:-1])])
-        self._complete = complete[: self.CAPACITY]
-        self._open = stretches[-1:]
+        complete = np.concatenate([self._complete_stretches, self._long(stretches[:-1])])
+        self._complete_stretches = complete[: self.CAPACITY]
+        self._newest_stretch = stretches[-1:]
         self._last = position[-1].copy()
 
     def stretches(self) -> np.ndarray:
         """Return first and last stamp of each stretch until now, shape (n, 2)."""
-        return np.concatenate([self._complete, self._long(self._open)])
+        return np.concatenate([self._complete_stretches, self._long(self._newest_stretch)])
 
     def _long(self, stretches: np.ndarray) -> np.ndarray:
         """Return the stretches of at least `LEAST_NS`."""

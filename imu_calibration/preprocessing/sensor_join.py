@@ -299,20 +299,22 @@ def _delay_within(
     cost = _DelayCost(gyroscope, time, windows)
 
     # The least residual, first among widely spaced delays, then near the best of them.
-    best, around = 0.0, reach
+    best = 0.0
+    half_range = reach
     steps = [DELAY_STEP]
     if reach > MAX_DELAY:
         steps = [WIDE_STEP, DELAY_STEP]
     for step in steps:
-        delays = best + np.arange(-around, around + step / 2, step)
+        delays = best + np.arange(-half_range, half_range + step / 2, step)
         best = delays[int(np.argmin([cost.residual(delay) for delay in delays]))]
-        around = step
+        half_range = step
     fine_delays = best + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)
     # Column 0: of all windows; column 1 + k: without part k.
     residuals = np.array([cost.residuals_without_parts(delay) for delay in fine_delays])
     total = float(np.sum(windows.change**2))
     if residuals[:, 0].min() > (1.0 - MIN_EXPLAINED) * total:
         return None
+    # Among many delays one may fit by chance; it does not predict other parts of the recording.
     if reach > MAX_DELAY and cost.prediction_error(best) > (1.0 - MIN_PREDICTED) * total:
         return None
     delay = _minimum_of_parabola(fine_delays, residuals[:, 0])
@@ -344,7 +346,7 @@ class _DelayCost:
         # Times of the gyroscope, s, and integral of its rates up to them, rad, shape (n, 3).
         self._time = time
         steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
-        self._theta = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._integral = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         self._windows = windows
 
         # Parts of the windows, in order. A sum over the windows of a part is a matrix product.
@@ -353,11 +355,11 @@ class _DelayCost:
         self._parts = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
         # Of each part: the 9 numbers of [u x].T [u x], the 3 of [u x].T change, and |change|^2.
         cross = skew(windows.middle)
-        squared = np.einsum('nij,nik->njk', cross, cross).reshape(-1, 9)
-        applied = np.einsum('nij,ni->nj', cross, windows.change)
-        self._squared = [squared[part].T for part in self._parts]
-        self._applied = [applied[part].T for part in self._parts]
-        self._observed = np.array([np.sum(windows.change[part] ** 2) for part in self._parts])
+        cross_squares = np.einsum('nij,nik->njk', cross, cross).reshape(-1, 9)
+        cross_changes = np.einsum('nij,ni->nj', cross, windows.change)
+        self._cross_squares = [cross_squares[part].T for part in self._parts]
+        self._cross_changes = [cross_changes[part].T for part in self._parts]
+        self._change_squares = np.array([np.sum(windows.change[part] ** 2) for part in self._parts])
 
     def residual(self, delay: float) -> float:
         """Return the least sum of squares of all windows."""
@@ -386,18 +388,18 @@ class _DelayCost:
         start, stop = self._windows.start, self._windows.stop
         turned = np.empty((len(start), 4))
         for axis in range(3):
-            turned[:, axis] = np.interp(stop + delay, self._time, self._theta[:, axis])
-            turned[:, axis] -= np.interp(start + delay, self._time, self._theta[:, axis])
+            turned[:, axis] = np.interp(stop + delay, self._time, self._integral[:, axis])
+            turned[:, axis] -= np.interp(start + delay, self._time, self._integral[:, axis])
         turned[:, 3] = stop - start
         products = (turned[:, :, None] * turned[:, None, :]).reshape(-1, 16)
         normal = np.empty((DELAY_PARTS, 12, 12))
         applied = np.empty((DELAY_PARTS, 12))
         for number, part in enumerate(self._parts):
             # Unknown 4 j + l is the number (j, l) of (A, b): N[(j, l), (k, m)].
-            blocks = (self._squared[number] @ products[part]).reshape(3, 3, 4, 4)
+            blocks = (self._cross_squares[number] @ products[part]).reshape(3, 3, 4, 4)
             normal[number] = blocks.transpose(0, 2, 1, 3).reshape(12, 12)
-            applied[number] = (self._applied[number] @ turned[part]).reshape(12)
-        return normal, applied, self._observed
+            applied[number] = (self._cross_changes[number] @ turned[part]).reshape(12)
+        return normal, applied, self._change_squares
 
 
 def _all_and_without_each(of_parts: np.ndarray) -> np.ndarray:

@@ -175,7 +175,11 @@ class MotionGatherer:
                 self._queue[name].append((epoch + self._epoch_shift[name], samples))
 
     def _work(self):
-        """Process the samples of this epoch; advance to the next epoch when the streams have."""
+        """
+        Return the windows that the queued samples of this epoch complete.
+
+        When the clocks of the streams were reset, also those of the next epoch.
+        """
         windows = []
         while True:
             for name in STREAMS:
@@ -244,17 +248,18 @@ class _Unwrapper:
     """Removes jumps of joint angles by full turns, sample by sample."""
 
     def __init__(self):
-        # Last position, shape (1, n_joints), and the full turns to subtract from it.
-        self._last = None
+        # Last position as read, rad, shape (1, n_joints); None before the first.
+        self._last_position = None
+        # Full turns that are subtracted from it, shape (n_joints,).
         self._turns = 0
 
     def unwrap(self, joints):
         """Return the joints without jumps of more than half a turn."""
         if not len(joints):
             return joints
-        last = joints.position[:1] if self._last is None else self._last
-        step = np.diff(np.concatenate([last, joints.position]), axis=0)
-        self._last = joints.position[-1:].copy()
+        before = joints.position[:1] if self._last_position is None else self._last_position
+        step = np.diff(np.concatenate([before, joints.position]), axis=0)
+        self._last_position = joints.position[-1:].copy()
         turns = self._turns + np.cumsum(np.rint(step / (2 * np.pi)).astype(np.int64), axis=0)
         self._turns = turns[-1]
         if not turns.any():
