@@ -88,7 +88,7 @@ class CompensationStream:
         """Largest measured rate, rad/s."""
         self._temperature_range: list[float] = []
         """Lowest and highest temperature, degrees Celsius; empty without one."""
-        self._last: dict[str, Any] = {}
+        self._last_inputs: dict[str, Any] = {}
         """Arguments of `Uncertainty.at` at the last complete sample."""
         self.measured = dict.fromkeys(SENSORS, False)
         """Sensor -> whether a finite reading of it was received."""
@@ -143,7 +143,7 @@ class CompensationStream:
         usable = np.flatnonzero(has_force & has_rate)
         if len(usable):
             k = usable[-1]
-            self._last = {
+            self._last_inputs = {
                 'force': imu.force_s[k],
                 'rate': imu.rate_s[k],
                 'derivative': slope[k],
@@ -205,7 +205,7 @@ class CompensationStream:
             force_cov = force_noise
         if rate_cov is None or not is_known(rate_cov):
             rate_cov = rate_noise
-        sensitivity = self._uncertainty.at(**self._last, slope_error=self.slope.error())
+        sensitivity = self._uncertainty.at(**self._last_inputs, slope_error=self.slope.error())
         return sensitivity.covariances(force_cov, rate_cov)
 
     def warnings(self) -> list[str]:
@@ -416,7 +416,7 @@ class SampleCompensation:
         """Temperature above the calibration's reference temperature, K; None before the first."""
         self.branch = ThermalBranch()
         self.vibration = BandVariance()
-        self._shakes = model.uses('vibration')
+        self._uses_vibration = model.uses('vibration')
         """Whether the correction uses the vibration."""
         self.at_zero = {
             sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS
@@ -427,7 +427,7 @@ class SampleCompensation:
         self.needs_slope = uses_slope(calibration, transfer)
         """Whether the correction uses the derivative of the rate."""
         # With known densities the sampling period determines the noise of a sample.
-        self._needs_stamps = self.needs_slope or self._shakes or calibration.knows_density
+        self._needs_stamps = self.needs_slope or self._uses_vibration or calibration.knows_density
         """Whether the stamps are followed."""
         self.slope = RateSlope(
             partial(derivative_for, calibration, transfer=transfer),
@@ -474,20 +474,20 @@ class SampleCompensation:
             self.counts['no temperature yet'] += 1
             return None
         total = wx + wy + wz + fx + fy + fz
-        if total - total != 0.0:
+        if total - total != 0.0:  # NaN where a reading is NaN or infinite
             self.counts['not finite'] += 1
             return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._needs_stamps else NO_SLOPE
         vibration = (
             self.vibration.push(self.slope.period or 0.0, (fx, fy, fz))
-            if self._shakes
+            if self._uses_vibration
             else NO_SLOPE
         )
         ux, uy, uz, vx, vy, vz = self._kernel(
             fx, fy, fz, wx, wy, wz, *slope, warming, self.branch.now, *vibration
         )
-        squared = vx * vx + vy * vy + vz * vz
-        if squared != squared:  # NaN
+        rate_squared = vx * vx + vy * vy + vz * vz
+        if rate_squared != rate_squared:  # NaN
             self.counts['outside the invertible range'] += 1
             return None
         self.last = (
@@ -498,8 +498,8 @@ class SampleCompensation:
             self.branch.now,
             vibration,
         )
-        if squared > self.fastest_squared:
-            self.fastest_squared = squared
+        if rate_squared > self.fastest_squared:
+            self.fastest_squared = rate_squared
         self.corrected += 1
         if self.needs_slope and self.slope.n_changes != self._n_changes:
             self._follow_slope()
@@ -518,18 +518,21 @@ class SampleCompensation:
             is used; None: the sensor is absent.
 
         """
-        of_force, of_rate = self._uncertainty.noise
-        force = _stated_covariance(force_cov, of_force)
-        rate = _stated_covariance(rate_cov, of_rate)
+        force_noise, rate_noise = self._uncertainty.noise
+        force = _stated_covariance(force_cov, force_noise)
+        rate = _stated_covariance(rate_cov, rate_noise)
         return self._sensitivity.covariances(force, rate, self.with_parameters)
 
     def refresh(self) -> None:
         """Update the covariances of the corrected readings at the latest sample."""
+        force, rate, slope, warming, branch, vibration = self.last
         self._sensitivity = self._uncertainty.at(
-            *self.last[:3],
-            warming=self.last[3],
-            branch=self.last[4],
-            vibration=self.last[5],
+            force,
+            rate,
+            slope,
+            warming=warming,
+            branch=branch,
+            vibration=vibration,
             slope_error=self.slope.error() if self.needs_slope else None,
         )
         self.revision += 1

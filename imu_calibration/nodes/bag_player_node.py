@@ -90,10 +90,7 @@ class BagPlayerNode(Node):
             note=f'from the bag {files.user_path(self.settings.bag)}',
         )
         self._players = [self._publisher(name) for name in self._topics]
-        first_ns = 0
-        for raw in self._bag.stretches(self._topics):
-            first_ns = int(raw.received_ns()[0])
-            break
+        first_ns = self._first_ns()
         pace = Pace(
             self.settings.rate,
             100.0 if self.settings.clock else 0.0,
@@ -141,6 +138,12 @@ class BagPlayerNode(Node):
                 f'{path} must be a readable rosbag2 recording, got: {" ".join(str(error).split())};'
                 ' check the path'
             ) from error
+
+    def _first_ns(self) -> int:
+        """Return the time of reception of the first message to be played, ns; 0 without one."""
+        for raw in self._bag.stretches(self._topics):
+            return int(raw.received_ns()[0])
+        return 0
 
     def _choose_topics(self) -> list[str]:
         """Return the requested topics, or all with an installed type; at least one."""

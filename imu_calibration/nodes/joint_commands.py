@@ -207,7 +207,7 @@ def make_command(
 _ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
 
 
-class OtherDrivers:
+class OtherCommanders:
     """
     Finds other publishers and action clients that command the joints.
 

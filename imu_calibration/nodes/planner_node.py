@@ -53,7 +53,7 @@ from imu_calibration.nodes.diagnostics import (
     say,
 )
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
-from imu_calibration.nodes.joint_commands import COMMANDS, OtherDrivers, make_command
+from imu_calibration.nodes.joint_commands import COMMANDS, OtherCommanders, make_command
 from imu_calibration.nodes.lifecycle import (
     HINTS,
     announce,
@@ -227,7 +227,7 @@ class PlannerNode(Node):
 
         # Commands to the joints, and the thread that selects them.
         self._command = make_command(self, settings.command, self._refused)
-        self._others = OtherDrivers(self, self._command)
+        self._other_commanders = OtherCommanders(self, self._command)
         self.worker = PlannerWorker(
             self.driver,
             self._make_campaign,
@@ -238,7 +238,7 @@ class PlannerNode(Node):
                 self._send,
                 self._stop_joints,
                 self._say,
-                self._others.obstacle,
+                self._other_commanders.obstacle,
             ),
             lock=self._lock,
         )
@@ -514,9 +514,9 @@ class PlannerNode(Node):
                 f'{self._command.name} has no subscriber: start the controller, or remap'
                 ' joint_trajectory'
             )
-        other_driver = self._others.obstacle()
-        if other_driver:
-            return False, other_driver
+        obstacle = self._other_commanders.obstacle()
+        if obstacle:
+            return False, obstacle
         if not self._calibration_clients['solve'].service_is_ready():
             return False, (
                 f'service {self._calibration_clients["solve"].srv_name} does not exist; start'

@@ -53,11 +53,11 @@ class SpikeFilter:
 
     A reading is a spike when its deviation from the cubic through the four nearest readings exceeds
     `LARGE_SDS` sds of the noise, and by far the differences of its neighbours. The cubic follows
-    motion; it must agree with the predictions from each side. Where one of the four is an outlier
-    as well, the median of the nine readings around replaces the cubic (Hampel's test). The noise is
-    estimated from medians of second differences, over the chunk of samples before or the samples
-    around; white noise exceeds 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv.
-    Signal Process. 2016:87.
+    fast motion; it must agree with the predictions from each side. Where one of the four is an
+    outlier as well, the median of the nine readings around replaces the cubic (Hampel's test). The
+    noise is estimated from medians of second differences, over the chunk of samples before or the
+    samples around; white noise exceeds 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP
+    J. Adv. Signal Process. 2016:87.
     """
 
     def __init__(self) -> None:

@@ -744,7 +744,7 @@ HAND = _of(
     (
         'vibration is not followed live',
         'SampleCompensation.correct',
-        'self._shakes',
+        'self._uses_vibration',
         'False',
         'test_signal_history_vibration.py::test_compensation_live_and_of_a_recording_take_the_rectification_out',
     ),
@@ -776,7 +776,7 @@ HAND = _of(
         '_1[1:-1] |= ...',
         'test_poses_faults.py::test_a_slow_turn_about_the_vertical_is_no_pose',
     ),
-    ('spikes stay', 'LARGE', '...', '8000000000.0', 'test_spike_filter.py'),
+    ('spikes stay', 'LARGE_SDS', '...', '8000000000.0', 'test_spike_filter.py'),
     (
         'knocks pass for spikes',
         'SHARED',

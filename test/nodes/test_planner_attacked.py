@@ -13,7 +13,7 @@ from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.qos import qos_profile_action_status_default
 from trajectory_msgs.msg import JointTrajectory
 
-from imu_calibration.nodes.joint_commands import OtherDrivers
+from imu_calibration.nodes.joint_commands import OtherCommanders
 from imu_calibration.planning.driver import DriveState
 
 from ros.planner_bench import PlannerBench
@@ -119,7 +119,7 @@ def test_a_second_publisher_of_trajectories_keeps_the_joints_from_being_driven(b
         answer = table.ask(what)
         assert not answer.success and '/tester' in answer.message, answer.message
     table.node.destroy_publisher(other)
-    table.looks(lambda: not table.planner._others.obstacle(), 'its end')
+    table.looks(lambda: not table.planner._other_commanders.obstacle(), 'its end')
     assert table.ask('next').success
 
 
@@ -132,22 +132,22 @@ def test_a_goal_of_another_client_keeps_the_joints_from_being_driven(bench):
     goal = GoalStatus(status=GoalStatus.STATUS_EXECUTING)
     goal.goal_info.goal_id.uuid = [7] * 16
     controller.publish(GoalStatusArray(status_list=[goal]))
-    table.looks(table.planner._others.obstacle, 'the status')
+    table.looks(table.planner._other_commanders.obstacle, 'the status')
     answer = table.ask('start')
     assert not answer.success and '/follow_joint_trajectory' in answer.message
     table.planner._command.goals.add(bytes([7] * 16))  # a goal of its own
-    assert not table.planner._others.obstacle()
+    assert not table.planner._other_commanders.obstacle()
     table.planner._command.goals.clear()
     goal.status = GoalStatus.STATUS_SUCCEEDED
     controller.publish(GoalStatusArray(status_list=[goal]))
-    table.looks(lambda: not table.planner._others.obstacle(), 'the end of the goal')
+    table.looks(lambda: not table.planner._other_commanders.obstacle(), 'the end of the goal')
     assert table.ask('next').success
 
 
 def test_another_driver_that_appears_later_stops_before_the_next_motion(bench, monkeypatch):
     answers = ['']  # at ~/next
     monkeypatch.setattr(
-        OtherDrivers, 'obstacle', lambda self: answers.pop() if answers else 'there is /rival'
+        OtherCommanders, 'obstacle', lambda self: answers.pop() if answers else 'there is /rival'
     )
     table = bench(first_reach=0.0)
     table.looks(lambda: table.planner.driver.position is not None, 'the joints')
