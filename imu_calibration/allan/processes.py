@@ -160,7 +160,7 @@ class ScaleCovariance:
         # the products of correlations in each step.
         self._lag = _lags(self._short, self._long, self._lengths[0][-1])
         self._step = np.diff(self._lag, axis=1)
-        weight = self._share(self._lag)
+        weight = self._pair_weight(self._lag)
         self._weight = 0.5 * (weight[:, 1:] + weight[:, :-1])
 
         # Results that are needed again.
@@ -194,7 +194,7 @@ class ScaleCovariance:
         elif other.lattice:
             of_pairs = self._sum_at_spikes(one)
         else:
-            of_pairs = self._sum(self._correlation(one), self._correlation(other))
+            of_pairs = self._sum_of_products(self._correlation(one), self._correlation(other))
 
         # Symmetric in the scales, and in the processes.
         matrix = np.zeros((len(self.factors), len(self.factors)))
@@ -216,9 +216,9 @@ class ScaleCovariance:
                 products[i, j] = self.product(one, other)
         return products
 
-    def _sum(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    def _sum_of_products(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """
-        Sum products of correlations over integer lags.
+        Return the sums of products of two correlations over all integer lags, shape (n_pairs,).
 
         Both correlations are interpolated linearly between the available lags, which is exact for
         white noise. With their values a, b and c, d at two lags that are h samples apart::
@@ -241,15 +241,16 @@ class ScaleCovariance:
             for j, at_long in enumerate(SECOND_DIFFERENCE):
                 lag = i * self._short - j * self._long
                 size = at_short * at_long / (self._short * self._long * self.period**2)
-                total += (size * self._share(lag) * self._evaluate(other, lag))[:, 0]
+                total += (size * self._pair_weight(lag) * self._evaluate(other, lag))[:, 0]
         return total
 
-    def _share(self, lag: np.ndarray) -> np.ndarray:
+    def _pair_weight(self, lag: np.ndarray) -> np.ndarray:
         """
-        Return the number of pairs of terms at distance `lag`, normalised.
+        Return the weights of lags in the covariance of two Allan variances, (n_pairs, n_lags).
 
-        The number is divided by twice the product of the numbers of terms: the covariance of two
-        Allan variances is the sum of the squared correlations of their terms with this weight.
+        It is the number of pairs of second differences at the distance `lag`, divided by twice the
+        product of their numbers: the covariance is the sum of the squared correlations of the
+        differences with this weight.
         """
         n_pairs = np.zeros_like(lag)
         n_short = np.zeros_like(self._short)
@@ -348,7 +349,7 @@ def _lags(short: np.ndarray, long: np.ndarray, length: float) -> np.ndarray:
     for k in range(3):
         parts.append(short - k * long + local)
 
-    # The number of pairs is linear between these lags; see `ScaleCovariance._share`.
+    # The number of pairs is linear between these lags; see `ScaleCovariance._pair_weight`.
     n_short = _n_terms(length, short)
     n_long = _n_terms(length, long)
     for bend in (-n_short, n_long - n_short, n_long):

@@ -302,11 +302,11 @@ class _BiasState:
         )
 
 
-LIMIT = 4.0
+MAX_ERROR_SDS = 4.0
 """Standard deviations; three axes exceed it by chance once in five thousand calibrations."""
 MIN_STOP_SECONDS = 2.0
 """Shortest stop that is tested, s."""
-WORSE = 1.5
+HARM_RATIO = 1.5
 """
 Times the error without calibration, from which a calibration does harm rather than too little.
 """
@@ -486,12 +486,12 @@ class CalibrationHealth:
 
         # Changes since the calibration, and the bias that would correct them.
         lines = []
-        if rate_off[axis] > LIMIT:
+        if rate_off[axis] > MAX_ERROR_SDS:
             lines.append(
                 f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about'
                 f' {"xyz"[axis]}, {rate_off[axis]:.0f} times its sd'
             )
-        if force_off > LIMIT:
+        if force_off > MAX_ERROR_SDS:
             lines.append(
                 f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f}'
                 ' times its sd beyond what places differ by'
@@ -513,10 +513,12 @@ class CalibrationHealth:
             )
 
         # The same errors without the calibration.
-        rate_is_worse = np.linalg.norm(rate) > WORSE * measured_rate
+        rate_is_worse = np.linalg.norm(rate) > HARM_RATIO * measured_rate
         measured_error = abs(measured_length - self._gravity)
-        force_is_worse = gravity_error > WORSE * measured_error + LIMIT * gravity_sd
-        if (rate_off[axis] > LIMIT and rate_is_worse) or (force_off > LIMIT and force_is_worse):
+        force_is_worse = gravity_error > HARM_RATIO * measured_error + MAX_ERROR_SDS * gravity_sd
+        if (rate_off[axis] > MAX_ERROR_SDS and rate_is_worse) or (
+            force_off > MAX_ERROR_SDS and force_is_worse
+        ):
             return LiveState(
                 HARMS,
                 '; '.join(lines)
@@ -524,7 +526,7 @@ class CalibrationHealth:
                 ' again',
                 values,
             )
-        if bias_update is not None and force_off <= LIMIT:
+        if bias_update is not None and force_off <= MAX_ERROR_SDS:
             return LiveState(
                 FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values
             )
@@ -536,7 +538,7 @@ class CalibrationHealth:
 
 
 SIX = tuple[float, ...]
-AS_STOPS = [0, 4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
+STOP_COLUMNS = [0, 4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
 """
 Columns of a sample for the detection of stops: time, force, rate, measured force, measured rate.
 """
@@ -599,7 +601,7 @@ class StopWatch:
         since_ns = int(samples[-1, 0])
         self._samples = []
         self._next_ns = since_ns + round(1e9 * HEALTH_BLOCK_SECONDS)
-        rows = samples[:, AS_STOPS]
+        rows = samples[:, STOP_COLUMNS]
         rows[:, 0] *= 1e-9
         stop = self._detector.push(rows)
         if stop is not None:

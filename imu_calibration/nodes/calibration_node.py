@@ -233,8 +233,8 @@ class CalibrationNode(Node):
             gravity=gravity,
             gravity_sd=gravity_sd,
         )
-        place = SessionFiles(self.settings.save_file)
-        live = self._resumed(place) if self.settings.resume else self._make_live()
+        session_files = SessionFiles(self.settings.save_file)
+        live = self._resumed(session_files) if self.settings.resume else self._make_live()
         self._gatherer = LiveGatherer(
             self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id
         )
@@ -253,7 +253,7 @@ class CalibrationNode(Node):
             self._gatherer,
             live,
             self._make_live,
-            place=place,
+            session_files=session_files,
             autosave_period=self.settings.autosave_period,
             listeners=listeners,
             hints=HINTS['calibration_node'],
@@ -268,7 +268,7 @@ class CalibrationNode(Node):
         """Time of the start, s of the steady clock."""
         self._listen(joints)
         reference = self._reference.live_words(words_of(robot, self.settings.table_file))
-        self.get_logger().info(f'calibrates {reference}; ~/save writes {place.calibration}')
+        self.get_logger().info(f'calibrates {reference}; ~/save writes {session_files.calibration}')
         self._guide = CalibrationGuide(
             self._inputs,
             f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
@@ -325,12 +325,12 @@ class CalibrationNode(Node):
         by_hand = self._session_settings[LiveByHandSettings]
         return self._reference.live(options, live, by_hand, saved=saved)
 
-    def _resumed(self, place: SessionFiles) -> LiveSession:
+    def _resumed(self, session_files: SessionFiles) -> LiveSession:
         """Return the session that continues the saved one, or a new one where that fails."""
         try:
-            live = self._make_live(place.earlier())
+            live = self._make_live(session_files.earlier())
         except ImuCalibrationError as error:
-            renamed = place.put_aside()  # a save would write over it
+            renamed = session_files.put_aside()  # a save would write over it
             say(
                 self.get_logger(),
                 LOG_ERROR,
@@ -338,7 +338,7 @@ class CalibrationNode(Node):
                 f'earlier motion is in {renamed}',
             )
             return self._make_live()
-        place.continue_earlier()
+        session_files.continue_earlier()
         line = f'no session in {place.accumulator}: a new session starts'
         if live.n_windows:
             line = f'continued with {live.n_windows} {live.observations} from {place.accumulator}'

@@ -229,7 +229,8 @@ class CalibrationWorker(threading.Thread):
     live : LiveSession
     make_live : callable
         Returns a new LiveSession, for a reset.
-    place : SessionFiles
+    session_files : SessionFiles
+        Where calibration and accumulator are saved.
     autosave_period : float
         Interval at which the accumulator is saved, s; 0: on request only.
     listeners : Listeners
@@ -246,7 +247,7 @@ class CalibrationWorker(threading.Thread):
         live: LiveSession,
         make_live: Callable[[], LiveSession],
         *,
-        place: SessionFiles,
+        session_files: SessionFiles,
         autosave_period: float,
         listeners: Listeners,
         hints: dict[str, str] | None = None,
@@ -256,7 +257,7 @@ class CalibrationWorker(threading.Thread):
         self.gatherer = gatherer
         self.live = live
         self.make_live = make_live
-        self.place = place
+        self.session_files = session_files
         self.autosave_period = autosave_period
         self.listeners = listeners
         self.hints = hints or {}
@@ -284,9 +285,9 @@ class CalibrationWorker(threading.Thread):
         """State of the last picture of the coverage (see `_cover`)."""
         self._trouble = ''
         """Why the last attempt of a solution failed; '' otherwise."""
-        self.place.note_saved(self.live.n_windows)
-        self._faults: dict[str, str] = {'place': self.place.try_place()}
-        """Step, 'solution' or 'place' -> its present fault, '' without one."""
+        self.session_files.note_saved(self.live.n_windows)
+        self._faults: dict[str, str] = {'place': self.session_files.try_place()}
+        """Step, 'solution' or 'place' (of the files) -> its present fault, '' without one."""
         self.state = WorkerState(groups=self.live.groups())
         """State for the diagnostics, which another thread reads."""
 
@@ -325,7 +326,7 @@ class CalibrationWorker(threading.Thread):
             self.join(timeout)
         if self.is_alive():
             return f'a solution was still being made: {self.gathered} since the last save are lost'
-        return self.place.keep(self.live, self.gathered)
+        return self.session_files.keep(self.live, self.gathered)
 
     def run(self) -> None:
         """Run the steps until `end`."""
@@ -495,18 +496,18 @@ class CalibrationWorker(threading.Thread):
             outcome = f'no calibration yet: {error.with_hint(self.hints)}'
         if text is None and not self.live.n_windows:
             return False, f'{outcome}; no file was written'
-        is_saved, written = self.place.save(self.live, text)
+        is_saved, written = self.session_files.save(self.live, text)
         self._faults['place'] = '' if is_saved else written
         return is_saved and text is not None, f'{outcome}; {written}'
 
     def _reset(self) -> tuple[bool, str]:
         """Begin a new session; return (success, message)."""
-        n_lost = self.place.unsaved(self.live)
+        n_lost = self.session_files.unsaved(self.live)
         self.live = self.make_live()
         self._new_windows = False
         self._includes_pending = True
         self._n_diagnosed = 0
-        self.place.note_saved(0)
+        self.session_files.note_saved(0)
         self._trouble = ''
         self._diagnosis.forget()
         message = 'restarted; '
@@ -527,7 +528,7 @@ class CalibrationWorker(threading.Thread):
 
     def _autosave(self) -> None:
         """Save the accumulator when that is due."""
-        if self.place.autosave(self.live, self.autosave_period):
+        if self.session_files.autosave(self.live, self.autosave_period):
             self._faults['place'] = ''
 
     def _tell(self) -> None:
@@ -549,8 +550,8 @@ class CalibrationWorker(threading.Thread):
         values = {
             self.gathered: self.live.n_windows,
             'solutions': self._n_solutions,
-            'saves to': str(self.place.calibration),
-            f'{self.gathered} in no file yet': self.place.unsaved(self.live),
+            'saves to': str(self.session_files.calibration),
+            f'{self.gathered} in no file yet': self.session_files.unsaved(self.live),
             'process': os.getpid(),
             **counts,
         }

@@ -34,31 +34,31 @@ class SensorPresence:
         self.n_late = 0
         """Samples with a reading of the absent sensor, which is not used."""
         # Whether it is known which sensors exist, and the samples that were received before.
-        self._decided = False
-        self._first: ImuSamples | None = None
+        self._is_decided = False
+        self._buffered: ImuSamples | None = None
 
     def push(self, samples: ImuSamples) -> ImuSamples:
         """Return the samples that can be processed, none while it is not known which exist."""
-        if self._decided:
+        if self._is_decided:
             return self._without_absent(samples)
-        if self._first is not None:
-            samples = ImuSamples.concatenate([self._first, samples])
+        if self._buffered is not None:
+            samples = ImuSamples.concatenate([self._buffered, samples])
         missing = missing_sensors(samples.select(slice(MIN_ABSENT_SAMPLES)))
         if missing and len(samples) < MIN_ABSENT_SAMPLES:
-            self._first = samples
+            self._buffered = samples
             return samples.select(slice(0))
         return self._decide(missing, samples)
 
     def finish(self) -> ImuSamples | None:
         """Return the buffered samples, or None."""
-        if self._first is None:
+        if self._buffered is None:
             return None
-        return self._decide(missing_sensors(self._first), self._first)
+        return self._decide(missing_sensors(self._buffered), self._buffered)
 
     def _decide(self, missing: tuple[str, ...], samples: ImuSamples) -> ImuSamples:
         """Decide by the sensors that are missing in the first samples, and return these."""
-        self._decided = True
-        self._first = None
+        self._is_decided = True
+        self._buffered = None
         # Without a reading of either sensor the samples are not finite, and none is absent.
         if len(missing) == 1:
             self.absent = missing

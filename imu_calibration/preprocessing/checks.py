@@ -94,6 +94,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 sensor=sensor,
             )
             continue
+        # An axis without any change is a fault if another one has noise: the steps are fine enough.
         for axis in np.flatnonzero(constant):
             if has_noise.any():
                 yield CheckFinding(
@@ -103,6 +104,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                     ' the remaining axes do; check the sensor and its driver',
                     sensor=sensor,
                 )
+        # An axis that is constant for a time only.
         for axis in np.flatnonzero(~constant):
             stuck = evidence.stuck[:, part][:, axis]
             if stuck.any():
@@ -124,14 +126,14 @@ def without_readings(evidence: RecordingEvidence) -> np.ndarray:
     the cleaned samples; one chunk on both sides is included, because its readings may be mixed.
     """
     chunks = evidence.chunks
-    flags = np.logical_or(*evidence.frozen.values())
-    flags |= evidence.stuck[:, evidence.n_changed > 0].any(axis=1)
+    is_unusable = np.logical_or(*evidence.frozen.values())
+    is_unusable |= evidence.stuck[:, evidence.n_changed > 0].any(axis=1)
     for part in evidence.frozen_parts:
         half = 0.5 * chunks.duration
-        flags |= (chunks.time - half >= part.start) & (chunks.time + half <= part.stop)
-    if not len(flags):
+        is_unusable |= (chunks.time - half >= part.start) & (chunks.time + half <= part.stop)
+    if not len(is_unusable):
         return NO_RANGES
-    runs = runs_of(any_within(flags, 1, 1))
+    runs = runs_of(any_within(is_unusable, 1, 1))
     ranges = runs * chunks.size
     # The samples after the last full chunk are those of the last one.
     ranges[runs[:, 1] == len(chunks), 1] = evidence.n_samples

@@ -81,13 +81,13 @@ class OverflowSearch:
         # Sum of the sizes of all overflows, which is added to later stamps.
         self._shift_ns = 0
         # Last returned stamp, and the first steps forward, up to `PERIOD_STEPS`, ns.
-        self._last: int | None = None
+        self._last_ns: int | None = None
         self._first_steps = np.zeros(0, np.int64)
 
     def removed(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return the next stamps without overflows, ns, shape (n,)."""
         stamps = stamp_ns + self._shift_ns
-        first = stamps[0] if self._last is None else self._last
+        first = stamps[0] if self._last_ns is None else self._last_ns
         steps = np.diff(stamps, prepend=first)
 
         # The period from the first steps forward of the stream.
@@ -110,7 +110,7 @@ class OverflowSearch:
                 self._shift_ns += size
                 self.count += 1
                 self.size_ns = size
-        self._last = int(stamps[-1])
+        self._last_ns = int(stamps[-1])
         return stamps
 
 
@@ -163,6 +163,7 @@ def without_overflows(
     back = np.flatnonzero(steps < -LEAST_STEP_NS)
     if not len(forward) or len(back) < LEAST_EQUAL_STEPS:
         return CounterStamps(stamps, search.count, search.size_ns)
+    # A step back is the period less the size of the counter.
     period = np.median(forward)
     sizes = period - steps[back]
     size = np.median(sizes)

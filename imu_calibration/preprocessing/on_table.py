@@ -372,6 +372,7 @@ def same_motion(sums: ProductSums, windows: list[Window], table: Table) -> Check
     # Other checks report units, signs and axes.
     if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:
         return a_period_late(windows, table) if explained < 1.0 - SHARE_TIE else None
+    # An IMU that rests, that is late or that moves otherwise.
     key = 'imu_topic'
     cause = 'this IMU does not turn when the table does; give the topic of the IMU on the table'
     if np.trace(sums.measured) > MIN_RATE_GAIN * np.trace(sums.reference):

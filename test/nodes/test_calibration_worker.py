@@ -34,7 +34,7 @@ def station(tmp_path, monkeypatch):
         gatherer,
         live,
         lambda: live,
-        place=SessionFiles(str(tmp_path / 'calibration.yaml')),
+        session_files=SessionFiles(str(tmp_path / 'calibration.yaml')),
         autosave_period=0.0,
         listeners=Listeners(lambda text: None, lambda residuals: None),
         provenance={'serial': 'A-17'},
