@@ -311,18 +311,20 @@ def _chain(robot: Any, link: str) -> tuple[list[Joint], _Placement]:
             key='imu_link',
             code='link_unknown',
         )
-    on_the_way = []
+    # From the link inwards; the root has no parent.
+    joints_to_root = []
     while link in robot.parent_map:
         name, link = robot.parent_map[link]
-        on_the_way.append(robot.joint_map[name])
-        if len(on_the_way) > len(robot.joint_map):
+        joints_to_root.append(robot.joint_map[name])
+        if len(joints_to_root) > len(robot.joint_map):
             raise InputError(
                 f"the links of a robot description must form a tree, those around '{link}' form a"
                 ' circle; correct it'
             )
+    # Outwards again.
     joints = []
     placement = _Placement(np.zeros(3), np.eye(3))  # since the last moving joint
-    for joint in reversed(on_the_way):
+    for joint in reversed(joints_to_root):
         placement = placement.then(*_origin(joint))
         if joint.type == 'fixed':
             continue
@@ -344,9 +346,9 @@ def _chain(robot: Any, link: str) -> tuple[list[Joint], _Placement]:
         placement = _Placement(np.zeros(3), np.eye(3))
     if not joints:
         raise InputError(
-            f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least"
-            f" one joint, it is fixed to the root '{link}'; name the link that carries the IMU, or"
-            ' calibrate by hand'
+            f"the link '{joints_to_root[0].child if joints_to_root else link}' must be moved by at"
+            f" least one joint, it is fixed to the root '{link}'; name the link that carries the"
+            ' IMU, or calibrate by hand'
         )
     return joints, placement
 

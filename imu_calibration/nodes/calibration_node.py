@@ -339,9 +339,10 @@ class CalibrationNode(Node):
             )
             return self._make_live()
         session_files.continue_earlier()
-        line = f'no session in {place.accumulator}: a new session starts'
+        line = f'no session in {session_files.accumulator}: a new session starts'
         if live.n_windows:
-            line = f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
+            gathered = f'{live.n_windows} {live.observations}'
+            line = f'continued with {gathered} from {session_files.accumulator}'
         self.get_logger().info(line)
         return live
 

@@ -163,7 +163,7 @@ class CalibrationGuide:
         self._logged_stamping = line.word
 
     def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        """Yield a line on other decisions than in the last one."""
+        """Yield a line when the decisions on the sensors, or their completeness, have changed."""
         verdict = state.judged
         if state.complete:
             verdict += ', every parameter is determined'
@@ -179,7 +179,11 @@ class CalibrationGuide:
             )
 
     def _next(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        """Yield a line on another useful motion, not more often than `MIN_ADVICE_SECONDS`."""
+        """
+        Yield a line when the most useful next motion has changed.
+
+        Not more often than each `MIN_ADVICE_SECONDS`.
+        """
         advice = advice_of(state)
         if not advice or advice == self._logged_advice or state.complete:
             return
@@ -189,7 +193,7 @@ class CalibrationGuide:
             yield LOG_INFO, f'next: {advice}'
 
     def _diagnosis(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        """Yield a line on another outcome of the diagnosis."""
+        """Yield a line when the outcome of the diagnosis has changed."""
         outcome = state.diagnosis
         if outcome is None or outcome.word in (diagnosis.WAITING, diagnosis.OFF):
             return
@@ -242,6 +246,8 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
                 values=state.streams.values,
             )
         )
+
+    # The decisions, then their reasons, at most three, and faults.
     parts = [state.judged or state.verdict or 'waiting for motion', *state.lines[:3]]
     if state.trouble:
         parts.append(state.trouble)

@@ -70,8 +70,8 @@ class StreamCheck:
         """Whether an IMU stream holds the readings of two sensors."""
         self.epoch = 0
         """Number of clock resets so far."""
-        # Sensors that are missing in all pieces with samples that are not finite.
-        self._unread = set(SENSORS)
+        # Sensors without a finite reading in any piece that has samples which are not finite.
+        self._never_read = set(SENSORS)
 
         # Statistics of the accepted samples: their number, the time from the first to the last one
         # summed over the epochs, the smallest and the largest stamp.
@@ -82,7 +82,7 @@ class StreamCheck:
         self._last_ns = -NEVER_NS
 
         # Stray stamps: the newest sample, while it may be one, and the stamp before it.
-        self._undecided: Any = None
+        self._possible_stray: Any = None
         self._stamp_before_ns: int | None = None
         # Largest stamp of this epoch as recorded, and after the times were computed.
         self._newest_recorded_ns: int | None = None
@@ -139,9 +139,9 @@ class StreamCheck:
             accepted += self._checked(buffered)
         self._count('zero', self._zeros.finish())
         last = []
-        if self._undecided is not None:
-            last += self._accept(self._undecided)
-            self._undecided = None
+        if self._possible_stray is not None:
+            last += self._accept(self._possible_stray)
+            self._possible_stray = None
         last += self._end_epoch()
         return accepted + self._without_spikes(last, ended=True)
 
@@ -180,9 +180,9 @@ class StreamCheck:
         """Return the sensor without any reading; an accepted sample has readings of both."""
         if self.presence is not None:
             return self.presence.absent
-        if self._n_accepted or len(self._unread) == len(SENSORS):
+        if self._n_accepted or len(self._never_read) == len(SENSORS):
             return ()
-        return tuple(self._unread)
+        return tuple(self._never_read)
 
     def _without_spikes(
         self, accepted: list[tuple[int, Any]], ended: bool = False
@@ -219,20 +219,20 @@ class StreamCheck:
             return samples
         finite = np.logical_and.reduce([np.isfinite(column).all(axis=1) for column in columns])
         if isinstance(samples, ImuSamples):
-            self._unread.intersection_update(missing_sensors(samples))
+            self._never_read.intersection_update(missing_sensors(samples))
         self._count('not finite', len(finite) - np.count_nonzero(finite))
         return samples.select(finite)
 
     def _without_strays(self, samples: Any) -> Any:
         """
-        Return samples without stray stamps, which are far from both neighbours.
+        Return samples without stray stamps: single ones that are more than a second off.
 
-        The neighbours are closer to each other than to the stray; after a reset of the clock they
-        are not. A last sample far from the one before is buffered until the next one is received.
+        After a reset of the clock the neighbours are not close to each other. A last sample far
+        from the one before is buffered until the next one is received.
         """
-        if self._undecided is not None:
-            samples = type(samples).concatenate([self._undecided, samples])
-            self._undecided = None
+        if self._possible_stray is not None:
+            samples = type(samples).concatenate([self._possible_stray, samples])
+            self._possible_stray = None
         if not len(samples):
             return samples
         stamps = samples.stamp_ns
@@ -243,6 +243,7 @@ class StreamCheck:
         is_far = size > BACKWARD_RESET_NS
         step_of_neighbours = np.abs(step[:-1] + step[1:])
 
+        # A stray is far from both neighbours, which are closer to each other.
         stray = np.zeros(len(stamps), bool)
         stray[1:-1] = is_far[:-1] & is_far[1:]
         stray[1:-1] &= step_of_neighbours < np.minimum(size[:-1], size[1:])
@@ -252,9 +253,10 @@ class StreamCheck:
             # The first sample of the stream has one neighbour only.
             stray[0] = _is_reset(step[0])
 
+        # The last sample has no later neighbour yet.
         if not len(step) or is_far[-1]:
             n_decided = len(samples) - 1
-            self._undecided = samples.select(slice(n_decided, None))
+            self._possible_stray = samples.select(slice(n_decided, None))
             samples = samples.select(slice(0, n_decided))
             stray = stray[:-1]
         if len(samples):
@@ -647,8 +649,8 @@ class BlockCleaner:
         self._watchers = watchers
         self._checks = {name: StreamCheck(one_sensor=one_sensor) for name in STREAMS}
         # Samples that are not cleaned yet, and (epoch, samples) that are not returned yet.
-        self._raw: dict[str, list] = {name: [] for name in STREAMS}
-        self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
+        self._collected: dict[str, list] = {name: [] for name in STREAMS}
+        self._cleaned: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
         self.lost: Counter[str] = Counter()
         """Messages that could not be converted to samples: reason -> count."""
         self.notes: Counter[str] = Counter()
@@ -664,8 +666,8 @@ class BlockCleaner:
         """Number of samples that were added and not returned."""
         n_buffered = 0
         for stream in STREAMS:
-            n_buffered += sum(len(part) for _, part in self._ready[stream])
-            n_buffered += sum(len(part) for part in self._raw[stream])
+            n_buffered += sum(len(part) for _, part in self._cleaned[stream])
+            n_buffered += sum(len(part) for part in self._collected[stream])
         return n_buffered
 
     @property
@@ -726,7 +728,7 @@ class BlockCleaner:
                     samples = self._nominal.apply(samples)
                 if name == 'joints':
                     samples = self._in_requested_order(samples)
-                self._raw[name].append(samples)
+                self._collected[name].append(samples)
         if self.n_buffered < CLEANING_BATCH:
             return CleanedBlock()
         self._clean()
@@ -736,7 +738,7 @@ class BlockCleaner:
         """Return the buffered samples; no block may be added after this."""
         self._clean()
         for name, check in self._checks.items():
-            self._ready[name] += check.finish()
+            self._cleaned[name] += check.finish()
         cleaned = self._take_ready()
         for watcher in self._watchers:
             watcher.finish(self)
@@ -750,21 +752,21 @@ class BlockCleaner:
 
     def _clean(self) -> None:
         """Clean the samples that were collected."""
-        for name, parts in self._raw.items():
+        for name, parts in self._collected.items():
             if parts:
                 samples = parts[0]
                 if len(parts) > 1:
                     samples = _SAMPLE_TYPES[name].concatenate(parts)
-                self._ready[name] += self._checks[name].push(samples)
-                self._raw[name] = []
+                self._cleaned[name] += self._checks[name].push(samples)
+                self._collected[name] = []
 
     def _take_ready(self) -> CleanedBlock:
         """Return the cleaned samples, without those to leave out, and pass them to the watchers."""
         filled = {}
-        for name, parts in self._ready.items():
+        for name, parts in self._cleaned.items():
             filled[name] = [(epoch, part) for epoch, part in parts if len(part)]
         cleaned = CleanedBlock(**filled)
-        self._ready = {name: [] for name in STREAMS}
+        self._cleaned = {name: [] for name in STREAMS}
         if len(self._without):
             cleaned = replace(cleaned, imu=self._without_ranges(cleaned.imu))
         for sensor in self._unusable:
