@@ -256,7 +256,7 @@ class RateSlope:
         self._undecided_rates: list[tuple] = []
         """Rates since a long step, which may be of lost samples or a late stamp, rad/s."""
         self._undecided_ns = 0
-        """Time from the stamp before `_pending` to the newest one."""
+        """Time from the stamp before these rates to the newest one."""
 
         # Counters for the user of the derivative.
         self.restarts = 0
