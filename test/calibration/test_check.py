@@ -1,6 +1,7 @@
 """``imu_calibration check``: does this file help on that recording, on a table and by hand?"""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -49,6 +50,16 @@ class Case:
         """Return what the check says of a session."""
         return check_recording(block, self.calibration, **{**self.choices, **choices})
 
+    @cached_property
+    def of_first(self):
+        """What the check says of the session of the calibration."""
+        return self.checked(self.first)
+
+    @cached_property
+    def of_second(self):
+        """What the check says of another session."""
+        return self.checked(self.second)
+
 
 @pytest.fixture(scope='module')
 def on_table():
@@ -94,7 +105,7 @@ def case(request):
 
 
 def test_a_good_file_helps_in_another_session_of_its_imu(case):
-    found = case.checked(case.second)
+    found = case.of_second
     assert found.helps and found.exit_code == 0
     assert all(
         part.after < 0.6 * part.before
@@ -134,8 +145,8 @@ def test_the_verb_prints_errors_and_answers_with_its_exit_code(capsys, tmp_path,
 
 
 def test_the_recording_that_a_file_was_made_from_is_noticed(on_table):
-    assert on_table.checked(on_table.first).notes
-    assert not on_table.checked(on_table.second).notes
+    assert on_table.of_first.notes
+    assert not on_table.of_second.notes
 
 
 def test_a_sensor_without_readings_is_unproven_and_a_3(on_table):
@@ -180,7 +191,7 @@ def test_an_earlier_calibration_is_proven_beside_a_new_one(on_table):
 
 
 def test_by_hand_the_errors_are_those_at_rest_and_of_turns(by_hand):
-    found = by_hand.checked(by_hand.second)
+    found = by_hand.of_second
     accelerometer, gyroscope = found.proof['accelerometer'], found.proof['gyroscope']
     # Scatter of the poses 2 mm/s^2, biases 0.2 m/s^2.
     assert accelerometer.after < 0.01 < 0.05 < accelerometer.before
@@ -196,7 +207,8 @@ def test_turns_alone_tell_a_wrong_scale_of_the_gyroscope(by_hand):
     second, bias = by_hand.second.imu, by_hand.calibration.value('gyroscope', 'bias')
     wrong = replace(second, rate_s=bias + 1.05 * (second.rate_s - bias))
     right, found = (
-        by_hand.checked(SampleBlock(imu)).proof['gyroscope'].regimes for imu in (second, wrong)
+        checked.proof['gyroscope'].regimes
+        for checked in (by_hand.of_second, by_hand.checked(SampleBlock(wrong)))
     )
     assert (
         found['rest'].after == pytest.approx(right['rest'].after, rel=0.1)
@@ -207,14 +219,12 @@ def test_turns_alone_tell_a_wrong_scale_of_the_gyroscope(by_hand):
 def test_the_gravity_of_the_calibration_is_taken_and_said(by_hand):
     found = check_recording(by_hand.second, by_hand.calibration)
     assert found.helps and any('9.81 m/s^2' in note for note in found.notes)
-    stated = by_hand.checked(by_hand.second)
-    assert not any('9.81 m/s^2' in note for note in stated.notes)
+    assert not any('9.81 m/s^2' in note for note in by_hand.of_second.notes)
 
 
 def test_check_gives_3_when_the_error_by_hand_has_changed(by_hand):
     """A gravity that is wrong by 0.05 m/s^2 leaves that error at rest, and turns as they are."""
-    for recording in (by_hand.first, by_hand.second):
-        same = by_hand.checked(recording)
+    for same in (by_hand.of_first, by_hand.of_second):
         assert same.exit_code == 0 and not same.changed
         kinds = {(each.sensor, each.regime) for each in same.changes}
         assert kinds == {('accelerometer', 'rest'), ('gyroscope', 'turns')}
