@@ -33,7 +33,7 @@ FEW = (
     'accel_quadratic+accel_bias_drift+gyro_g_sensitivity+gyro_bandwidth+gyro_bias_drift+'
     'gyro_bias_trend+time_offset'
 )
-
+DRIFTS = 'accel_bias_drift+gyro_g_sensitivity+gyro_bias_drift+gyro_bias_trend'
 FORMULA = CATALOGUE.with_effects(
     term(
         'warm_force',
@@ -47,8 +47,10 @@ FORMULA = CATALOGUE.with_effects(
 )
 SESSIONS = {
     'findings': {'effects': ['accel_quadratic', 'gyro_g_sensitivity', 'gyro_bias_drift']},
-    'thermal': {'effects': ['accel_thermal_bias', 'gyro_thermal_scale']},
-    'formula': {'effects': ['warm_force'], 'catalogue': FORMULA},
+    'temperature': {
+        'effects': ['accel_thermal_bias', 'gyro_thermal_scale', 'warm_force'],
+        'catalogue': FORMULA,
+    },
 }
 RATES = {'imu_rate': 50.0, 'joint_rate': 50.0}
 
@@ -162,7 +164,7 @@ def drifting(size=0.5 * DEG, time_constant=35.0):
 
 def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third():
     samples, table, at_end, at_start, duration = drifting()
-    calibration = imu.calibrate(samples, table, candidates=FEW).calibration
+    calibration = imu.calibrate(samples, table, candidates=DRIFTS).calibration
     bias, sd = (
         calibration.value('gyroscope', 'bias'),
         calibration.sd[calibration.model.slices['gyroscope', 'bias']],
@@ -206,7 +208,7 @@ def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_w
 ):
     """Its value at the end holds neither afterwards nor in a session that repeats it."""
     samples, table, at_end, at_start, duration = drifting(size, time_constant)
-    calibration = imu.calibrate(samples, table, candidates=FEW).calibration
+    calibration = imu.calibrate(samples, table, candidates=DRIFTS).calibration
     (entry,) = calibration.statistics['uncorrected']
     assert (entry['effect'], entry['applied']) == (name, MEAN)
     time = np.linspace(0.0, duration, 1000)
@@ -347,7 +349,7 @@ def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
     time = 1e-9 * (samples.stamp_ns - samples.stamp_ns[0])
     course = -1.0 * DEG * np.expm1(-time / (0.3 * time[-1]))
     moved = SampleBlock(replace(samples, rate_s=samples.rate_s + course[:, None]))
-    calibration = imu.calibrate(moved, gravity=GRAVITY, candidates=FEW).calibration
+    calibration = imu.calibrate(moved, gravity=GRAVITY, candidates=DRIFTS).calibration
     step = calibration.value('gyroscope', 'bias') - truth[9:12]
     np.testing.assert_allclose(step, course[-1], atol=0.05 * DEG)
     # Its columns are taken at a point, not at its prior.
