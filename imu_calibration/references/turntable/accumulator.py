@@ -308,17 +308,18 @@ def _with_mean_rows_only(window: WindowStatistics) -> WindowStatistics:
 
 def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.ndarray]:
     """
-    Return the indices by which rows of the model `wide` become rows of the model `narrow`.
+    Return sensor -> indices of the columns of a wide model that a narrow model has too.
 
-    Sensor -> indices into ``[columns of wide | output]``: the columns of the groups of `narrow`,
-    then the three outputs.
+    A row of the wide model is ``[columns of its groups | three outputs]``. The indices are those of
+    the groups of `narrow`, in its order, then the last three.
     """
     chosen = {}
     for sensor in SENSORS:
-        slices = wide.layout(sensor).rows
+        columns_of_group = wide.layout(sensor).rows  # name of a group -> slice of the columns
         indices = []
         for name, _ in narrow.groups(sensor):
-            indices.append(np.arange(slices[name].start, slices[name].stop))
+            columns = columns_of_group[name]
+            indices.append(np.arange(columns.start, columns.stop))
         chosen[sensor] = np.concatenate([*indices, [-3, -2, -1]])
     return chosen
 

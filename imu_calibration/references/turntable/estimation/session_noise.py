@@ -174,35 +174,43 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
     """
     gram = products[:, :-1, :-1]
     gradient = products[:, :-1, -1]
-    scale = _scales(np.einsum('kii->ki', gram))
+    scale = _unit_length_scales(np.einsum('kii->ki', gram))
     eigenvalues, vectors = np.linalg.eigh(gram * scale[:, :, None] * scale[:, None, :])
-    along = np.einsum('kij,ki->kj', vectors, gradient * scale)
+    along_vectors = np.einsum('kij,ki->kj', vectors, gradient * scale)
     strong = eigenvalues > DESIGN_EIGENVALUE_SHARE * eigenvalues[:, -1:]
-    squares = along**2 * strong / np.where(strong, eigenvalues, 1.0)
+    squares = along_vectors**2 * strong / np.where(strong, eigenvalues, 1.0)
     return float(squares.sum()), int(strong.sum())
 
 
 def least_misfit(products: np.ndarray) -> tuple[float, int]:
     """
-    Return the residual sum of squares of the best fit from products of ``[design | output]``.
+    Return the residual sum of squares of a least-squares fit, and the rank of its design.
 
-    Shape (q + 1, q + 1), and the rank.
+    For output y and design A with the eigenvectors v_j and eigenvalues l_j of A'A, columns scaled
+    to unit length: ``y'y - sum_j (v_j' A'y)^2 / l_j``, over the l_j above rounding.
+
+    Parameters
+    ----------
+    products : array, shape (q + 1, q + 1)
+        Products of ``[design | output]``.
+
     """
-    scale = np.append(_scales(np.diag(products)[:-1]), 1 / np.sqrt(max(products[-1, -1], 1e-300)))
+    output_scale = 1 / np.sqrt(max(products[-1, -1], 1e-300))
+    scale = np.append(_unit_length_scales(np.diag(products)[:-1]), output_scale)
     scaled = products * np.outer(scale, scale)
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
-    seen = eigenvalues > RESIDUAL_EIGENVALUE_SHARE * max(eigenvalues[-1], 1e-300)
-    along = (vectors.T @ scaled[:-1, -1])[seen]
-    # |output|^2 less the part along the design, in the scale of the output.
-    remaining = max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0)
-    return remaining / scale[-1] ** 2, int(seen.sum())
+    above_rounding = eigenvalues > RESIDUAL_EIGENVALUE_SHARE * max(eigenvalues[-1], 1e-300)
+    along_vectors = (vectors.T @ scaled[:-1, -1])[above_rounding]
+    explained = (along_vectors**2 / eigenvalues[above_rounding]).sum()
+    residual = max(scaled[-1, -1] - explained, 0.0)
+    return residual / output_scale**2, int(above_rounding.sum())
 
 
-def _scales(squares: np.ndarray) -> np.ndarray:
+def _unit_length_scales(squares: np.ndarray) -> np.ndarray:
     """
-    Return the scales that give columns unit length.
+    Return the factors that give columns unit length, from their sums of squares, same shape.
 
-    0 for a column that is zero or negative through rounding.
+    The factor is 0 where the sum is zero, or negative through rounding.
     """
     return np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
 

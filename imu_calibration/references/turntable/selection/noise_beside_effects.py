@@ -142,10 +142,13 @@ def noise_beside_effects(
 
     # Variance within moving windows: from a fit with the noise at rest, then, with its serial
     # correlation, from a fit with the first variance.
-    every = np.arange(space.size)
+    all_parameters = np.arange(space.size)
     for is_correlated in (False, True):
         values, _ = solve_normal(
-            normal_matrix(space, noise), every, space.prior_sd, prior_mean=space.prior_mean
+            normal_matrix(space, noise),
+            all_parameters,
+            space.prior_sd,
+            prior_mean=space.prior_mean,
         )
         for sensor in space.sensors:
             noise[sensor] = _with_moving_factors(
@@ -167,8 +170,8 @@ def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ..
     """
     if noise.known:
         return noise.known
-    of_second = float(np.sqrt(np.median(noise.white_variance) * period))
-    return (BiasProcess(NATURAL * of_second, CORRELATION_TIMES[0]),)
+    noise_of_one_second = float(np.sqrt(np.median(noise.white_variance) * period))
+    return (BiasProcess(NATURAL * noise_of_one_second, CORRELATION_TIMES[0]),)
 
 
 def plausible_processes(
@@ -192,17 +195,17 @@ def plausible_processes(
     sensor : str
 
     """
-    natural = natural_processes(noise, period)
+    least_processes = natural_processes(noise, period)
     if noise.known or not noise.bias_processes:
-        return natural
-    within = float(np.sqrt(sum(process.within(duration) ** 2 for process in noise.bias_processes)))
-    plausible = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
+        return least_processes
+    wander = float(np.sqrt(sum(process.within(duration) ** 2 for process in noise.bias_processes)))
+    plausible = PLAUSIBLE * max(least_processes[0].sd, STABLE[sensor])
     # `middle_wander` is of a long duration, as `bias_variance`.
-    by_middle = (
-        MAX_MIDDLE_RATIO * noise.middle_wander * within / float(np.sqrt(noise.bias_variance))
+    limit_by_middle_axis = (
+        MAX_MIDDLE_RATIO * noise.middle_wander * wander / float(np.sqrt(noise.bias_variance))
     )
-    most = float(np.clip(by_middle, plausible, MAX_WANDER_RATIO * plausible))
-    share = min(1.0, most / within)
+    limit = float(np.clip(limit_by_middle_axis, plausible, MAX_WANDER_RATIO * plausible))
+    share = min(1.0, limit / wander)
     return tuple(replace(process, sd=share * process.sd) for process in noise.bias_processes)
 
 
@@ -255,8 +258,9 @@ def _with_moving_factors(
         of_kind = space.recording.kind == kind
         dof = (space.recording.count[of_kind] - 1).sum()
         variances = np.zeros(3)
-        along = np.zeros(3)  # mean square of the residual along the columns of a window
+        column_variances = np.zeros(3)  # mean square of the residual along the window's columns
         for axis in range(3):
+            # The residual is its products with the columns times these weights.
             of_axis = weights[space.places(sensor, axis)]
             if is_correlated:
                 squares = 0.0
@@ -268,12 +272,12 @@ def _with_moving_factors(
                     squares_of_windows, rank_of_windows = misfit_along(products)
                     squares = squares + squares_of_windows
                     rank = rank + rank_of_windows
-                along[axis] = squares / max(rank, 1)
+                column_variances[axis] = squares / max(rank, 1)
             else:
                 variances[axis] = of_axis @ space.within_sum(sensor, axis, of_kind) @ of_axis / dof
         correlation = 1.0
         if is_correlated:
-            correlation = float(np.clip(np.mean(along / variances), 1.0, None))
+            correlation = float(np.clip(np.mean(column_variances / variances), 1.0, None))
         factor = np.maximum(variances / noise.white_variance, LEAST_NOISE_SHARE)
         factor = factor * correlation / noise.inflation
         moving[str(kind)] = MovingFactors(factor, factor, np.maximum(factor, 1.0), correlation)
@@ -319,7 +323,7 @@ def _with_bias_process(
 
     # Which smooth effect, course in time or step explains them better than a bias process?
     processes = natural_processes(noise[sensor], recording.period)
-    natural = float(np.sqrt(sum(process.sd**2 for process in processes)))
+    natural_wander = float(np.sqrt(sum(process.sd**2 for process in processes)))
     smooth_columns = equations[:, :, len(structural) : -1]
     options = []  # columns of each smooth effect among `smooth_columns`
     for parameters_of_effect in smooth:
@@ -330,18 +334,19 @@ def _with_bias_process(
         n_structural=len(structural),
         options=options,
         prior_sd=drift_prior(
-            smooth_columns, space.prior_sd[of_smooth], max(natural, STABLE[sensor])
+            smooth_columns, space.prior_sd[of_smooth], max(natural_wander, STABLE[sensor])
         ),
-        natural=natural,
-        stable=STABLE[sensor],
+        natural_wander=natural_wander,
+        normal_wander=STABLE[sensor],
     )
     choice = _best_course(wander)
 
-    # Offsets and bias process with that model.
+    # Offsets and bias process with that model. The wander of the middle axis is a limit
+    # (`plausible_processes`), needed only where the process exceeds a plausible one.
     search = choice.search
-    shape = search.best(choice.used)[0]
+    shape, _ = search.best(choice.used)
     middle_wander = 0.0
-    if shape[1] > PLAUSIBLE * search.usual:
+    if shape.bias > PLAUSIBLE * search.usual:
         middle_wander = search.of_middle_axis(shape, choice.used)
     polished = search.polished(shape, choice.used)
     return replace(noise[sensor], middle_wander=middle_wander, **polished)
@@ -355,8 +360,8 @@ class _Choice:
     """Search for the noise of rows with the columns under test."""
     used: Sequence[int]
     """Parameters of the smooth effect, course or step that is in the model; empty without one."""
-    moment: int
-    """Number of the step among the steps under test; negative if it is no step."""
+    step: int
+    """Index of the step in the model among the steps under test; negative if it has none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -372,65 +377,78 @@ class _WanderProblem:
     Their products are the information on the parameters that is not from means.
     """
     n_structural: int
-    """Number of columns that every model has."""
+    """Number of the first parameters, not smooth in time, which every model under test has."""
     options: Sequence[Sequence[int]]
     """Parameters of each smooth effect, counted after the structural ones."""
     prior_sd: np.ndarray
     """Prior sd of the parameters of all smooth effects, shape (n_smooth,)."""
-    natural: float
-    """Standard deviation of the bias processes that are known, SI."""
-    stable: float
-    """Bias variation of a stable sensor, SI."""
+    natural_wander: float
+    """Sd of the bias that the sensor has at least (`natural_processes`), SI."""
+    normal_wander: float
+    """Sd of the bias that is normal for any sensor of this type (`STABLE`), SI."""
 
-    def choice(self, courses: Sequence[np.ndarray], steps: Sequence[np.ndarray] = ()) -> _Choice:
+    def best_model(
+        self, courses: Sequence[np.ndarray], steps: Sequence[np.ndarray] = ()
+    ) -> _Choice:
         """
-        Return the best model: with one of the smooth effects, courses in time and steps, or none.
+        Return the likeliest model of the wander: a bias process and at most one cause in time.
 
-        Courses and steps are values in each window, shape (k,), times a bias of each axis.
+        A cause is a smooth effect, a course in time or a step. The courses and steps, each shape
+        (n_windows,), are multiplied by one bias per axis.
         """
-        # Columns of the courses and steps on each axis, and their priors.
-        added = _columns_of_biases([*courses, *steps], len(self.rows))
-        usual = max(self.natural, self.stable)
-        sd = drift_prior(added, np.full(added.shape[2], np.inf), usual)
-        # A course has one parameter on each axis.
-        options = [list(option) for option in self.options]
-        n_smooth = len(self.prior_sd)
-        for first in range(n_smooth, n_smooth + len(sd), len(AXES)):
-            options.append([first, first + 1, first + 2])
-
+        # Columns of the courses and steps, three biases each, and their priors.
+        bias_columns = _columns_of_biases([*courses, *steps], len(self.rows))
+        usual_wander = max(self.natural_wander, self.normal_wander)
+        bias_sd = drift_prior(bias_columns, np.full(bias_columns.shape[2], np.inf), usual_wander)
         equations = self.rows.equations
         rows = replace(
             self.rows,
-            equations=np.concatenate([equations[:, :, :-1], added, equations[:, :, -1:]], axis=2),
-            products=_with_priors(self.rows.products, sd),
+            equations=np.concatenate(
+                [equations[:, :, :-1], bias_columns, equations[:, :, -1:]], axis=2
+            ),
+            products=_with_priors(self.rows.products, bias_sd),
         )
-        likelihood = NoiseLikelihood(rows, common=self.n_structural, choices=options)
-        least = 0.0 if rows.processes else self.natural
-        search = BiasProcessSearch(likelihood, least, self.stable)
+
+        # Parameters of each cause, counted after the structural ones: effects, courses, steps.
+        options = [list(option) for option in self.options]
+        n_smooth = len(self.prior_sd)
+        for first in range(n_smooth, n_smooth + len(bias_sd), len(AXES)):
+            options.append([first, first + 1, first + 2])
         first_step = len(options) - len(steps)
-        # Each of the moments is as likely as the other ones.
+        # A step is at any of the moments with equal probability: minus twice its logarithm.
         prices = np.zeros(len(options))
         prices[first_step:] = 2 * np.log(max(len(steps), 1))
-        used = _needed_smooth(search, options, prior_sd=np.append(self.prior_sd, sd), prices=prices)
-        moment = options.index(list(used)) - first_step if used else -1
-        return _Choice(search, used, moment)
+
+        likelihood = NoiseLikelihood(rows, common=self.n_structural, choices=options)
+        # Known bias processes are in the rows already, so that a further one may be zero.
+        least_wander = 0.0 if rows.processes else self.natural_wander
+        search = BiasProcessSearch(likelihood, least=least_wander, usual=self.normal_wander)
+        prior_sd = np.append(self.prior_sd, bias_sd)
+        used = _needed_smooth(search, options, prior_sd=prior_sd, prices=prices)
+        step = options.index(list(used)) - first_step if used else -1
+        return _Choice(search, used, step)
 
 
 def _best_course(wander: _WanderProblem) -> _Choice:
-    """Return the best model of the wander; a step is sought coarsely, then near the best moment."""
+    """
+    Return the likeliest model of the wander, with a course in time, a step, an effect or none.
+
+    A step is sought among `MOST_MOMENTS` windows, then between the two nearest to the best.
+    """
     recording = wander.recording
     if np.ptp(recording.session) > 0:  # between two recordings each bias may change
-        return wander.choice([])
+        return wander.best_model(courses=[])
     count = len(wander.rows)
     temperature = recording.describe['temperature']
     courses = [course.values for course in temperature_courses(recording.time, temperature)]
     places = step_places(np.arange(count), MOST_MOMENTS)
-    choice = wander.choice(courses, _steps(places, count))
-    if choice.moment >= 0 and len(places) == MOST_MOMENTS:
-        first = places[max(choice.moment - 1, 0)]
-        last = places[min(choice.moment + 1, len(places) - 1)]
+    choice = wander.best_model(courses, _steps(places, count))
+    # With fewer places each window between the outermost ones was tried already.
+    if choice.step >= 0 and len(places) == MOST_MOMENTS:
+        first = places[max(choice.step - 1, 0)]
+        last = places[min(choice.step + 1, len(places) - 1)]
         places = step_places(np.arange(first, last + 1), MOST_MOMENTS, least=0)
-        choice = wander.choice(courses, _steps(places, count))
+        choice = wander.best_model(courses, _steps(places, count))
     return choice
 
 
@@ -456,8 +474,8 @@ def _with_priors(information: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """
     count = len(information) - 1 + len(sd)
     extended = np.zeros((count + 1, count + 1))
-    kept = np.append(np.arange(len(information) - 1), count)
-    extended[np.ix_(kept, kept)] = information
+    given = np.append(np.arange(len(information) - 1), count)
+    extended[np.ix_(given, given)] = information
     added = np.arange(len(information) - 1, count)
     extended[added, added] = 1 / sd**2
     return extended
@@ -521,8 +539,8 @@ def _information_without_means(
     space: ParameterSpace, sensor: str, noise: dict[str, NoiseModel], parameters: np.ndarray
 ) -> np.ndarray:
     """Return the normal matrix of parameters by their priors and the samples within windows."""
-    at = np.append(parameters, space.size)
-    normal = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
+    chosen = np.append(parameters, space.size)  # and the residual, which is last
+    normal = within_matrix(space, noise, sensors=(sensor,))[np.ix_(chosen, chosen)]
     prior = 1 / space.prior_sd[parameters] ** 2
     normal[:-1, :-1] += np.diag(prior)
     normal[:-1, -1] += space.prior_mean[parameters] * prior
