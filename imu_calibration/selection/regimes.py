@@ -366,7 +366,7 @@ class RegimeSearch:
 
         # One end after the other; the candidates are between the edges of the bins too.
         for end in (0, 1):
-            if not bounds:
+            if not bounds:  # classes have no bounds
                 break
             low, high = bounds
             options = []
@@ -379,8 +379,14 @@ class RegimeSearch:
             best = int(np.argmin(squares))
             bounds = options[best]
             mark = inside[:, best]
-        (size,), (after,) = rest.offsets(whitening.whiten(mark[:, None]))
-        return _RefinedRange(mark, bounds, variable.words(chosen, bounds), size, after)
+        offsets, squares = rest.offsets(whitening.whiten(mark[:, None]))
+        return _RefinedRange(
+            inside=mark,
+            bounds=bounds,
+            words=variable.words(chosen, bounds),
+            offset=offsets[0],
+            squares=squares[0],
+        )
 
     def tested(self, gains: Sequence[np.ndarray]) -> tuple[float, list[tuple[Ranges, int]]]:
         """

@@ -228,9 +228,10 @@ def without_groups(blocks: Sequence[Rows], groups: np.ndarray) -> list[Rows]:
 
 def _with_noise(block: Rows, used: Sequence[int]) -> Rows:
     """
-    Return the rows with the likeliest of the candidate noises, with the parameters `used` fitted.
+    Return the rows with their likeliest noise, with the parameters `used` fitted.
 
-    Independent scatter of the rows, and a bias process where the bias drifts.
+    The noise is the known one, an independent scatter of the rows, and, where the bias drifts, a
+    bias process. Their sizes are the likeliest ones of a grid.
     """
     n_rows, n_axes, _ = block.equations.shape
     basis = orthonormal_basis(flat(block.equations)[:, used], DEPENDENT)

@@ -122,40 +122,44 @@ def latitude_findings(
     return _of_windows(windows, table, NAMED_SDS if has_g_sensitivity else CONTRADICTING_SDS)
 
 
-def _of_estimated_rate(solution: Solution, table: Table, part: slice) -> tuple[CheckFinding, ...]:
+def _of_estimated_rate(
+    solution: Solution, table: Table, rate_params: slice
+) -> tuple[CheckFinding, ...]:
     """
     Return the contradiction of the estimated Earth's rate to the latitude, or none.
 
-    The vertical component is compared first, then the length; `part` are the parameters of the
-    rate in the level frame.
+    The vertical component is compared first, then the magnitude. `rate_params` are the three
+    parameters of the rate in the level frame.
     """
-    if solution.held[part].any():
+    if solution.held[rate_params].any():
         return ()
-    rate = solution.values[part]
-    covariance = solution.covariance[part, part]
+    rate = solution.values[rate_params]
+    covariance = solution.covariance[rate_params, rate_params]
+    # Without a latitude only the magnitude of the Earth's rate is known.
     if table.latitude is None:
-        length, sd = _length(rate, covariance)
-        return (_excess(length, sd),) if _contradicts_length(length, sd) else ()
+        magnitude, sd = _magnitude(rate, covariance)
+        return (_excess(magnitude, sd),) if _exceeds_earth_rate(magnitude, sd) else ()
     expected_up = _vertical_rate(table)
     up_sd = float(np.sqrt(covariance[2, 2]))
     severity = _severity(rate[2] - expected_up, up_sd)
     if severity is not None:
+        # The latitude with the other sign expects the vertical component `-expected_up`.
         if severity == WARNING and _agrees(rate[2] + expected_up, up_sd, expected_up):
             raise _wrong_sign(table, rate[2], expected_up)
         return (
             _finding('vertical component', rate[2], up_sd, expected=expected_up, severity=severity),
         )
-    length, length_sd = _length(rate, covariance)
-    if _contradicts(length - EARTH_RATE, length_sd):
-        return (_finding('magnitude', length, length_sd, expected=EARTH_RATE, severity=WARNING),)
+    magnitude, sd = _magnitude(rate, covariance)
+    if _contradicts(magnitude - EARTH_RATE, sd):
+        return (_finding('magnitude', magnitude, sd, expected=EARTH_RATE, severity=WARNING),)
     return ()
 
 
-def _length(rate: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Return the length of an estimated rate, and its standard deviation along the estimate."""
-    length = float(np.linalg.norm(rate))
-    direction = rate / length if length > 0 else np.array([1.0, 0.0, 0.0])
-    return length, float(np.sqrt(direction @ covariance @ direction))
+def _magnitude(rate: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Return the norm of an estimated rate, shape (3,), and its standard deviation."""
+    magnitude = float(np.linalg.norm(rate))
+    direction = rate / magnitude if magnitude > 0 else np.array([1.0, 0.0, 0.0])
+    return magnitude, float(np.sqrt(direction @ covariance @ direction))
 
 
 def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFinding, ...]:
@@ -176,7 +180,7 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
     severity = _severity(vertical, vertical_sd, sds)
     if severity is None:
         return ()
-    # A g-sensitivity has other entries too.
+    # A K with other entries is a g-sensitivity, and no error of the latitude.
     remaining = np.abs(dependence.matrix - vertical * np.eye(3))
     tolerated = np.maximum(AGREEING_SDS * dependence.sd, AGREEING_SHARE * abs(vertical))
     if np.any(remaining > tolerated):
@@ -184,7 +188,7 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
     # At no latitude the vertical component is larger than the Earth's rate.
     expected_up = _vertical_rate(table)
     measured_up = expected_up + vertical
-    if _contradicts_length(measured_up, vertical_sd):
+    if _exceeds_earth_rate(measured_up, vertical_sd):
         return ()
     if severity == WARNING and _agrees(measured_up + expected_up, vertical_sd, expected_up):
         raise _wrong_sign(table, measured_up, expected_up)
@@ -265,8 +269,8 @@ def _weights_of_kinds(windows: WindowRates, design: np.ndarray) -> np.ndarray:
     return weight
 
 
-def _contradicts_length(rate: float, sd: float) -> bool:
-    """Return whether a component or a length is significantly larger than the Earth's rate."""
+def _exceeds_earth_rate(rate: float, sd: float) -> bool:
+    """Return whether a rate, rad/s, is significantly larger than the Earth's rate."""
     return abs(rate) > EARTH_RATE and _contradicts(abs(rate) - EARTH_RATE, sd)
 
 

@@ -86,13 +86,14 @@ def common_turn(solution: Solution) -> CommonTurn | None:
     triads = []
     variances = []
     for sensor in SENSORS:
-        part = solution.model.part(sensor, Role.LINEAR)
-        if part.stop > part.start and not solution.held[part].any():
-            matrix = solution.values[part].reshape(3, 3)
+        params = solution.model.part(sensor, Role.LINEAR)
+        if params.stop > params.start and not solution.held[params].any():
+            matrix = solution.values[params].reshape(3, 3)
             triads.append(matrix / np.linalg.norm(matrix, axis=1, keepdims=True))
-            variances.append(np.diag(solution.covariance)[part].reshape(3, 3))
+            variances.append(np.diag(solution.covariance)[params].reshape(3, 3))
     if not triads:
         return None
+    # R is the mean turn of the triads; it is common if their turns agree, relative to its angle.
     turns = [nearest_rotation(triad) for triad in triads]
     common = nearest_rotation(np.sum(turns, axis=0))
     vector = rotation_vector(common)
@@ -106,16 +107,18 @@ def common_turn(solution: Solution) -> CommonTurn | None:
         axes = triad @ common.T
         half_sums = (axes + axes.T)[np.triu_indices(3, 1)] / 2
         squares += float(half_sums @ half_sums)
-    freedom = 3 * (len(triads) - 1) + 3 * len(triads)
-    spread = max(squares / freedom, LEAST_TURN_SD**2)
+    # Of n triads 3 (n - 1) for the differences of their turns, and 3 n for the half sums.
+    dof = 3 * (len(triads) - 1) + 3 * len(triads)
+    turn_variance = max(squares / dof, LEAST_TURN_SD**2)
 
     # Variance of the mean of the turns: of the axes, and of their estimates.
-    estimates = np.zeros(3)
+    estimate_variance = np.zeros(3)
     for variance in variances:
+        # A turn about x is half the difference of the elements yz and zy; so for y and z.
         off_diagonal = (variance + variance.T)[[1, 2, 0], [2, 0, 1]]
-        estimates += off_diagonal / 4 / len(triads) ** 2
-    sd = np.sqrt(spread / len(triads) + estimates)
-    return CommonTurn(common, vector, bool(agreed), sd, freedom)
+        estimate_variance += off_diagonal / 4 / len(triads) ** 2
+    sd = np.sqrt(turn_variance / len(triads) + estimate_variance)
+    return CommonTurn(common, vector, bool(agreed), sd, dof)
 
 
 def common_turn_deg(solution: Solution) -> list[float] | None:
@@ -151,8 +154,8 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
     zero = ''
     if last_joint.turns and abs(last_axis @ turn.vector) > ALONG * turn.angle:
         zero = f' (or the zero of {table.joint_names[-1]}, which has the same effect)'
-    angles = np.round(mount_rpy_deg(turn.matrix, table), 2)
-    fits = ', '.join(f'{value + 0.0:.2f}' for value in angles)
+    mount_angles = np.round(mount_rpy_deg(turn.matrix, table), 2)
+    fits = ', '.join(f'{angle + 0.0:.2f}' for angle in mount_angles)  # + 0.0: no negative zero
     size = f'{turn.angle / DEG:.2f} deg'
     if not severe:
         text = (

@@ -233,12 +233,12 @@ def parameter_shifts(
 
         # The samples about the mean of their window.
         for k, (source, design, of_window) in enumerate(zip(sources, designs, outputs)):
-            moved = of_window[sensor].changes
+            output_changes = of_window[sensor].changes
             centred = design - means[k]
             within = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
             normal += np.tensordot(within, centred, ([0, 1], [0, 1]))
-            right[:, k] += moved.mean(axis=1) @ weighted[k]
-            right[:, k] += np.tensordot(moved, within, ([1, 2], [0, 1]))
+            right[:, k] += output_changes.mean(axis=1) @ weighted[k]
+            right[:, k] += np.tensordot(output_changes, within, ([1, 2], [0, 1]))
     index = np.flatnonzero(~fixed_parameters(solution.model) & ~solution.held)
     shifts = np.zeros_like(right)
     shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])

@@ -99,9 +99,11 @@ def find_onset(
         return None
 
     # The fewest parameters that explain as much as the best, then the least excess.
-    most = SIMPLER * min(max(candidate.excess, candidate.noise) for candidate in candidates)
-    good = [candidate for candidate in candidates if candidate.excess <= most]
-    best = min(good, key=lambda candidate: (len(candidate.group.parameters), candidate.excess))
+    limit = SIMPLER * min(max(candidate.excess, candidate.noise) for candidate in candidates)
+    sufficient = [candidate for candidate in candidates if candidate.excess <= limit]
+    best = min(
+        sufficient, key=lambda candidate: (len(candidate.group.parameters), candidate.excess)
+    )
     return _onset_of(best, problem, windows=windows, table=table)
 
 
@@ -189,6 +191,7 @@ def _candidate(
     losses = _losses_of_moments(rows, fitted, changing, allowed)
     last = min(losses, key=losses.__getitem__)
     least = losses[last]
+    # Biases that change above a temperature, passed several times, are no onset.
     temperature_passed = None
     if group.role is Role.OFFSET:
         temperature = rows.space.recording.describe['temperature']
@@ -211,10 +214,11 @@ def _candidate(
         return None
     if gradual.loss - step.loss <= SUDDEN * (constant.loss - step.loss):
         return None
+    # The moment is after the first of the likely windows, and before the one after the last.
     likely = [k for k, loss in losses.items() if loss < least + LIKELY]
     return _Candidate(
-        group,
-        parameters[fitted],
+        group=group,
+        parameters=parameters[fitted],
         ends=(min(likely), max(likely) + 1),
         excess=after.squares,
         noise=after.limit,
@@ -341,16 +345,16 @@ def _onset_of(
         for sensor, squares_of_axes in zip(sensors, squares, strict=True):
             sensor_axes[sensor] = largest_axes(squares_of_axes)
     return Onset(
-        moment,
-        moment_sd,
-        group.name,
-        before,
-        after,
-        dict(zip(names, sd.tolist())),
-        {label: units[label] for label in names},
-        candidate.share,
-        sensor_axes,
-        candidate.temperature_c,
+        time=moment,
+        time_sd=moment_sd,
+        what=group.name,
+        before=before,
+        after=after,
+        sd=dict(zip(names, sd.tolist())),
+        units={label: units[label] for label in names},
+        share=candidate.share,
+        sensor_axes=sensor_axes,
+        temperature_c=candidate.temperature_c,
     )
 
 

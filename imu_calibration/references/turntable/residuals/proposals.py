@@ -313,20 +313,20 @@ def _proposal_of(
     # The excess is a sum of squares; its reduction as a root mean square.
     share = share_removed(without_formula, after)
     return Proposal(
-        blocks.sensor,
-        tuple(effects),
-        tuple(after.amplitudes),
-        tuple(after.sd),
-        frozenset(families),
-        tuple(axes),
-        share,
-        share_interval(without_formula, after, np.random.default_rng(1)),
-        1.0 - float(np.sqrt(max(1.0 - share, 0.0))),
-        choices[0].p_value,
-        tuple(alike),
-        _nearest(fits, without_formula, problem),
-        _motion(effects),
-        tuple(rms_of_terms),
+        sensor=blocks.sensor,
+        effects=tuple(effects),
+        values=tuple(after.amplitudes),
+        sds=tuple(after.sd),
+        family=frozenset(families),
+        axes=tuple(axes),
+        share=share,
+        ci95=share_interval(without_formula, after, np.random.default_rng(1)),
+        reduction=1.0 - float(np.sqrt(max(1.0 - share, 0.0))),
+        p_value=choices[0].p_value,
+        alike=tuple(alike),
+        nearest=_nearest(fits, without_formula, problem),
+        motion=_motion(effects),
+        sizes=tuple(rms_of_terms),
     )
 
 

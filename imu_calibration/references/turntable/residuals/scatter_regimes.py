@@ -63,19 +63,19 @@ class ScatterSearch(RegimeSearch):
 
         # A regime must fit clearly better than a variance that follows a smooth curve.
         fits = []  # (cost, dispersion)
-        for each in self.ranges:
-            if len(each.variable.edges):
-                fits.append(_smooth_scatter(each.variable.curves, rough, weight))
+        for ranges in self.ranges:
+            if len(ranges.variable.edges):
+                fits.append(_smooth_scatter(ranges.variable.curves, rough, weight))
         one_variance = (variance_cost(weight @ rough, weight.sum()), 1.0)
         smooth_cost, dispersion = min(fits, default=one_variance)
         largest_cost = smooth_cost - SURE * dispersion
         squares = weight * rough
         regimes = []
-        for each, number in likely:
-            variable = each.variable
-            excess_of_bins = np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0)
-            bins = _shortest_part(variable.chosen(each.member[number]), excess_of_bins)
-            inside = each.marks[:, bins].sum(axis=1)  # share of each block
+        for ranges, number in likely:
+            variable = ranges.variable
+            excess_of_bins = np.maximum(ranges.marks.T @ (weight * (rough - 1.0)), 0.0)
+            bins = _shortest_part(variable.chosen(ranges.member[number]), excess_of_bins)
+            inside = ranges.marks[:, bins].sum(axis=1)  # share of each block
             outside = 1.0 - inside
 
             # Sums of squares inside and outside, degrees of freedom, and their ratio.
@@ -89,18 +89,18 @@ class ScatterSearch(RegimeSearch):
                 bounds = variable.bounds(bins)
                 regimes.append(
                     RestRegime(
-                        self.sensor,
-                        axis,
-                        variable.name,
-                        variable.words(bins, bounds) + ', by larger scatter',
-                        float(share),
-                        p_value,
-                        float(np.sqrt(median * max(variance[0] - variance[1], 0.0))),
-                        inside > 0.5,
-                        self.time,
-                        False,
-                        bounds,
-                        variable.is_rate,
+                        sensor=self.sensor,
+                        axis=axis,
+                        variable=variable.name,
+                        text=variable.words(bins, bounds) + ', by larger scatter',
+                        share=float(share),
+                        p_value=p_value,
+                        size=float(np.sqrt(median * max(variance[0] - variance[1], 0.0))),
+                        inside=inside > 0.5,
+                        time=self.time,
+                        offset=False,
+                        bounds=bounds,
+                        is_rate=variable.is_rate,
                     )
                 )
         return largest_share_first(regimes)
@@ -132,9 +132,9 @@ class ScatterSearch(RegimeSearch):
         count = weight.sum()
         energy = squares.sum(axis=0)
         falls = []
-        for each in self.ranges:
-            count_inside = (each.member @ (each.marks.T @ weight))[:, None]
-            energy_inside = each.member @ (each.marks.T @ squares)
+        for ranges in self.ranges:
+            count_inside = (ranges.member @ (ranges.marks.T @ weight))[:, None]
+            energy_inside = ranges.member @ (ranges.marks.T @ squares)
             count_outside = count - count_inside
             least_outside = np.maximum(energy - energy_inside, count_outside)
             louder = energy_inside * count_outside > LOUDER * least_outside * count_inside

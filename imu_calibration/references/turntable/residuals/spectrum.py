@@ -118,18 +118,18 @@ def orders_of(
     squares = np.einsum('pkxi,pkxj->kxij', parts, parts)
     squares_of_mean = count[:, None, None, None] * np.einsum('kxi,kxj->kxij', mean, mean)
     covariance = (squares - squares_of_mean) / (count - 1)[:, None, None, None]
-    # Repeated data have no scatter.
+    # Repeated data have no scatter, with which a mean could be compared: there T^2 is zero.
     trace = np.trace(covariance, axis1=-2, axis2=-1)
-    known = trace > ROUNDING_SHARE * (mean**2).sum(axis=-1)
-    known &= np.linalg.det(covariance) > ROUNDING_SHARE * trace**2
-    covariance[~known] = np.eye(2)
-    mean[~known] = 0.0
+    has_scatter = trace > ROUNDING_SHARE * (mean**2).sum(axis=-1)
+    has_scatter &= np.linalg.det(covariance) > ROUNDING_SHARE * trace**2
+    covariance[~has_scatter] = np.eye(2)
+    mean[~has_scatter] = 0.0
     whitened = np.linalg.solve(covariance, mean[..., None])[..., 0]
     t_squared = count[:, None] * np.einsum('kxi,kxi->kx', mean, whitened)
 
     # T^2 (n - 2) / (2 (n - 1)) follows F(2, n - 2).
-    degrees = (count - 2)[:, None]
-    p_value = f_sf(t_squared * degrees / (2 * (count - 1)[:, None]), 2, degrees)
+    dof = (count - 2)[:, None]
+    p_value = f_sf(t_squared * dof / (2 * (count - 1)[:, None]), 2, dof)
 
     # The coherent wave, and its power over that of the other orders.
     wave = sums.sum(axis=0) / weight.sum(axis=0)[:, None]
@@ -509,11 +509,11 @@ def of_stretches(
     around it. With h peaks in n stretches, the p-value of a frequency is the probability of at
     least h peaks by noise (binomial law), times the number of frequencies.
     """
-    every = list(stretches)
-    if not every:
+    stretches = list(stretches)
+    if not stretches:
         return
     # Length of the transform: all stretches are padded to the longest that is possible.
-    size = round(1 / (FREQUENCY_STEP * every[0].step))
+    size = round(1 / (FREQUENCY_STEP * stretches[0].step))
     grid = FREQUENCY_STEP * np.arange(size // 2 + 1)
     # Sums over the stretches, for each frequency and axis.
     n_peaks = np.zeros((len(grid), 3))
@@ -521,7 +521,7 @@ def of_stretches(
     sum_of_heights = np.zeros((len(grid), 3))  # P over the median of all frequencies
     sum_of_excess = np.zeros((len(grid), 3))  # squared amplitude by P - N
     n_stretches = np.zeros(len(grid), int)
-    for stretch in every:
+    for stretch in stretches:
         length = len(stretch.residual)
         shown = (grid * length * stretch.step >= CYCLES_OF_TONE) & (grid <= stretch.highest)
         spectrum = _spectrum(stretch.residual, size, shown)
@@ -549,15 +549,15 @@ def of_stretches(
         best = int(np.argmax(significant_height))
         if chance[best, axis] < TONE_P_VALUE:
             yield Tone(
-                sensor,
-                AXES[axis],
-                joint,
-                float(grid[best]),
-                float(np.sqrt(sum_of_excess[best, axis] / n_stretches[best])),
-                float(chance[best, axis]),
-                float(n_peaks[best, axis] / n_stretches[best]),
-                grid[n_stretches > 0],
-                mean_ratio[n_stretches > 0],
+                sensor=sensor,
+                axis=AXES[axis],
+                joint=joint,
+                frequency=float(grid[best]),
+                amplitude=float(np.sqrt(sum_of_excess[best, axis] / n_stretches[best])),
+                p_value=float(chance[best, axis]),
+                share=float(n_peaks[best, axis] / n_stretches[best]),
+                frequencies=grid[n_stretches > 0],
+                power=mean_ratio[n_stretches > 0],
             )
 
 
@@ -649,12 +649,13 @@ def find_sway(blocks: BlockMeans, fits: BlockFits) -> Tone | None:
     # F test, with at least half of the blocks as degrees of freedom of the residual.
     squares = float(residual @ residual)
     n_columns = max(design.shape[1] for design in blocks.design)
-    freedom = len(residual) - 3 * n_columns - n_amplitudes
-    if freedom < len(residual) / 2:
+    dof = len(residual) - 3 * n_columns - n_amplitudes
+    if dof < len(residual) / 2:
         return None
-    variance = max(squares - falls[best], 1e-300) / freedom
-    ratio = falls[best] / n_amplitudes / variance
-    p_value = float(f_sf(ratio, n_amplitudes, freedom)) * len(frequencies)
+    variance = max(squares - falls[best], 1e-300) / dof
+    f_ratio = falls[best] / n_amplitudes / variance
+    p_value = float(f_sf(f_ratio, n_amplitudes, dof)) * len(frequencies)
+    # Where the joints move with that period, their errors can be the cause.
     if p_value > TONE_P_VALUE or _follows_joints(waves[best], ref.joint_angle):
         return None
     share = share_removed(fits.fit(), fits.fit(columns[best]))
@@ -665,15 +666,15 @@ def find_sway(blocks: BlockMeans, fits: BlockFits) -> Tone | None:
     output = np.einsum('bka,k->ba', columns[best], amplitudes)
     rms_of_axes = np.sqrt(np.mean(output**2, axis=0))
     return Tone(
-        blocks.sensor,
-        AXES[int(np.argmax(rms_of_axes))],
-        None,
-        float(frequencies[best]),
-        float(np.linalg.norm(amplitudes)),
-        p_value,
-        share,
-        frequencies,
-        np.array(falls) / n_amplitudes / variance,
+        sensor=blocks.sensor,
+        axis=AXES[int(np.argmax(rms_of_axes))],
+        joint=None,
+        frequency=float(frequencies[best]),
+        amplitude=float(np.linalg.norm(amplitudes)),
+        p_value=p_value,
+        share=share,
+        frequencies=frequencies,
+        power=np.array(falls) / n_amplitudes / variance,
         tilts=True,
     )
 

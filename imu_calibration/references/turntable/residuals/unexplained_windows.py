@@ -106,7 +106,7 @@ def _unexplained(
     values: np.ndarray,
 ) -> Unexplained:
     """
-    Return the Unexplained of a sensor.
+    Return the residual of a sensor that the model does not explain, and its likely cause.
 
     Parameters
     ----------
@@ -121,10 +121,10 @@ def _unexplained(
     """
     space = problem.space
     recording = problem.recording
-    of_axes = []
+    residual_of_axes = []  # of the means of the windows
     for axis in range(3):
-        of_axes.append(space.mean[sensor][axis] @ values[space.places(sensor, axis)])
-    residual = np.stack(of_axes, axis=1)
+        residual_of_axes.append(space.mean[sensor][axis] @ values[space.places(sensor, axis)])
+    residual = np.stack(residual_of_axes, axis=1)
     floor = explained.floor.noise[sensor]
     white = recording.mean_variance(floor)
     noise_sd = np.sqrt(white + floor.bias_variance)
@@ -136,16 +136,24 @@ def _unexplained(
         sigma = max(sigma_means, sigma_within)
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
-    found = Unexplained(significant, rms, float(sigma), None, 0.0, residual, noise_sd)
+    unexplained = Unexplained(
+        significant=significant,
+        rms=rms,
+        sigma=float(sigma),
+        correlates_with=None,
+        share=0.0,
+        residual=residual,
+        noise_sd=noise_sd,
+    )
     if not significant:
-        return found
+        return unexplained
 
     # An excess within windows only: its rms in units of the variance of their samples.
     if sigma_means <= SIGNIFICANT_SDS:
         moving_kinds = np.unique(recording.kind[recording.moving])
         variance = np.mean([floor.row_variance(kind) for kind in moving_kinds])
         rms_within = np.sqrt(variance * excess_within / explained.n_within)
-        return replace(found, rms=float(rms_within))
+        return replace(unexplained, rms=float(rms_within))
 
     # The means differ by less than the wander of the bias, but neighbours by more than white noise.
     if rms == 0:
@@ -156,7 +164,7 @@ def _unexplained(
         used = np.flatnonzero(values[space.places(sensor, axis)[:-1]])
         fitted.append(space.mean[sensor][axis][:, used])
     name, share = correlate(_explanations(recording), residual, noise_sd, fitted=fitted)
-    return replace(found, rms=rms, correlates_with=name, share=share)
+    return replace(unexplained, rms=rms, correlates_with=name, share=share)
 
 
 def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:

@@ -323,11 +323,11 @@ def _with_lags(
     is not, another explanation. To save time, a trial is relinearised at its choice only if all of
     its lags are named before, or if no trial succeeds and it is the best.
     """
-    most = None  # number of effects of the next explanation, at most
-    refused = []
+    max_effects = None  # of the next explanation
+    refused = []  # explanations of which some lags are not named
     tried = []
     for number in range(EXPLANATIONS):
-        selected = explanations.select(most, refused)
+        selected = explanations.select(max_effects, refused)
         at_lags = explanations.settled(selected, searched)
         chosen = at_lags.problem.search.run(at_lags.chosen)
         settled, rivals = settle_rivals(at_lags.problem, chosen, searched)
@@ -340,9 +340,9 @@ def _with_lags(
             if trial.helps:
                 return trial.outcome, trial.rivals
         tried.append(trial)
-        most = max(len(selected.lags) - 1, 1)
+        max_effects = max(len(selected.lags) - 1, 1)
         refused = [*refused, selected]
-        if not explanations.others(most, refused):
+        if not explanations.others(max_effects, refused):
             break
     best = _best_of(tried, searched)
     return best.outcome, best.rivals

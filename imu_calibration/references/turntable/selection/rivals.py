@@ -236,13 +236,14 @@ def best_pairs(search: Search) -> list[list[Question]]:
 
     The normal matrix with the baseline projected out and each effect's block scaled to the unit
     matrix gives a system of two blocks for each pair; systems of one shape are solved together.
-    Each member must keep some signal that is not collinear with its mate. That each is significant
-    without its mate is tested by the search from the pair (`Search.run`).
+    Each effect must keep some signal that is not collinear with the other. That each is significant
+    in addition to the other is tested by the search from the pair (`Search.run`).
     """
     blocks = _Blocks(search)
     pairs_of_shape = defaultdict(list)
     for one, two in combinations(range(len(search.questions)), 2):
         names = {search.questions[one].name, search.questions[two].name}
+        # No pair of one effect at two time constants, and none that the search may not add.
         if len(names) == 2 and not names & search.resolved:
             pairs_of_shape[blocks.size(one), blocks.size(two)].append((one, two))
     scored: list[tuple[float, int, int]] = []
@@ -275,12 +276,12 @@ class _Blocks:
         information, right = search.evidence.equations()
         base = list(search.baseline)
         free: list[int] = []
-        self.at: list[slice] = []
+        self.params_of: list[slice] = []
         """Place of the parameters of each question in M and b."""
         for question in search.questions:
             start = len(free)
             free += question.parameters
-            self.at.append(slice(start, len(free)))
+            self.params_of.append(slice(start, len(free)))
 
         # Schur complement: M = I_ff - I_fb I_bb^-1 I_bf, and the same of the right side.
         factor = scipy.linalg.cho_factor(information[np.ix_(base, base)])
@@ -289,13 +290,13 @@ class _Blocks:
         right = right[free] - cross.T @ scipy.linalg.cho_solve(factor, right[base])
 
         # Scale rows and columns by L^-1 of each block L L'.
-        for at in self.at:
-            scale = np.sqrt(np.diag(matrix)[at])
-            block = matrix[at, at] / np.outer(scale, scale)
+        for params in self.params_of:
+            scale = np.sqrt(np.diag(matrix)[params])
+            block = matrix[params, params] / np.outer(scale, scale)
             lower = np.linalg.cholesky(block + 1e4 * JITTER * np.eye(len(block))) * scale[:, None]
-            matrix[at] = np.linalg.solve(lower, matrix[at])
-            matrix[:, at] = np.linalg.solve(lower, matrix[:, at].T).T
-            right[at] = np.linalg.solve(lower, right[at])
+            matrix[params] = np.linalg.solve(lower, matrix[params])
+            matrix[:, params] = np.linalg.solve(lower, matrix[:, params].T).T
+            right[params] = np.linalg.solve(lower, right[params])
         self.matrix = matrix
         self.right = right
 
@@ -307,11 +308,14 @@ class _Blocks:
         """
         Yield (fall of the loss in nats less the penalty, one, two) of pairs of questions.
 
-        All pairs have the same numbers of parameters. Pairs with a member that its mate imitates
+        All pairs have the same numbers of parameters. Pairs in which one effect imitates the other
         are omitted.
         """
-        every = np.arange(len(self.right))
-        places = np.array([[*every[self.at[one]], *every[self.at[two]]] for one, two in pairs])
+        indices = np.arange(len(self.right))
+        params_of_pairs = []
+        for one, two in pairs:
+            params_of_pairs.append([*indices[self.params_of[one]], *indices[self.params_of[two]]])
+        places = np.array(params_of_pairs)
         n_first = self.size(pairs[0][0])
         systems = self.matrix[places[:, :, None], places[:, None, :]]
         systems = systems + 1e4 * JITTER * np.eye(places.shape[1])
@@ -319,7 +323,7 @@ class _Blocks:
         # The loss falls by x' b at the solution x of M x = b.
         values = np.linalg.solve(systems, self.right[places][:, :, None])[:, :, 0]
         fall = np.einsum('ki,ki->k', values, self.right[places])
-        # Share |M_21 x_1|^2 / |x_1|^2 of the signal of each member that its mate imitates.
+        # Share |M_21 x_1|^2 / |x_1|^2 of the signal of each effect that the other imitates.
         cross = systems[:, :n_first, n_first:]
         first = values[:, :n_first]
         second = values[:, n_first:]
