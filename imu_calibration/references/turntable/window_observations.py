@@ -73,8 +73,9 @@ def error_budget(data: 'WindowObservations', solution: Solution) -> ErrorBudget:
     """
     Return the ErrorBudget of a calibration on a table.
 
-    First order, around the solution; weights of the solver. All windows at rest are used, and the
-    moving windows with kept samples.
+    The shifts of the parameters by each error of the reference are of first order, with the weights
+    of the solver (`parameter_shifts`). All windows at rest are used, and the moving windows with
+    kept samples.
 
     Parameters
     ----------
@@ -97,12 +98,12 @@ def error_budget(data: 'WindowObservations', solution: Solution) -> ErrorBudget:
     texts = {'noise': 'noise and wander of the sensors, as this recording shows them'}
     start = 0
     for error in errors:
-        moved = shifts[start : start + len(error.changes)]
+        shifts_of_error = shifts[start : start + len(error.changes)]
         start += len(error.changes)
         # Squares of independent shifts are summed over windows, common shifts before squaring.
         if not error.scattered:
-            moved = moved.sum(axis=1, keepdims=True)
-        causes[error.name] = np.sqrt((moved**2).sum(axis=(0, 1)))
+            shifts_of_error = shifts_of_error.sum(axis=1, keepdims=True)
+        causes[error.name] = np.sqrt((shifts_of_error**2).sum(axis=(0, 1)))
         texts[error.name] = error.text
     return ErrorBudget(tuple(solution.param_names), causes, texts)
 

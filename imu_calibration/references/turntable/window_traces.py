@@ -301,7 +301,8 @@ def _drifts(
     """
     Return the [velocity, position] error of dead reckoning with each model, m/s and m.
 
-    After `DEAD_RECKONING` seconds from the start of the windows, which must have no gap.
+    The errors are those after `DEAD_RECKONING` seconds from the start of the windows, which must
+    have no gap.
     """
     motion, temperature, rows = all_samples(windows)
     time = np.concatenate([window.time for window in windows])

@@ -72,11 +72,11 @@ def attitude_dependence(
     residual = white[:, -1]
     squares_0 = float(residual @ residual - np.sum((of_design.T @ residual) ** 2))
     squares_1 = float(residual @ residual - np.sum((of_both.T @ residual) ** 2))
-    freedom_0 = len(residual) - of_design.shape[1]
-    freedom_1 = len(residual) - of_both.shape[1]
-    n_added = freedom_0 - freedom_1
-    if n_added == 0 or freedom_1 < MIN_SPARE or squares_1 <= 0:
+    dof_0 = len(residual) - of_design.shape[1]
+    dof_1 = len(residual) - of_both.shape[1]
+    n_added = dof_0 - dof_1
+    if n_added == 0 or dof_1 < MIN_SPARE or squares_1 <= 0:
         return None
-    ratio = (squares_0 / freedom_0) / (squares_1 / freedom_1)
-    f_value = ((squares_0 - squares_1) / n_added) / (squares_1 / freedom_1)
-    return AttitudeDependence(ratio, float(f_sf(f_value, n_added, freedom_1)))
+    ratio = (squares_0 / dof_0) / (squares_1 / dof_1)
+    f_value = ((squares_0 - squares_1) / n_added) / (squares_1 / dof_1)
+    return AttitudeDependence(ratio, float(f_sf(f_value, n_added, dof_1)))

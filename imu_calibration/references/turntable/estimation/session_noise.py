@@ -237,9 +237,7 @@ def white_noise(
     rows: Sequence[WindowStatistics], sensor: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """
-    Return (white_variance, inflation) pooled over static windows, each shape (3,).
-
-    Or None without static windows.
+    Return (white_variance, inflation) pooled over static windows, each shape (3,), None without.
 
     Windows whose variance differs from the median by more than a factor of two (clipped, knocked)
     are excluded. If vibration varies, the reference is the quietest level instead of the median,
@@ -264,22 +262,22 @@ def white_noise(
     inflations = np.array([row.sensors[sensor].inflation for row in static])
     counts = np.array([row.count for row in static], float)
 
-    pooled = np.empty(3)
-    factors = np.empty(3)
+    white_variance = np.empty(3)
+    inflation = np.empty(3)
     for axis in range(3):
         usual, shaken = _usual(variances[:, axis], inflations[:, axis])
         near = (variances[:, axis] <= 2 * usual) & (variances[:, axis] >= 0.5 * usual)
         weight = counts * near
-        pooled[axis] = usual
+        white_variance[axis] = usual
         if weight.sum():
-            pooled[axis] = np.average(variances[:, axis], weights=weight)
+            white_variance[axis] = np.average(variances[:, axis], weights=weight)
         # Short windows have no means of pieces, and hence no inflation.
         weight = (counts >= MIN_INFLATION_SAMPLES) * near
-        factors[axis] = 1.0
+        inflation[axis] = 1.0
         if weight.sum():
-            factors[axis] = np.average(inflations[:, axis], weights=weight)
-        factors[axis] = max(factors[axis], MIN_SHAKEN_INFLATION if shaken else MIN_INFLATION)
-    return np.maximum(pooled, LEAST_NOISE[sensor] ** 2), factors
+            inflation[axis] = np.average(inflations[:, axis], weights=weight)
+        inflation[axis] = max(inflation[axis], MIN_SHAKEN_INFLATION if shaken else MIN_INFLATION)
+    return np.maximum(white_variance, LEAST_NOISE[sensor] ** 2), inflation
 
 
 def _rests(rows: Sequence[WindowStatistics], sensor: str) -> list[WindowStatistics]:
@@ -386,7 +384,8 @@ def updated_noise(
     # Centred rows: the excess over the noise at rest.
     moving = {}
     for kind in system.within[sensor]:
-        moving[kind] = _judged(system, sensor, kind, values).factors(noise)
+        misfit = _misfit_with_correlation(system, sensor, kind, values)
+        moving[kind] = misfit.factors(noise)
     noise = replace(noise, moving=moving)
 
     # Means: offsets of windows and bias processes.
@@ -394,11 +393,14 @@ def updated_noise(
     return replace(noise, **estimate_offsets(rows))
 
 
-def _judged(system: WeightedSystem, sensor: str, kind: str, values: np.ndarray) -> BandMisfit:
+def _misfit_with_correlation(
+    system: WeightedSystem, sensor: str, kind: str, values: np.ndarray
+) -> BandMisfit:
     """
-    Return the misfit of the centred rows of a kind.
+    Return the misfit of the centred rows of one kind of window at the estimate `values`.
 
-    Of the fast part at least the misfit along the parameters.
+    Where the two bands differ, the misfit of the fast one is at least that along the parameters
+    (`misfit_along`).
     """
     misfit = moving_misfit(system, sensor, kind, values=values)
     if not misfit.apart.any():
@@ -415,21 +417,22 @@ def _judged(system: WeightedSystem, sensor: str, kind: str, values: np.ndarray) 
 
     all_rows = system.within[sensor][kind]
     slow_rows = system.accumulator.slow[sensor, kind]
-    along = np.zeros(3)
+    along_parameters = np.zeros(3)
     for axis in range(3):
-        of_fast = products(all_rows, axis) - products(slow_rows, axis)
-        squares, rank = misfit_along(of_fast[None])
-        along[axis] = squares / max(rank, 1)
-    return replace(misfit, fast=np.where(misfit.apart, np.maximum(misfit.fast, along), misfit.fast))
+        fast_products = products(all_rows, axis) - products(slow_rows, axis)
+        squares, rank = misfit_along(fast_products[None])
+        along_parameters[axis] = squares / max(rank, 1)
+    larger = np.maximum(misfit.fast, along_parameters)
+    return replace(misfit, fast=np.where(misfit.apart, larger, misfit.fast))
 
 
 def moving_misfit(
     system: WeightedSystem, sensor: str, kind: str, *, values: np.ndarray | None = None
 ) -> BandMisfit:
     """
-    Return the misfit of the centred rows of a kind at `values`.
+    Return the misfit of the centred rows of one kind of window at the parameters `values`.
 
-    Without them, of each part at its own best fit.
+    Without values, the misfit of all rows and that of the slow rows are each at their best fit.
     """
     accumulator = system.accumulator
     rows = system.within[sensor][kind]

@@ -426,8 +426,8 @@ def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> 
             attitude[sensor] = dependence
         misfit = system.misfit(sensor, system.means[sensor], values)
         white = system.mean_rows(misfit[:, :, None], noise).white()
-        freedom = max(white.size - _parameters_of_means(system, sensor), 1)
-        chi2[sensor] = {'means': float((white**2).sum() / freedom)}
+        dof = max(white.size - _parameters_of_means(system, sensor), 1)
+        chi2[sensor] = {'means': float((white**2).sum() / dof)}
 
         # Centred rows of each kind of moving window.
         slow_over_fast[sensor] = {}

@@ -121,7 +121,7 @@ class WeightedSystem(WindowMeans):
         Yield (centred rows ``[columns | output]``, weight of each axis, shape (3,)).
 
         For each kind of window all rows, then the rows of their slow part with the weight that they
-        have in addition, if any. Of all windows, or of one block.
+        have in addition, if any. The rows are those of one block, by default of all windows.
         """
         source: Accumulator | WindowBlock = block or self.accumulator
         for kind in self.within[sensor]:

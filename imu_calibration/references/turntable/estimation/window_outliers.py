@@ -125,12 +125,12 @@ class _MeanFit:
         imitated = np.einsum('kap,pq,aq->ka', self.design, self.covariance, gradient)
         improved = self.residual - (column - imitated) * offset
 
-        # F test of three offsets with the residual degrees of freedom of these windows.
+        # F test of three offsets with the residual degrees of dof of these windows.
         design = self.design[of_kind]
         leverage = np.einsum('kap,pq,kaq->ka', design, self.covariance, design).sum()
-        freedom = 3 * len(of_kind) - leverage - 3
-        if freedom < MIN_WINDOW_FREEDOM:
+        dof = 3 * len(of_kind) - leverage - 3
+        if dof < MIN_WINDOW_FREEDOM:
             return 1.0
         without_offset = (self.residual[of_kind] ** 2).sum()
         with_offset = (improved[of_kind] ** 2).sum()
-        return chance_of_fall(without_offset - with_offset, 3, rest=with_offset, spare=freedom)
+        return chance_of_fall(without_offset - with_offset, 3, rest=with_offset, spare=dof)

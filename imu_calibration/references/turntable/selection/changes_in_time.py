@@ -301,8 +301,8 @@ class ChangingColumns:
             squares[rows.part][at_squares] += white.T @ white
 
             # Within windows, where the function is constant: sum_w f_w P_w and sum_w f_w g_w P_w.
-            along = np.tensordot(axis.within, functions, (0, 0)).transpose(0, 2, 1)
-            both = np.tensordot(pairs, axis.squares, (0, 0)).transpose(0, 2, 1, 3)
-            cross[rows.part + 1][at_cross] += along.reshape(len(rows.places), -1)
-            squares[rows.part + 1][at_squares] += both.reshape(len(places), -1)
+            with_model = np.tensordot(axis.within, functions, (0, 0)).transpose(0, 2, 1)
+            of_pairs = np.tensordot(pairs, axis.squares, (0, 0)).transpose(0, 2, 1, 3)
+            cross[rows.part + 1][at_cross] += with_model.reshape(len(rows.places), -1)
+            squares[rows.part + 1][at_squares] += of_pairs.reshape(len(places), -1)
         return Changes(cross, squares)

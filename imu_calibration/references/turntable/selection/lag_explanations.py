@@ -120,7 +120,7 @@ class LagExplanations:
     """Each costs less than no lag."""
     rest: Sequence[Question]
     """Chosen effects that are no lags."""
-    silent: float | None
+    cost_without_lag: float | None
     """Held-out cost without any lag, nats, without rests; None where rests determine the noise."""
 
     def others(
@@ -141,7 +141,7 @@ class LagExplanations:
 
     def select(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
         """Return the simplest explanation with at most `most` effects that is not refused."""
-        return simplest(self.others(most, refused), self.silent)
+        return simplest(self.others(most, refused), self.cost_without_lag)
 
     def settled(self, selected: Explanation, searched: SearchedWindows) -> 'SettledLags':
         """Return an explanation with the problem linearised at its lags."""
@@ -211,30 +211,32 @@ def lag_explanations(
         if question.name in CLOCKS:
             for k in question.parameters:
                 clocks[problem.space.names[k]] = float(values[k])
-    described = _described(searched, effects, rest=rest, clocks=clocks or None)
+    hypotheses = _described(searched, effects, rest=rest, clocks=clocks or None)
 
-    judges = [each.problem for each in described]
-    names = [name for name in described[0].values if name.split('.')[1] not in FAMILY]
-    explanations = _explanations(described, judges, names)
+    judges = [each.problem for each in hypotheses]
+    names = [name for name in hypotheses[0].values if name.split('.')[1] not in FAMILY]
+    explanations = _explanations(hypotheses, judges, names)
     if not explanations:
         return None
 
     # Without rests the noise is that of the misfit: the cost without a lag is the scale of costs.
-    silent = None
+    cost_without_lag = None
     if problem.recording.moving.all():
-        without = [question for question in described[0].chosen if question.name not in FAMILY]
-        silent = sum(_cost(described[0], without, judges, sensor) for sensor in SENSORS)
-    return LagExplanations(problem, explanations, rest, silent)
+        without = [question for question in hypotheses[0].chosen if question.name not in FAMILY]
+        cost_without_lag = sum(_cost(hypotheses[0], without, judges, sensor) for sensor in SENSORS)
+    return LagExplanations(problem, explanations, rest, cost_without_lag)
 
 
-def simplest(explanations: Sequence[Explanation], silent: float | None = None) -> Explanation:
+def simplest(
+    explanations: Sequence[Explanation], cost_without_lag: float | None = None
+) -> Explanation:
     """
     Return the simplest explanation within the search's price of the best.
 
     Parameters
     ----------
     explanations : sequence of Explanation
-    silent : float, optional
+    cost_without_lag : float, optional
         Cost without any lag, for a recording without rests: an explanation of as many effects with
         a common clock is then accepted within the resolution of the misfit.
 
@@ -242,15 +244,15 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
     best = min(each.cost for each in explanations)
     near = [each for each in explanations if each.cost < best + TIE]
     selected = min(near, key=lambda each: each.rank)
-    if silent is None or len(selected.lags) < 2 or CLOCK in selected.lags:
+    if cost_without_lag is None or len(selected.lags) < 2 or CLOCK in selected.lags:
         return selected
-    dearest = best + TIE + MAX_CLOCK_LOSS * (silent - best)
-    common = []
+    largest_cost = best + TIE + MAX_CLOCK_LOSS * (cost_without_lag - best)
+    with_common_clock = []
     for each in explanations:
         has_as_many = CLOCK in each.lags and len(each.lags) == len(selected.lags)
-        if has_as_many and each.cost < dearest:
-            common.append(each)
-    return simplest(common) if common else selected
+        if has_as_many and each.cost < largest_cost:
+            with_common_clock.append(each)
+    return simplest(with_common_clock) if with_common_clock else selected
 
 
 def _described(
@@ -325,14 +327,14 @@ def _hypothesis(
 
 
 def _explanations(
-    described: Sequence[LagHypothesis], judges: Sequence[LinearisedProblem], names: Sequence[str]
+    hypotheses: Sequence[LagHypothesis], judges: Sequence[LinearisedProblem], names: Sequence[str]
 ) -> list[Explanation]:
     """
     Return every Explanation of a lag of each sensor that costs less than no lag.
 
     Parameters
     ----------
-    described : sequence of LagHypothesis
+    hypotheses : sequence of LagHypothesis
     judges : sequence of LinearisedProblem
         Problems whose noise judges the costs.
     names : sequence of str
@@ -343,12 +345,12 @@ def _explanations(
     options = []
     cost_without = 0.0
     for sensor in SENSORS:
-        no_lag = _without_lag(described[0], judges, sensor)
+        no_lag = _without_lag(hypotheses[0], judges, sensor)
         cost_without += no_lag.cost
         of_sensor = [no_lag]
-        for hypothesis in described:
+        for hypothesis in hypotheses:
             of_sensor.append(_option(hypothesis, judges, sensor))
-        if len(described) == 1:
+        if len(hypotheses) == 1:
             # Without curvature the kinds are one column.
             for ending in ('bandwidth', 'filter'):
                 of_sensor.append(replace(of_sensor[1], kind=(ending,), alike=True))
@@ -428,9 +430,10 @@ def _cost(
 
 def _described_together(one: _Option, two: _Option, names: Sequence[str]) -> Iterator[Explanation]:
     """
-    Yield the explanations of two sensors' lags.
+    Yield the explanations of two sensors' lags in which the lags of the sensors are positive.
 
-    Separate lags, or a common clock and the additional lags of each.
+    The lags are separate, or a common clock and the additional lags of each sensor. `names` are the
+    parameters of which an explanation has the values.
     """
     values = {}
     for name in names:
@@ -501,9 +504,9 @@ def _rivals(
             # The change of the parameters counts once for each replaced lag.
             known = {rival.question.name for rival in rivals.values()}
             rivals[name] = Rival(
-                question_of[replaced],
-                question_of[name],
-                other.cost - selected.cost,
-                {} if replaced in known else moves,
+                question=question_of[replaced],
+                other=question_of[name],
+                behind=other.cost - selected.cost,
+                moves={} if replaced in known else moves,
             )
     return list(rivals.values())

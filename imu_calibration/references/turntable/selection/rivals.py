@@ -118,7 +118,8 @@ def settle_rivals(
         moves = {}
         for name in problem.baseline.param_names:
             moves[name] = values[k][name] - values[best][name]
-        rivals.append(Rival(question, other, float(costs[k] - costs[best]), moves))
+        behind = float(costs[k] - costs[best])
+        rivals.append(Rival(question, other, behind=behind, moves=moves))
     return settled, rivals
 
 

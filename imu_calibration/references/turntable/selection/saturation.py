@@ -116,8 +116,8 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     """
     Return the parameters of a model by one least-squares step from its start, shape (n_params,).
 
-    On thinned samples of moving windows and on the means of static ones, all with the weight of one
-    sample at rest.
+    The rows are a part of the samples of moving windows and the means of static ones, all with the
+    weight of one sample at rest.
     """
     start = np.where(np.isfinite(model.start()), model.start(), 0.0)
     prior, sd = model.prior()
@@ -257,15 +257,15 @@ def without_clipped(
     """
     kept = []
     for window, of_sensors in zip(windows, predicted):
-        good = np.ones(len(window.time), bool)
+        usable = np.ones(len(window.time), bool)
         for sensor, level in levels.items():
             near = np.abs(of_sensors[sensor]) > level - CLIP_MARGIN_SDS * noise_sd[sensor]
             clipped = np.abs(measured(window, sensor)) >= level * SAME_LEVEL
-            good &= ~(near | clipped).any(axis=1)
-        if good.all():
+            usable &= ~(near | clipped).any(axis=1)
+        if usable.all():
             kept.append(window)
-        elif window.kind != 'static' and good.sum() >= MIN_LEFT_SAMPLES:
-            kept.append(window.select(good))
+        elif window.kind != 'static' and usable.sum() >= MIN_LEFT_SAMPLES:
+            kept.append(window.select(usable))
     return kept
 
 
@@ -285,34 +285,34 @@ def without_clipping(
     output is a limit.
     """
     locked = locked_windows(np.array([window.kind for window in windows]))
-    piled = _piled(windows)
-    found = _limits(windows_at(windows, piled | ~locked), table, model)
-    if found is None or not found.limits:
+    at_limit = _windows_at_limit(windows)
+    fit = _limits(windows_at(windows, at_limit | ~locked), table, model)
+    if fit is None or not fit.limits:
         return windows, locked, []
-    locked &= ~piled
+    locked &= ~at_limit
 
     # Windows are cut at their clipped samples: locked and other ones separately, then in the order
     # of time again.
-    levels = {limit.sensor: limit.level for limit in found.limits}
+    levels = {limit.sensor: limit.level for limit in fit.limits}
     entries = []
     for is_locked in (False, True):
         part = windows_at(windows, locked == is_locked)
-        predicted = predictions(part, table, model, values=found.values)
-        for window in without_clipped(part, predicted, levels, noise_sd=found.noise_sd):
+        predicted = predictions(part, table, model, values=fit.values)
+        for window in without_clipped(part, predicted, levels, noise_sd=fit.noise_sd):
             entries.append((window.time[0], is_locked, window))
     entries.sort(key=lambda entry: entry[:2])
     kept = [window for _, _, window in entries]
-    return kept, np.array([is_locked for _, is_locked, _ in entries]), found.limits
+    return kept, np.array([is_locked for _, is_locked, _ in entries]), fit.limits
 
 
-def _piled(windows: Sequence[Window]) -> np.ndarray:
+def _windows_at_limit(windows: Sequence[Window]) -> np.ndarray:
     """Return a mask of the windows with the largest output of a sensor that may be clipped."""
-    piled = np.zeros(len(windows), bool)
+    at_limit = np.zeros(len(windows), bool)
     for sensor in sensors_of(windows):
         if may_be_clipped(windows, sensor):
             largest = np.array([np.abs(measured(window, sensor)).max() for window in windows])
-            piled |= largest >= largest.max() * SAME_LEVEL
-    return piled
+            at_limit |= largest >= largest.max() * SAME_LEVEL
+    return at_limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +347,7 @@ def _limits(windows: Sequence[Window], table: Table, model: SensorModel) -> _Lim
     for _ in range(2):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
         kept = without_clipped(windows, predicted, largest_readings, noise_sd=noise_sd)
-        # An output that is always at or near its limit does not determine it.
+        # Too few windows are below the limit: an output always near it does not determine it.
         if len(kept) < MIN_FOLD_WINDOWS:
             return None
 

@@ -229,9 +229,9 @@ class WindowEvidence(Evidence):
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """
-        Return the p-value of some of the parameters `used`.
+        Return the p-value of some of the parameters `used` being zero; 0 with few windows.
 
-        From their scatter over windows (Hotelling's T^2); 0 with few windows.
+        It is that of Hotelling's T^2 with the scatter of the estimates over windows.
 
         With the slopes ``g_k = A_k' V_k^-1 e_k`` of the windows at the fit and its covariance C,
         the estimates have the covariance ``C sum(g_k g_k') C`` for any noise. The model has white
@@ -248,10 +248,11 @@ class WindowEvidence(Evidence):
             of_kind = {name: self.noise[sensor].row_variance(name) for name in np.unique(kind)}
             variance = np.array([of_kind[name] for name in kind])
             for axis, means in enumerate(self._white[sensor]):
-                at = self.space.places(sensor, axis)
-                within = self.space.slopes_within(sensor, axis, weights[at])
+                places = self.space.places(sensor, axis)
+                of_axis = weights[places]  # times these weights, columns give the residual
+                within = self.space.slopes_within(sensor, axis, of_axis)
                 within = within / variance[:, axis : axis + 1]
-                slopes[:, at] += means * (means @ weights[at])[:, None] + within
+                slopes[:, places] += means * (means @ of_axis)[:, None] + within
 
         # Shifts of the estimates by each window, in sds, and their scatter.
         places = [list(used).index(k) for k in parameters]
@@ -266,7 +267,7 @@ class WindowEvidence(Evidence):
             return 0.0
 
         # T^2 = z' S^-1 z, an F statistic with rank and n_windows - rank degrees of freedom.
-        along = (directions.T @ (values[places] / sd))[observable]
-        t_squared = (along**2 / scatter[observable]).sum()
-        ratio = dof / (rank * (n_windows - 1)) * t_squared
-        return float(f_sf(ratio, rank, dof))
+        in_directions = (directions.T @ (values[places] / sd))[observable]
+        t_squared = (in_directions**2 / scatter[observable]).sum()
+        f_ratio = dof / (rank * (n_windows - 1)) * t_squared
+        return float(f_sf(f_ratio, rank, dof))
