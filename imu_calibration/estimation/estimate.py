@@ -124,4 +124,6 @@ def estimate(
 
     # 4. The covariance as a sum of named terms.
     terms = terms_of_fit(of_free, rows.scatter_term(of_free), of_held)
-    return JointEstimate(state, rows, terms, held, free, not_believed)
+    return JointEstimate(
+        state=state, rows=rows, terms=terms, held=held, free=free, not_believed=not_believed
+    )

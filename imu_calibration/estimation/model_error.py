@@ -143,8 +143,8 @@ def waves_of_blocks(
     squared = np.einsum('kc,cij->kij', weights**2, information)
     expected = squared - mixed @ covariance @ mixed
     if shared is not None:
-        along = np.einsum('kc,cdi->kdi', weights, shared[:, :, free])
-        expected -= along.transpose(0, 2, 1) @ along
+        nuisance_products = np.einsum('kc,cdi->kdi', weights, shared[:, :, free])  # L_k
+        expected -= nuisance_products.transpose(0, 2, 1) @ nuisance_products
     expected = covariance @ expected @ covariance
     return CosineScores(np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance)
 
@@ -171,9 +171,10 @@ class CosineScores:
 
     def group(self, part: slice) -> np.ndarray:
         """
-        Return the indices among the free parameters of one effect, whose parameters are `part`.
+        Return the indices, among the free parameters, of those of one effect.
 
-        Without parameters of which the recording contains almost no information.
+        The effect has the parameters `part` of the model. Parameters of which the recording
+        contains almost no information are omitted.
         """
         least = LEAST_SHARE_OF_DATA * np.diag(self.covariance)
         informed = np.all(np.einsum('kii->ki', self.expected) > least, axis=0)

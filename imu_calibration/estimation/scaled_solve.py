@@ -202,9 +202,10 @@ def covariance_with_held(
 
 def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
     """
-    Return an orthonormal basis of columns of unit length, maybe dependent.
+    Return an orthonormal basis of the space of some columns, shape (n_rows, rank).
 
-    Singular values above `least` of the largest count.
+    The columns may be dependent: with unit length, singular values above `least` of the largest
+    count for the rank.
     """
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]

@@ -127,8 +127,8 @@ class Whitening:
             ones = self._ones[index]
             square = (ones**2).sum(axis=0)
             shrink = (1 - 1 / np.sqrt(1 + self._session_variance * square)) / square
-            along = np.einsum('ka,kaq->aq', ones, white[index])
-            white[index] -= (shrink * ones)[:, :, None] * along
+            projected = np.einsum('ka,kaq->aq', ones, white[index])  # u' times the rows
+            white[index] -= (shrink * ones)[:, :, None] * projected
         return white
 
 

@@ -101,13 +101,13 @@ class Evidence:
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (matrix, right side) of the normal equations of all parameters, with the prior.
+        Return (matrix (q, q), right side (q,)) of the normal equations of all parameters.
 
-        Of all rows, shapes (q, q) and (q,).
+        They contain all rows and the prior.
         """
-        known = 1 / self.prior_sd**2
-        matrix = self.total[:-1, :-1] + np.diag(known)
-        right = self.total[:-1, -1] + known * self.prior_mean
+        prior_information = 1 / self.prior_sd**2
+        matrix = self.total[:-1, :-1] + np.diag(prior_information)
+        right = self.total[:-1, -1] + prior_information * self.prior_mean
         return matrix, right
 
     def fit(self, used: Sequence[int]) -> ParameterFit:

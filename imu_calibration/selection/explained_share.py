@@ -68,8 +68,8 @@ class Explained:
         """
         Return the excess over noise of each part in standard deviations, shape (n_parts,).
 
-        The larger one of all axes together and of the worst axis, with a stricter limit: two quiet
-        axes dilute the excess of the third.
+        It is the larger value of all axes together and of the worst axis, with a stricter limit:
+        two quiet axes dilute the excess of the third.
         """
         together, alone = self._sigmas(sensor, excess)
         return np.maximum(together, alone.max(axis=1))
@@ -108,9 +108,9 @@ class Explained:
         """
         Return the least ``removed / (removed + remaining)`` of the sensors in which an effect acts.
 
-        Of the excess over noise with and without the effect in the choice. In each sensor only the
-        parts with the effect count (means of windows, within windows, or both): an unexplained
-        excess in the other part does not hide it.
+        Removed is the fall of the excess over noise by the effect in the choice, remaining the
+        excess with it. In each sensor only the parts with the effect count (means of windows,
+        within windows, or both): an unexplained excess in the other part does not hide it.
         """
         shares = []
         for removed, remaining in self._where_it_shows(chosen, question):

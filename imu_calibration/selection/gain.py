@@ -85,7 +85,15 @@ def gain_of(
         rms.append(float(np.sqrt(squares.sum() / max(number.sum(), 1))))
     before, after = rms
     n_groups = len(pair[0][0])
-    return Gain(sensor, measure, before, after, reduction_interval(pair), n_groups, of)
+    return Gain(
+        sensor=sensor,
+        measure=measure,
+        heldout_rms_before=before,
+        heldout_rms_after=after,
+        ci95=reduction_interval(pair),
+        windows=n_groups,
+        of=of,
+    )
 
 
 def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:

@@ -178,4 +178,15 @@ def ranged(
         return f'while the {name} is {low:.3g} to {high:.3g} {unit}'
 
     bins = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
-    return [Variable(name, bins, edges, False, words, values, starts, is_rate)]
+    return [
+        Variable(
+            name,
+            bins,
+            edges,
+            cyclic=False,
+            words=words,
+            values=values,
+            starts=starts,
+            is_rate=is_rate,
+        )
+    ]

@@ -28,7 +28,7 @@ class StampJitter:
         return {'sd_s': self.sd, 'variance_ratio': self.ratio} if self.significant else {}
 
 
-NO_JITTER = StampJitter(0.0, False)
+NO_JITTER = StampJitter(sd=0.0, significant=False)
 """Where no errors are estimated."""
 
 

@@ -112,7 +112,7 @@ class RowEvidence(Evidence):
         for left_out in (second, first, no_groups):
             # The noise is estimated with the effects in the model, as part of the baseline.
             blocks = without_groups(self.blocks, left_out)
-            fits.append(RowEvidence(blocks, self.prior_sd, {}, baseline=used).fit(used))
+            fits.append(RowEvidence(blocks, self.prior_sd, smooth={}, baseline=used).fit(used))
         return fits[0], fits[1], fits[2]
 
     def weights(self, used: Sequence[int]) -> np.ndarray:

@@ -508,7 +508,7 @@ class GatherStep:
             gathered = self._gather(
                 self.blocks(source),
                 session,
-                (),
+                watchers=(),  # the checks have seen all samples
                 windows=windows,
                 without=preflight.without_readings,
                 unusable=tuple(preflight.unusable),

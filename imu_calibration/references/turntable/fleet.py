@@ -154,10 +154,10 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
         When no unit was calibrated.
 
     """
-    good = [
+    calibrated = [
         (result.name, result.calibration) for result in results if result.calibration is not None
     ]
-    if not good:
+    if not calibrated:
         first = f'; the first, {results[0].name}: {results[0].error}' if results else ''
         raise InputError(
             f'at least one unit must be calibrated, none of {len(results)} was{first}',
@@ -165,7 +165,7 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
         )
     estimates_of: dict[str, list[_Estimate]] = {}  # parameter -> estimates that are not held
     si_units: dict[str, str] = {}  # parameter -> SI unit
-    for unit_name, calibration in good:
+    for unit_name, calibration in calibrated:
         for effect in calibration.model.effects:
             for index, name in enumerate(effect.param_names()):
                 si_units[name] = effect.unit_of(index)
@@ -197,7 +197,16 @@ def _spread(name: str, si_unit: str, estimates: Sequence[_Estimate]) -> Spread:
     """Return the spread of a parameter over the units; NaN without any estimate."""
     if not estimates:
         missing = float('nan')
-        return Spread(name, si_unit, 0, missing, missing, missing, (missing, ''), (missing, ''))
+        return Spread(
+            name,
+            si_unit,
+            count=0,
+            mean=missing,
+            spread=missing,
+            typical_sd=missing,
+            lowest=(missing, ''),
+            highest=(missing, ''),
+        )
     value = np.array([estimate.value for estimate in estimates])
     sd = np.array([estimate.sd for estimate in estimates])
     lowest = estimates[int(np.argmin(value))]

@@ -163,7 +163,8 @@ class NoiseModel(SensorNoise):
         """
         Return the variance of window means about the bias in the middle of the window, (k, 3).
 
-        That of `mean_variance`, and that of the change of the bias within the window.
+        It is the sum of `mean_variance` and of the variance by the change of the bias within the
+        window.
         """
         noise = self.mean_variance(kinds, counts, durations, keys=keys)
         return noise + means_beside_middles(self.bias_processes, durations)[:, None]

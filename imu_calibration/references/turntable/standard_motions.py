@@ -112,15 +112,15 @@ def _turn(
     if arm is not None:
         force = force + np.cross(alpha_s, arm) + np.cross(rate_s, np.cross(rate_s, arm))
     return Reference(
-        time,
-        attitudes_with_vertical(up_s),
-        force,
-        rate_s,
-        alpha_s,
-        gravity,
-        surroundings.temperature_c,
-        surroundings.branch,
-        None if shaking is None else np.tile(shaking, (len(time), 1)),
+        time=time,
+        mat_sn=attitudes_with_vertical(up_s),
+        force_s=force,
+        rate_s=rate_s,
+        alpha_s=alpha_s,
+        gravity=gravity,
+        temperature_c=surroundings.temperature_c,
+        branch=surroundings.branch,
+        shaking=None if shaking is None else np.tile(shaking, (len(time), 1)),
         warming=surroundings.warming,
     )
 
@@ -341,8 +341,9 @@ def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
     else:
         return ()
     # Component of the vertical along the axis; the remaining one is along the next axis.
-    along = float(np.clip(np.dot(axis_s, up_s) * np.sign(cosine), -1.0, 1.0))
-    up = along * np.array(axis, float) + np.sqrt(1.0 - along**2) * np.roll(axis, 1)
+    up_along_axis = float(np.clip(np.dot(axis_s, up_s) * np.sign(cosine), -1.0, 1.0))
+    up_across = np.sqrt(1.0 - up_along_axis**2)
+    up = up_along_axis * np.array(axis, float) + up_across * np.roll(axis, 1)
     return _motions_about(axis, tuple(up.tolist()))
 
 

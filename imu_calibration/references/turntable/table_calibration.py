@@ -120,9 +120,9 @@ class TableRecordings:
             model,
             options.windows,
             options.nominal,
-            self.names,
-            keep_windows,
-            judged_from,
+            names=self.names,
+            spread=keep_windows,
+            judged_from=judged_from,
         )
         parts = self.reduced(step)
         gathered = join(parts, self.names, model=model, table=self.table)

@@ -45,7 +45,7 @@ def calibrate_with_table_errors(
     """
     result = conclude(recordings.solved(options), options)
     if options.as_asked or not _unlike_noise(result):
-        return TableErrors(result, ())
+        return TableErrors(result, findings=())
     # The ones that the table has: the zero of the first joint is part of the attitude of the base.
     added = []
     for key, effect in result.model.catalogue.effects(recordings.table.joint_names).items():

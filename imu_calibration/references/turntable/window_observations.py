@@ -276,7 +276,15 @@ def _sources(gathered: SessionData) -> Iterator[_Source]:
     for time, session, position in gathered.poses:
         motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
         count = counts.get((session, time), typical)
-        yield _Source('static', time, session, count, 1, motion, None)
+        yield _Source(
+            kind='static',
+            time=time,
+            session=session,
+            samples=count,
+            stride=1,
+            motion=motion,
+            temperature_c=None,
+        )
     stride = max(1, int(np.ceil(sum(len(w) for w in gathered.kept) / MOVING_SAMPLES)))
     for window in gathered.kept:
         used = slice(None, None, stride)

@@ -110,17 +110,20 @@ def solve(
 
     of_model = model_error(system, values, noises, free=joint.free)
     quality = _fit_quality(system, values, noises)
+    not_believed = {}
+    for number, value in joint.not_believed.items():
+        not_believed[model.param_names[number]] = value
     return Solution(
-        model,
-        values,
-        {**joint.terms, **of_model.terms(total(joint.terms))},
-        joint.held,
-        noises,
-        quality.chi2,
-        joint.rows.data.T @ joint.rows.data,
-        quality.rms,
-        _session_biases(system, values, noises),
-        {model.param_names[number]: value for number, value in joint.not_believed.items()},
+        model=model,
+        values=values,
+        terms={**joint.terms, **of_model.terms(total(joint.terms))},
+        held=joint.held,
+        noise=noises,
+        chi2_per_dof=quality.chi2,
+        information=joint.rows.data.T @ joint.rows.data,
+        residual_rms=quality.rms,
+        session_biases=_session_biases(system, values, noises),
+        not_believed=not_believed,
         slow_over_fast=quality.slow_over_fast,
         attitude=quality.attitude,
     )

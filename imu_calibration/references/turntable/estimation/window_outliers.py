@@ -66,7 +66,7 @@ def _outliers_of_kind(of_kind: np.ndarray, excluded: np.ndarray, fit: '_MeanFit'
     n_excluded = n_windows - len(included)
     n_allowed = max(1, int(MAX_WINDOW_OUTLIERS * n_windows)) - n_excluded
     if n_allowed <= 0:
-        return Outliers(1.0, ())
+        return Outliers(least_p_value=1.0, numbers=())
 
     # The windows with the largest residuals are tested.
     squares = (fit.residual[included] ** 2).sum(axis=1)

@@ -146,7 +146,7 @@ def _groups(model: SensorModel, sensors: Sequence[str]) -> list[_Group]:
     groups = []
     for effect in model.effects:
         if effect.sudden:
-            groups.append(_Group(effect.name, numbers[model.slices[effect.key]], None))
+            groups.append(_Group(effect.name, numbers[model.slices[effect.key]], role=None))
     # A shock or a new start of a sensor changes its biases, a displaced mount its matrix.
     for prefix, role in (('bias of ', Role.OFFSET), ('', Role.LINEAR)):
         parts = [numbers[model.part(sensor, role)] for sensor in sensors]

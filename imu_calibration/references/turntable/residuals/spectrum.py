@@ -355,7 +355,7 @@ def find_tones(
     tones = {}
     for sensor, of_windows in residual_of.items():
         stretches = _stretches_of_time(windows, of_windows)
-        tones[sensor] = _significant(of_stretches(sensor, stretches, None), n_tests)
+        tones[sensor] = _significant(of_stretches(sensor, stretches, joint=None), n_tests)
         for tone in tones[sensor].values():
             axis = AXES.index(tone.axis)
             for window, residual in zip(windows, of_windows):
@@ -428,15 +428,15 @@ def _tones_of_orders(
         if clear.any():
             best = int(np.argmin(np.where(clear, orders.p_value[:, column], np.inf)))
             yield Tone(
-                sensor,
-                AXES[axis],
-                joint,
-                float(orders.order[best]),
-                float(orders.amplitude[best, column]),
-                float(orders.p_value[best, column] * len(orders.order)),
-                float(orders.share[best, column]),
-                orders.order,
-                orders.power[:, column],
+                sensor=sensor,
+                axis=AXES[axis],
+                joint=joint,
+                frequency=float(orders.order[best]),
+                amplitude=float(orders.amplitude[best, column]),
+                p_value=float(orders.p_value[best, column] * len(orders.order)),
+                share=float(orders.share[best, column]),
+                frequencies=orders.order,
+                power=orders.power[:, column],
             )
 
 

@@ -174,10 +174,10 @@ def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray
     Columns have shape (k, m), one row for each window.
     """
     describe = recording.describe
-    every = np.ones(len(recording.kind), bool)
+    all_windows = np.ones(len(recording.kind), bool)
     yield from slow_explanations(describe['time'], describe['temperature'])
-    yield 'rate', np.stack([describe['rate'], describe['rate'] ** 2], axis=1), every
-    yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
+    yield 'rate', np.stack([describe['rate'], describe['rate'] ** 2], axis=1), all_windows
+    yield 'specific force', (describe['specific force'] - 9.8)[:, None], all_windows
     for name in describe:
         if name.startswith('angle'):
             number = name[len('angle') :]
@@ -189,4 +189,4 @@ def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray
                 waves += [np.cos(multiple * angle), np.sin(multiple * angle)]
             joint = recording.model.joint_names[int(number)]
             yield f'angle of {joint}', np.stack(waves, axis=1), known
-    yield IN_MOTION, recording.moving[:, None].astype(float), every
+    yield IN_MOTION, recording.moving[:, None].astype(float), all_windows

@@ -90,7 +90,15 @@ def _cyclic(name: str, degrees: np.ndarray, starts: np.ndarray) -> Variable:
         return f'while the {name} is {low} to {high} deg'
 
     bins = np.minimum((degrees % 360.0 / 360.0 * N_BINS).astype(int), N_BINS - 1)
-    return Variable(name, bins, edges, True, words, degrees % 360.0, starts)
+    return Variable(
+        name,
+        bins,
+        edges,
+        cyclic=True,
+        words=words,
+        values=degrees % 360.0,
+        starts=starts,
+    )
 
 
 def _classes(
@@ -107,11 +115,11 @@ def _classes(
     return [
         Variable(
             name,
-            mask.astype(int),
-            np.zeros(0),
-            False,
-            lambda chosen, _: words[chosen[0]],
-            mask.astype(float),
-            starts,
+            bins=mask.astype(int),
+            edges=np.zeros(0),  # classes have no values that could be bounds
+            cyclic=False,
+            words=lambda chosen, _: words[chosen[0]],
+            values=mask.astype(float),
+            starts=starts,
         )
     ]

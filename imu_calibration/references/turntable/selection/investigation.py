@@ -154,7 +154,9 @@ def investigate(
     used, locked, limits = without_clipping(used, table, model)
     testable, not_testable = testable_effects(model, table, windows_at(used, ~locked))
     effects = without_saturation(testable)
-    searched = SearchedWindows(used, table, model, effects, locked, bias_processes)
+    searched = SearchedWindows(
+        used, table, model, effects=effects, locked=locked, bias_processes=bias_processes
+    )
 
     # Search for constant parameters.
     result = _explained(searched.linearised(), searched)

@@ -397,7 +397,14 @@ def _option(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sens
     """Return one sensor with the lag of a hypothesis."""
     cost = _cost(hypothesis, hypothesis.chosen, judges, sensor) + PENALTY * len(hypothesis.kind)
     lags, covariance = hypothesis.lags(sensor)
-    return _Option(sensor, hypothesis.kind, cost, lags, covariance, hypothesis.values)
+    return _Option(
+        sensor,
+        kind=hypothesis.kind,
+        cost=cost,
+        lags=lags,
+        covariance=covariance,
+        values=hypothesis.values,
+    )
 
 
 def _without_lag(
@@ -407,7 +414,14 @@ def _without_lag(
     chosen = hypothesis.without(sensor)
     values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(chosen)))
     cost = _cost(hypothesis, chosen, judges, sensor)
-    return _Option(sensor, (), cost, np.zeros(0), np.zeros((0, 0)), values)
+    return _Option(
+        sensor,
+        kind=(),
+        cost=cost,
+        lags=np.zeros(0),
+        covariance=np.zeros((0, 0)),
+        values=values,
+    )
 
 
 def _cost(

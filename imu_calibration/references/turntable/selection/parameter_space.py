@@ -461,7 +461,7 @@ def mean_rows(
     if scatter is not None:
         of_samples = of_sensor.mean_variance(recording.kind, recording.count)
         variance = variance + (scatter - 1) * of_samples
-    found = []
+    rows_of_axes = []
     for axis, equations in enumerate(space.mean[sensor]):
         of_axis = replace(
             means,
@@ -469,5 +469,5 @@ def mean_rows(
             variance=variance[:, axis : axis + 1],
             places=space.places(sensor, axis),
         )
-        found.append(of_axis)
-    return found
+        rows_of_axes.append(of_axis)
+    return rows_of_axes
