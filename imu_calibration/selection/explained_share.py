@@ -100,9 +100,9 @@ class Explained:
         to more.
         """
         together, alone = self._sigmas(sensor, excess)
-        of_axes = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
-        of_all = np.maximum(excess.sum(axis=1), of_axes)
-        return np.where(together > SIGNIFICANT_REST, of_all, of_axes)
+        of_significant_axes = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
+        of_all_axes = np.maximum(excess.sum(axis=1), of_significant_axes)
+        return np.where(together > SIGNIFICANT_REST, of_all_axes, of_significant_axes)
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
         """

@@ -455,7 +455,7 @@ def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
         )
         (process,) = plausible_processes(noise, 0.01, sensor='gyroscope', duration=1e9)
         assert process.sd == pytest.approx(most) and process.time == 15.0
-        assert noise.at_rest_only(process).offset_sd == 0.0
+        assert noise.without_misfit(process).offset_sd == 0.0
     # Where most axes do so up to three times the middle one, and twelve times.
     for middle, most in (
         (0.008, 0.03),

@@ -203,11 +203,16 @@ class NoiseModel(SensorNoise):
         factors = self.moving[kind]
         return np.sqrt(np.maximum(1 / factors.slow - 1 / factors.every, 0.0) / self.low_variance)
 
-    def at_rest_only(self, *processes: BiasProcess) -> 'NoiseModel':
-        """Return the noise without window offsets and misfit, with the given bias processes."""
+    def without_misfit(self, *processes: BiasProcess) -> 'NoiseModel':
+        """
+        Return the noise without errors of the model: offsets of windows and misfit along columns.
+
+        The excess of moving windows by vibration remains. The bias processes are the given ones.
+        """
         moving = {}
         for kind, factors in self.moving.items():
             every = factors.every / factors.along
+            # The means of moving windows have at least the noise at rest.
             means = np.minimum(factors.means, np.maximum(every, 1.0))
             moving[kind] = replace(factors, every=every, means=means)
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)

@@ -64,28 +64,31 @@ def _block_scores(
     system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (information, gradient) of each of k blocks of windows at the values.
+    Return (information A'A, gradient A'r) of each of k blocks of windows at the values.
 
-    With the whitened design A and residual r of a block they are A'A, shape (k, n_params,
-    n_params), and A'r, shape (k, n_params).
+    A is the whitened design of a block, r its residual. The shapes are (k, n_params, n_params) and
+    (k, n_params).
     """
     blocks = system.accumulator.blocks
     information = np.zeros((len(blocks), len(values), len(values)))
     gradient = np.zeros((len(blocks), len(values)))
     block_of_window = system.accumulator.block_of(system.session, system.time)
     for sensor in system.sensors:
-        of_axes = coefficients(system.model, sensor, values)
+        # Coefficients K of the columns C, shape (n_columns, 3): output = C K + error.
+        coefficient = coefficients(system.model, sensor, values)
         slope = coefficient_jacobian(system.model, sensor, values)
         noise = noises[sensor]
-        white = system.whitened_means(sensor, noise)
+        white_means = system.whitened_means(sensor, noise)
         for number, block in enumerate(blocks):
             weighed = list(system.weighed_rows(sensor, noise, block))
             for axis in range(3):
-                # The means of the block's windows, and their centred rows.
-                places = system.columns_and(sensor, axis)
-                centred = [rows[:, places] * weight[axis] for rows, weight in weighed]
-                rows = np.concatenate([white[block_of_window == number, axis], *centred])
+                # Rows [columns | output]: the means of the block's windows, and their centred rows.
+                places = system.columns_and_output(sensor, axis)
+                means = white_means[block_of_window == number, axis]
+                centred = [factor[:, places] * weight[axis] for factor, weight in weighed]
+                rows = np.concatenate([means, *centred])
                 design = rows[:, :-1] @ slope[:, axis]
+                residual = rows[:, -1] - rows[:, :-1] @ coefficient[:, axis]
                 information[number] += design.T @ design
-                gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ of_axes[:, axis])
+                gradient[number] += design.T @ residual
     return information, gradient

@@ -90,10 +90,10 @@ class WeightedSystem(WindowMeans):
         Shape (n_windows, 3, p + 1).
         """
         means = self.means[sensor]
-        of_axes = [means[:, self.columns_and(sensor, axis)] for axis in range(3)]
-        return self.mean_rows(np.stack(of_axes, axis=1), noise).white()
+        means_of_axes = [means[:, self.columns_and_output(sensor, axis)] for axis in range(3)]
+        return self.mean_rows(np.stack(means_of_axes, axis=1), noise).white()
 
-    def columns_and(self, sensor: str, axis: int) -> list[int]:
+    def columns_and_output(self, sensor: str, axis: int) -> list[int]:
         """Return the places of all columns and of the output of one axis in rows of a sensor."""
         p = self.means[sensor].shape[1] - 3
         return [*range(p), p + axis]
@@ -108,7 +108,7 @@ class WeightedSystem(WindowMeans):
         centred = list(self.weighed_rows(sensor, noise))
         factors = []
         for axis in range(3):
-            places = self.columns_and(sensor, axis)
+            places = self.columns_and_output(sensor, axis)
             parts = [white[:, axis]]
             parts += [rows[:, places] * weight[axis] for rows, weight in centred]
             factors.append(triangular(np.concatenate(parts)))
@@ -139,10 +139,10 @@ class WeightedSystem(WindowMeans):
         """
         parts = []
         for sensor in self.sensors:
-            of_axes = coefficients(self.model, sensor, values)
+            coefficient = coefficients(self.model, sensor, values)
             slope = coefficient_jacobian(self.model, sensor, values)
             for axis, factor in enumerate(factors[sensor]):
-                residual = factor[:, -1] - factor[:, :-1] @ of_axes[:, axis]
+                residual = factor[:, -1] - factor[:, :-1] @ coefficient[:, axis]
                 parts.append(np.column_stack([factor[:, :-1] @ slope[:, axis], residual]))
         equations = np.concatenate(parts)[:, None]
         return Rows(equations=equations, variance=np.ones(equations.shape[:2]))
@@ -151,9 +151,9 @@ class WeightedSystem(WindowMeans):
         """Return the residual of `linearise` without the derivatives, shape (m,)."""
         parts = []
         for sensor in self.sensors:
-            of_axes = coefficients(self.model, sensor, values)
+            coefficient = coefficients(self.model, sensor, values)
             for axis, factor in enumerate(factors[sensor]):
-                parts.append(factor[:, -1] - factor[:, :-1] @ of_axes[:, axis])
+                parts.append(factor[:, -1] - factor[:, :-1] @ coefficient[:, axis])
         return np.concatenate(parts)
 
     def linearised(self, sensor: str, values: np.ndarray, noise: NoiseModel) -> Rows:

@@ -125,7 +125,7 @@ class _MeanFit:
         imitated = np.einsum('kap,pq,aq->ka', self.design, self.covariance, gradient)
         improved = self.residual - (column - imitated) * offset
 
-        # F test of three offsets with the residual degrees of dof of these windows.
+        # F test of three offsets with the residual degrees of freedom of these windows.
         design = self.design[of_kind]
         leverage = np.einsum('kap,pq,kaq->ka', design, self.covariance, design).sum()
         dof = 3 * len(of_kind) - leverage - 3

@@ -438,7 +438,7 @@ class FormulaSearch:
         if p_value > FAMILY_WISE or falls[likeliest] <= price[likeliest]:
             return None
 
-        # Chi-square per degree of dof with the likeliest formula, at least 1.
+        # Chi-square per degree of freedom with the likeliest formula, at least 1.
         dof = max(3 * len(self._residual[0]) - sum(self.n_explained), 1)
         squares = sum(float(residual @ residual) for residual in self._residual)
         misfit = max((squares - falls[likeliest]) / dof, 1.0)

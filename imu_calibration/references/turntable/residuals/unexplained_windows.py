@@ -82,13 +82,13 @@ def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     cause in the sensor its own axis.
     """
     excess = scatter_in_motion(problem, sensor)
-    least = np.maximum(np.median(excess), problem.noise[sensor].at_rest_only().low_variance)
+    least = np.maximum(np.median(excess), problem.noise[sensor].without_misfit().low_variance)
     return np.where(excess > MUCH_SCATTER * least, excess, 0.0)
 
 
 def scatter_in_motion(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     """Return the excess variance of moving samples over the noise at rest, shape (3,)."""
-    noise = problem.noise[sensor].at_rest_only()
+    noise = problem.noise[sensor].without_misfit()
     recording = problem.recording
     kinds = recording.kind[recording.moving]
     counts = recording.count[recording.moving]

@@ -32,7 +32,7 @@ class ExplainedWindows(Explained):
             processes = plausible_processes(
                 of_sensor, recording.period, sensor=sensor, duration=duration
             )
-            noise[sensor] = of_sensor.at_rest_only(*processes)
+            noise[sensor] = of_sensor.without_misfit(*processes)
         values, _ = evidence.fit(range(evidence.space.size))
         scatter = scatter_of_each(evidence.space, evidence.noise, values)
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
