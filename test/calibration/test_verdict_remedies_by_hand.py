@@ -108,7 +108,7 @@ def test_a_warm_up_is_determined_and_a_weak_one_needs_no_attitude():
     hand = found.result.applied
     index = hand.param_names.index('gyroscope.gyro_bias_drift.x')
     tight = replace(hand, tolerances=1e-3 * hand.tolerances)
-    assert _without_motion(tight, index, _Excesses.of(tight)) == ALL_MOTIONS['warm_up']
+    assert _without_motion(tight, index, _Excesses.of_solution(tight)) == ALL_MOTIONS['warm_up']
 
 
 def test_live_the_next_step_is_the_cause_where_no_attitude_helps():

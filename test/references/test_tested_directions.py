@@ -161,7 +161,7 @@ def placed(seed, *, count, cross, wrong=0.0):
     force[-1] += wrong * force[-1] / GRAVITY
     poses = SimpleNamespace(force=force, conditions={})
     directions = force / np.linalg.norm(force, axis=1)[:, None]
-    return model, replace(model, untested=CROSS_TERMS), poses, directions
+    return model, replace(model, held_terms=CROSS_TERMS), poses, directions
 
 
 @pytest.mark.parametrize(('seed', 'count', 'shared'), [(10337, 9, 0.0374), (10341, 8, 0.0299)])

@@ -335,7 +335,13 @@ def foretold(knowledge: HandKnowledge) -> list[HandStep]:
     always the shortest plan: it begins with small turns, after which more steps are needed.
     """
     plans = [_rollout(knowledge, exponent) for exponent in WEIGHTS]
-    return min(plans, key=lambda plan: (plan[1], sum(step.seconds for step in plan[0])))[0]
+
+    def excess_then_seconds(plan: tuple[list[HandStep], float]) -> tuple[float, float]:
+        steps, excess = plan
+        return excess, sum(step.seconds for step in steps)
+
+    best_steps, _ = min(plans, key=excess_then_seconds)
+    return best_steps
 
 
 def _rollout(knowledge: HandKnowledge, seconds_exponent: float) -> tuple[list[HandStep], float]:
@@ -348,6 +354,7 @@ def _rollout(knowledge: HandKnowledge, seconds_exponent: float) -> tuple[list[Ha
             break
         steps.append(choice.step)
         knowledge = replace(knowledge, information=choice.information, up=choice.step.up)
+    # Rounded, so that plans of equal excess compare equal.
     return steps, round(float(knowledge.excess(knowledge.information)), 9)
 
 
@@ -361,10 +368,11 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     The recommended step is the next one of the common plan, shown in the picture, if it serves the
     sensor; otherwise the best step for the sensor.
     """
+    # Undetermined parameters: those of each sensor that need a motion, and those of each remedy.
     absent = hand.hand_model.absent
     lacking: dict[str, dict[str, float]] = {}
     remedies: dict[tuple[str, str], dict[str, float]] = {}
-    excesses = None if 'accelerometer' in absent else _Excesses.of(hand)
+    excesses = None if 'accelerometer' in absent else _Excesses.of_solution(hand)
     for index, name in enumerate(hand.param_names):
         sensor = name.partition('.')[0]
         if hand.statuses[index] not in LACKING or sensor in absent:
@@ -392,6 +400,7 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
         after = knowledge.excess(knowledge.then(step).information, parameters)
         return float(before - after) / step.seconds
 
+    # The step for each sensor, then the remedies.
     needs = []
     for sensor in SENSORS:
         if sensor not in lacking:
@@ -466,7 +475,7 @@ class _Excesses:
     """Of the angle of a turn."""
 
     @classmethod
-    def of(cls, hand: HandCalibration) -> '_Excesses':
+    def of_solution(cls, hand: HandCalibration) -> '_Excesses':
         """Return the ratios of a solution."""
         statistics = hand.statistics
         sd_force, sd_bias, sd_turn = SCATTER_SD

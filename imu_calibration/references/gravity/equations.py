@@ -198,12 +198,14 @@ class _RememberedTurn:
     """Bias, rad/s, shape (3,)."""
     matrix: np.ndarray
     """Matrix, shape (3, 3)."""
-    further: np.ndarray
+    further_values: np.ndarray
     """Values of the further effects, shape (p,)."""
     turn: Turn
     """Rotation, and its derivatives by these parameters."""
 
-    def moved(self, bias: np.ndarray, matrix: np.ndarray, further: np.ndarray) -> np.ndarray | None:
+    def moved(
+        self, bias: np.ndarray, matrix: np.ndarray, further_values: np.ndarray
+    ) -> np.ndarray | None:
         """
         Return `Turn.mat_ji` at other parameters to first order, ``(1 - [psi x]) mat_ji``.
 
@@ -212,7 +214,7 @@ class _RememberedTurn:
         psi = (
             self.turn.by_bias @ (bias - self.bias)
             + self.turn.by_matrix.reshape(3, 9) @ (matrix - self.matrix).ravel()
-            + self.turn.by_further @ (further - self.further)
+            + self.turn.by_further @ (further_values - self.further_values)
         )
         if np.linalg.norm(psi) >= MAX_FIRST_ORDER_ANGLE:
             return None
@@ -251,7 +253,7 @@ class _Equations:
         model = self.model
         poses = self.poses
         true = self.true_force
-        further, slopes = model.further(
+        further_output, slopes = model.further_output(
             'accelerometer', self.state.values, true, **poses.conditions
         )
         main = np.zeros((len(true), 3, model.size))
@@ -261,7 +263,7 @@ class _Equations:
             main[:, i, 3 + 3 * i : 4 + 4 * i] = true[:, : i + 1]
         main[:, :, model.extra_index('accelerometer')] = slopes
         return self._of_each_pose(
-            poses.force - self.force_bias - true @ self.force_matrix.T - further,
+            poses.force - self.force_bias - true @ self.force_matrix.T - further_output,
             main,
             poses.force_sem**2,
             place=OF_DIRECTION,
@@ -401,10 +403,10 @@ class _Equations:
 
         A remembered turn is corrected to first order if the parameters have changed little.
         """
-        further = self.state.values[self.further_of_gyroscope]
+        further_values = self.state.values[self.further_of_gyroscope]
         if number in self.memory:
             remembered = self.memory[number]
-            mat_ji = remembered.moved(bias, self.gyro_matrix, further)
+            mat_ji = remembered.moved(bias, self.gyro_matrix, further_values)
             if mat_ji is not None:
                 return mat_ji, remembered.turn
         turn = integrate_turn(
@@ -414,7 +416,7 @@ class _Equations:
             matrix=self.gyro_matrix,
             further=self._further_of_turn(data, bias),
         )
-        self.memory[number] = _RememberedTurn(bias, self.gyro_matrix, further, turn)
+        self.memory[number] = _RememberedTurn(bias, self.gyro_matrix, further_values, turn)
         return turn.mat_ji, turn
 
     def of_known_turn(self, data: TurnData, known: np.ndarray, known_cov: np.ndarray) -> Rows:
@@ -459,12 +461,12 @@ class _Equations:
         """
         Return (output, columns) of the gyroscope's further effects along a turn.
 
-        The shapes are those of `HandModel.further`. The true force and rate, at which the effects
-        are computed, are approximated by readings corrected for bias and matrix only.
+        The shapes are those of `HandModel.further_output`. The true force and rate, at which the
+        effects are computed, are approximated by readings corrected for bias and matrix only.
         """
         force = np.linalg.solve(self.force_matrix, (data.force - self.force_bias).T).T
         rate = np.linalg.solve(self.gyro_matrix, (data.rate - bias).T).T
-        return self.model.further(
+        return self.model.further_output(
             'gyroscope',
             self.state.values,
             force,

@@ -311,19 +311,19 @@ def solve_by_hand(data: HandData, options: HandOptions) -> HandCalibration:
     Return the calibration from given poses and turns (`calibrate_by_hand`).
 
     Cross terms of the accelerometer that no attitude tests are held at their prior, unless turns or
-    placements support them (`tested_directions`).
+    placements demand them (`tested_directions`).
     """
     report('solving')
     free = _solve(data, options)
     if 'accelerometer' in data.absent:
         return free
     up = directions(free.hand_model, free.used_poses)
-    untested = off_axis_lacking(up)
-    if not untested:
+    terms_without_test = off_axis_lacking(up)
+    if not terms_without_test:
         return free
 
     # The model with these cross terms against the one with their priors.
-    held = _solve(data, options, untested=untested)
+    held = _solve(data, options, held_terms=terms_without_test)
     testing_turns = turns_between(up, free.used_turns)
     if len(testing_turns) < TESTING_TURNS:
         return _chosen_by_placements(data.poses, free, held, up=up)
@@ -336,7 +336,9 @@ def _chosen_by_placements(
     poses: Poses, free: HandCalibration, held: HandCalibration, *, up: np.ndarray
 ) -> HandCalibration:
     """
-    Return the solution that the lengths of gravity support, with the covariance of the placements.
+    Return `free` if the lengths of gravity in the placements demand cross terms, otherwise `held`.
+
+    The covariance of the accelerometer is at least that of a fit with one error per placement.
 
     Parameters
     ----------
@@ -346,7 +348,7 @@ def _chosen_by_placements(
     free, held : HandCalibration
         Solutions with estimated cross terms, and with cross terms at their prior.
     up : array, shape (k, 3)
-        `directions`.
+        Direction of gravity in each pose (`directions`).
 
     """
     # Poses that at least one of the models does not exclude as outliers.
@@ -356,7 +358,8 @@ def _chosen_by_placements(
     demanded = placements_demand(free.hand_model, held.hand_model, poses, up=up, used=used)
     chosen = free if demanded else held
 
-    # One error for all rests of a placement gives a larger covariance than one for each rest.
+    # One error for all rests of a placement gives a larger covariance than one for each rest, which
+    # is in `terms` already: only the excess is added.
     fit = fit_placements(chosen.hand_model, chosen.values, poses, up=up, used=used)
     if fit.covariance is None:
         return chosen
@@ -372,9 +375,9 @@ def _turn_error(hand: HandCalibration, turn: TurnData) -> float:
 
 
 def _solve(
-    data: HandData, options: HandOptions, *, untested: tuple[str, ...] = ()
+    data: HandData, options: HandOptions, *, held_terms: tuple[str, ...] = ()
 ) -> HandCalibration:
-    """Return the calibration with the cross terms `untested` held at their prior."""
+    """Return the calibration with the cross terms `held_terms` at their prior."""
     poses = data.poses
 
     # 1. Model. The g-sensitivity relates both sensors, so that it needs both.
@@ -383,7 +386,7 @@ def _solve(
     if not data.absent:
         default, evidence = default_gyroscope(poses)
     sensors = _requested_effects(options, poses, default_gyroscope=default)
-    model = HandModel(sensors, options.gravity, untested=untested, absent=data.absent)
+    model = HandModel(sensors, options.gravity, held_terms=held_terms, absent=data.absent)
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
         raise InputError(
@@ -456,6 +459,7 @@ def _solve(
     }
     if options.gravity_sd:
         sd = options.gravity_sd / options.gravity
+        # A wrong gravity scales all axes: the tolerance is that of the scale factor of x.
         goal = float(goals[3])
         statistics['common_scale'] = {
             'sd': sd,

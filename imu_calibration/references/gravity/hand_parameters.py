@@ -85,7 +85,7 @@ class HandModel:
     Nominal reading of the gyroscope over the true rate: 2 where the driver converts for half the
     actual full-scale range.
     """
-    untested: tuple[str, ...] = ()
+    held_terms: tuple[str, ...] = ()
     """Cross terms that are held at their prior, because no attitude tests them."""
     absent: tuple[str, ...] = ()
     """Sensors without readings; all their parameters are held."""
@@ -117,10 +117,10 @@ class HandModel:
         return np.isin(self.model.param_names, UPPER_TERMS)
 
     @cached_property
-    def withheld(self) -> np.ndarray:
-        """Mask of the parameters in `untested` and of absent sensors, shape (n,)."""
-        of_absent = self.model.mask(lambda effect: effect.sensor in self.absent)
-        return np.isin(self.model.param_names, self.untested) | of_absent
+    def held(self) -> np.ndarray:
+        """Mask of the parameters that are not estimated, shape (n,)."""
+        of_absent_sensors = self.model.mask(lambda effect: effect.sensor in self.absent)
+        return np.isin(self.model.param_names, self.held_terms) | of_absent_sensors
 
     @cached_property
     def nominal(self) -> np.ndarray:
@@ -157,8 +157,11 @@ class HandModel:
     def extra_index(self, sensor: str) -> np.ndarray:
         """Return the indices of the parameters of the further effects of one sensor."""
         every = np.arange(self.size)
-        parts = [every[self.model.slices[e.key]] for e in self.extras if e.sensor == sensor]
-        return np.concatenate([np.zeros(0, int), *parts])
+        indices = [np.zeros(0, int)]
+        for effect in self.extras:
+            if effect.sensor == sensor:
+                indices.append(every[self.model.slices[effect.key]])
+        return np.concatenate(indices)
 
     def linear(self, values: np.ndarray) -> LinearParameters:
         """Return the biases and matrices of a parameter vector, shape (n,)."""
@@ -173,7 +176,7 @@ class HandModel:
         """Return the same model with the columns of warm-ups computed at `values`."""
         return replace(self, model=self.model.at(values))
 
-    def further(
+    def further_output(
         self,
         sensor: str,
         values: np.ndarray,
@@ -184,14 +187,18 @@ class HandModel:
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the sum of the further effects in a sensor's output, and its derivative.
+        Return the output of a sensor's effects beyond bias and matrix, and its derivative.
 
         Parameters
         ----------
+        sensor : str
+            Sensor whose effects are added up.
+        values : array, shape (n,)
+            All parameters of the model.
         force, rate : arrays, shape (m, 3)
             True specific force and rate; default: at rest.
         time : array, optional
-            Seconds since the first sample, shape (m,).
+            Seconds since the first sample, shape (m,); default: zero.
         temperature_c : array, optional
             Shape (m,); needed by thermal effects.
 
@@ -202,19 +209,21 @@ class HandModel:
             (m, 3, p) in the order of `extra_index`.
 
         """
-        effects = [e for e in self.extras if e.sensor == sensor]
+        effects = [effect for effect in self.extras if effect.sensor == sensor]
         if not effects:
             return np.zeros((len(force), 3)), np.zeros((len(force), 3, 0))
         time = np.zeros(len(force)) if time is None else np.asarray(time, float)
         rate = np.zeros_like(force) if rate is None else rate
+        # Attitude and angular acceleration are unknown. No effect reads these zeros: those that
+        # would are refused (`possible_by_hand`).
         ref = Reference(
-            time,
-            np.zeros((len(force), 3, 3)),
-            force,
-            rate,
-            np.zeros_like(force),
-            self.gravity,
-            temperature_c,
+            time=time,
+            mat_sn=np.zeros((len(force), 3, 3)),
+            force_s=force,
+            rate_s=rate,
+            alpha_s=np.zeros_like(force),
+            gravity=self.gravity,
+            temperature_c=temperature_c,
         )
         return output_of_effects(effects, self.model, values, ref=ref)
 
@@ -232,13 +241,13 @@ class HandModel:
 
         Bias and matrix are inverted directly, further effects by a fixed-point iteration::
 
-            true = matrix^-1 (reading - bias - further(true))
+            true = matrix^-1 (reading - bias - further_output(true))
         """
         force_bias, force_matrix, gyro_bias, gyro_matrix = self.linear(values)
         true_force = np.linalg.solve(force_matrix, (force - force_bias).T).T
         true_rate = np.linalg.solve(gyro_matrix, (rate - gyro_bias).T).T
         for _ in range(REPEATS if self.extras else 0):
-            further_force, _ = self.further(
+            further_force, _ = self.further_output(
                 'accelerometer',
                 values,
                 true_force,
@@ -246,7 +255,7 @@ class HandModel:
                 time=time,
                 temperature_c=temperature_c,
             )
-            further_rate, _ = self.further(
+            further_rate, _ = self.further_output(
                 'gyroscope',
                 values,
                 true_force,
@@ -293,7 +302,7 @@ class HandModel:
         # Row i of the lower triangular matrix has the elements up to i.
         true_of_row = np.tril(true[:, None].repeat(3, axis=1))
         columns[:, 3:12] = (by_reading[:, :, None] * true_of_row).reshape(-1, 9)
-        _, slopes = self.further(
+        _, slopes = self.further_output(
             'accelerometer', values, true, time=time, temperature_c=temperature_c
         )
         columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', by_reading, slopes)
@@ -314,13 +323,13 @@ class HandModel:
         The columns are minus its derivative by all parameters. `rate` is the mean reading, `force`
         the true specific force, each of shape (k, 3).
         """
-        further, slopes = self.further(
+        further_output, slopes = self.further_output(
             'gyroscope', values, force, time=time, temperature_c=temperature_c
         )
         columns = np.zeros((len(rate), 3, self.size))
         columns[:, :, self.gyro_bias] = np.eye(3)
         columns[:, :, self.extra_index('gyroscope')] = slopes
-        return rate - values[self.gyro_bias] - further, columns
+        return rate - values[self.gyro_bias] - further_output, columns
 
 
 GRAVITY_LEAST, GRAVITY_MOST = 9.7, 9.9

@@ -143,17 +143,19 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
         n_poses = sum(int(part.judged.sum()) for part in self.parts)
         if n_poses:
             judged['accelerometer'] = JudgedData(
-                np.ones((n_poses, 1)),
-                UNITS['accelerometer'],
-                n_poses,
-                1,
+                counts=np.ones((n_poses, 1)),
+                unit=UNITS['accelerometer'],
+                windows=n_poses,
+                components=1,
                 # Rests near the axes of the sensor: held-out rests have the directions of the
                 # other rests.
-                few_directions=bool(self.solution.hand_model.untested),
+                few_directions=bool(self.solution.hand_model.held_terms),
             )
         n_turns = sum(len(part.turns) for part in self.parts)
         if n_turns >= TURNS_LEAST:
-            judged['gyroscope'] = JudgedData(np.ones((n_turns, 1)), TURN_ANGLE_UNIT, n_turns, 1)
+            judged['gyroscope'] = JudgedData(
+                counts=np.ones((n_turns, 1)), unit=TURN_ANGLE_UNIT, windows=n_turns, components=1
+            )
         return judged
 
     def errors(self, sensor: str, folds: Sequence[np.ndarray]) -> HeldOutErrors:
@@ -296,11 +298,15 @@ def corrected_with(
     Without `rate` the sensor is at rest.
     """
     rate = np.zeros_like(force) if rate is None else rate
-    known = Calibration(
-        model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size
+    # Compensation uses the values alone, not their covariance and status.
+    calibration = Calibration(
+        model.model.at(values),
+        values,
+        covariance=np.zeros((model.size, model.size)),
+        status=(HELD,) * model.size,
     )
     return compensated_samples(
-        known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c
+        calibration, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c
     )
 
 
@@ -335,8 +341,9 @@ def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarra
         Unit vector of gravity in each pose.
 
     """
-    known = np.isfinite(rates).all(axis=1)
-    rotation = between_middles(poses, turn, total_rotation(turn.time[known], rates[known]))
+    is_finite = np.isfinite(rates).all(axis=1)
+    mat_ji = total_rotation(turn.time[is_finite], rates[is_finite])
+    rotation = between_middles(poses, turn, mat_ji)
     rotated = rotation @ up[turn.first]
     last = up[turn.last]
     return float(np.arctan2(np.linalg.norm(np.cross(rotated, last)), rotated @ last))

@@ -118,7 +118,8 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> PoseScan:
     if not imu.absent:  # a turn relates both sensors
         turns, dropped = collect_turns(seconds, imu, poses=poses)
     resting = 0.0
-    if seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1:  # the last rest still lasts
+    # The last rest still lasts where hardly any motion follows it.
+    if seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1:
         resting = float(seconds[-1] - seconds[rests[-1].start])
     return PoseScan(
         rests=rests,
@@ -369,11 +370,11 @@ class LiveByHand(LiveSession):
         # Decides when the next search for rest is due.
         self._pacer = SolvePacer(SEARCH_SHARE)
         # Number of samples since the last search.
-        self._unsearched = 0
+        self._n_unsearched = 0
         # Stamp of the end of the last rest that `push` has returned; None before the first.
         self._reported_ns: int | None = None
         # The last Coverage, with the (scan, result, gravity) from which it was computed.
-        self._shown: tuple[tuple, Coverage] | None = None
+        self._last_coverage: tuple[tuple, Coverage] | None = None
         # Result of the last search.
         self.scan = EMPTY_SCAN
         self.result: HandResult | None = None
@@ -447,14 +448,15 @@ class LiveByHand(LiveSession):
             return []
         imu = imu if self.options.nominal is None else self.options.nominal.apply(imu)
         self._store.add(self._check.push(imu))
-        self._unsearched += len(imu)
+        self._n_unsearched += len(imu)
         period = self._check.statistics().period
-        if self._unsearched * period < SEARCH_STEP or not self._pacer.due(self._clock()):
+        if self._n_unsearched * period < SEARCH_STEP or not self._pacer.due(self._clock()):
             return []
         start = self._clock()
-        self._unsearched = 0
+        self._n_unsearched = 0
         self._search(self._store)
         if self._store.forget(self.scan.rests, MAX_LIVE_POSES):
+            # The ranges at rest are indices of samples, which have changed.
             self._search(self._store)
         self._pacer.note(start, self._clock())
         return self._newly_ended()
@@ -576,14 +578,14 @@ class LiveByHand(LiveSession):
     def coverage(self) -> Coverage:
         """Return the Coverage: useful attitudes, and the next one."""
         inputs = (self.scan, self.result, self.options.gravity)
-        if self._shown is not None:
-            shown_inputs, coverage = self._shown
-            if all(new is old for new, old in zip(inputs, shown_inputs, strict=True)):
+        if self._last_coverage is not None:
+            last_inputs, coverage = self._last_coverage
+            if all(new is old for new, old in zip(inputs, last_inputs, strict=True)):
                 return coverage
         coverage = hand_coverage(
             self.scan, self.result, hand_options(self.options), frame_id=self.frame_id
         )
-        self._shown = (inputs, coverage)
+        self._last_coverage = (inputs, coverage)
         return coverage
 
     def status(self, hints: dict[str, str] | None = None) -> LiveState:

@@ -132,13 +132,16 @@ def _variance_of_means(rows: Rows, estimate: RowEstimate, weights: np.ndarray) -
     noise[means] = weights**2 @ rows.variance.ravel()
     component = np.full(len(stacked), NO_COMPONENT)
     component[means] = 0
-    rows = Rows(equations=stacked[:, None], variance=noise[:, None], component=component)
+    transformed_rows = Rows(
+        equations=stacked[:, None], variance=noise[:, None], component=component
+    )
 
     fallback = np.array([SCATTER_SD[0] ** 2])
-    variances = GroupVariances(fallback, np.zeros(1), fallback)
+    # Of these only the variance is read, as the start.
+    variances = GroupVariances(variance=fallback, dof=np.zeros(1), upper=fallback)
     for _ in range(VARIANCE_STEPS):
         before = variances.variance
-        variances = estimate_group_variances(rows, start=before, fallback=fallback)
+        variances = estimate_group_variances(transformed_rows, start=before, fallback=fallback)
         if np.allclose(variances.variance, before, rtol=0.01):
             break
     return variances

@@ -52,14 +52,15 @@ def unexplained_by_hand(
     Parameters
     ----------
     hand : HandCalibration
-        Of the baseline.
+        Solution of the baseline.
     blocks : sequence of Rows
         Rows at rest and of turns; those at rest are the first of each sensor.
     evidence : RowEvidence
         Of these rows.
     used : sequence of int
-        Parameters of the model.
+        Parameters of the model, columns of the rows.
     sensor : str
+        Its rows are examined.
 
     """
     residuals = evidence.residuals(used)
@@ -89,9 +90,10 @@ def unexplained_by_hand(
     noise_sd = np.sqrt(blocks[at_rest].floor)
     significant = bool(sigma > SIGNIFICANT_SDS and len(hand.poses) >= MIN_EXPLAINED_WINDOWS)
     unexplained = Unexplained(
-        significant,
-        rms,
-        float(max(sigma, -99.0)),
+        significant=significant,
+        rms=rms,
+        # Minus infinity, which no document holds, where no block has enough rows.
+        sigma=float(max(sigma, -99.0)),
         correlates_with=None,
         share=0.0,
         residual=residuals[at_rest],

@@ -48,53 +48,56 @@ def build_rows(
     constants: np.ndarray,
 ) -> tuple[list[Rows], SearchParameters]:
     """
-    Return (blocks of rows: norms at rest, rates at rest, turns; their parameters).
+    Return (three `Rows`: norms at rest, rates at rest, turns; their parameters).
+
+    The third is absent without turns.
 
     Parameters
     ----------
     hand : HandCalibration
-        Of the baseline.
+        Solution of the baseline, at which the rows are linearised.
     turns : list of TurnData
-        Between consecutive poses.
+        Turns between consecutive poses.
     effects : sequence of Effect
         Effects under test.
     constants : array
         Time constants of warm-ups under test, s.
 
     """
-    # Runs of columns: one for each effect, then for each warm-up one for each time constant.
-    runs = [_Run(effect, effect.name) for effect in effects if not effect.time_constant]
+    # An effect has one column group, a warm-up one for each time constant.
+    groups = [_ColumnGroup(effect, effect.name) for effect in effects if not effect.time_constant]
     for effect in effects:
         if effect.time_constant:
             for number, tau in enumerate(constants):
-                runs.append(_Run(effect, f'{effect.name}@{number}', float(tau)))
+                groups.append(_ColumnGroup(effect, f'{effect.name}@{number}', float(tau)))
 
-    # Places of the parameters: baseline, Earth's rate, runs.
+    # Order of the parameters: baseline, Earth's rate, column groups.
     parts = {}
     prior_sds = [FREE_SD_FACTOR * hand.hand_model.priors, np.array([EARTH_UPWARDS_SD])]
     start = hand.hand_model.size + 1
-    for run in runs:
-        parts[run.label] = slice(start, start + run.size)
-        prior_sds.append(run.effect.prior_sds()[: run.size])
-        start += run.size
+    for group in groups:
+        parts[group.label] = slice(start, start + group.size)
+        prior_sds.append(group.effect.prior_sds()[: group.size])
+        start += group.size
     space = SearchParameters(parts, np.concatenate(prior_sds))
 
-    # Columns at rest in the poses.
-    true = hand.gravity * hand.state.up
-    still = np.zeros_like(true)
+    # Derivatives of the outputs in the poses. The last parameter of a warm-up, its time constant,
+    # is fixed and has no column.
+    true_force = hand.gravity * hand.state.up
+    zero_rate = np.zeros_like(true_force)
     at_rest: dict[str, dict[str, np.ndarray]] = {sensor: {} for sensor in SENSORS}
-    for run in runs:
-        if run.effect.sensor in at_rest:
+    for group in groups:
+        if group.effect.sensor in at_rest:
             columns = _columns(
                 hand,
-                run.effect,
-                run.time_constant,
-                true,
-                still,
-                hand.poses.time,
-                hand.poses.temperature_c,
+                group.effect,
+                tau=group.time_constant,
+                force=true_force,
+                rate=zero_rate,
+                time=hand.poses.time,
+                temperature_c=hand.poses.temperature_c,
             )
-            at_rest[run.effect.sensor][run.label] = columns[:, :, : run.size]
+            at_rest[group.effect.sensor][group.label] = columns[:, :, : group.size]
 
     blocks = [
         _norm_block(hand, space, at_rest['accelerometer']),
@@ -102,12 +105,15 @@ def build_rows(
     ]
     turns_between_poses = gravity_turns(turns)
     if turns_between_poses:
-        # A turn is short against the time constant of a warm-up.
-        moving = []
-        for run in runs:
-            if run.effect.sensor == 'gyroscope' and run.time_constant is None:
-                moving.append(run.effect)
-        blocks.append(_turn_block(hand, turns_between_poses, space, at_rest['gyroscope'], moving))
+        # Without warm-ups: a turn is short against their time constants, so that the mean of the
+        # rests before and after it, which is subtracted, contains their output.
+        turn_effects = []
+        for group in groups:
+            if group.effect.sensor == 'gyroscope' and group.time_constant is None:
+                turn_effects.append(group.effect)
+        blocks.append(
+            _turn_block(hand, turns_between_poses, space, at_rest['gyroscope'], turn_effects)
+        )
     return blocks, space
 
 
@@ -116,8 +122,8 @@ FREE_SD_FACTOR = 1e3
 
 
 @dataclass(frozen=True)
-class _Run:
-    """Columns of one effect, of a warm-up at one time constant."""
+class _ColumnGroup:
+    """The columns of one effect, of a warm-up at one time constant."""
 
     effect: Effect
     """The effect under test."""
@@ -140,6 +146,7 @@ def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
 def _columns(
     hand: HandCalibration,
     effect: Effect,
+    *,
     tau: float | None,
     force: np.ndarray,
     rate: np.ndarray,
@@ -157,7 +164,7 @@ def _columns(
     sensors = sensors.with_effect(effect.sensor, effect.name)
     model = HandModel(sensors, hand.gravity)
     values = model.model.start_from(hand.model, hand.values)
-    _, columns = model.further(
+    _, columns = model.further_output(
         effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c
     )
     return columns
@@ -233,7 +240,7 @@ def _turn_block(
     turns: Sequence[TurnData],
     space: SearchParameters,
     at_rest: Mapping[str, np.ndarray],
-    moving: Sequence[Effect],
+    effects: Sequence[Effect],
 ) -> Rows:
     """
     Return two rows per turn, rad/s: the error of rotated gravity over the duration T of the turn.
@@ -243,7 +250,7 @@ def _turn_block(
         residual = -tangent' mat_ji u_i / T
 
     The bias in a turn is the mean of the rates at rest before and after it, which removes its
-    drift; the contributions of the effects `moving` at rest (`at_rest`) are removed with it. The
+    drift; the output of `effects` at rest, with the derivatives `at_rest`, is removed with it. The
     variance of a row is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the integrated rates,
     rad^2, and the standard errors s of the two means.
     """
@@ -260,8 +267,16 @@ def _turn_block(
         force = np.linalg.solve(matrix_f, (turn.force - bias_f).T).T
         rate = np.linalg.solve(matrix, (turn.rate - bias).T).T
         further = [np.zeros((len(force), 3, 0))]
-        for effect in moving:
-            columns = _columns(hand, effect, None, force, rate, turn.time, turn.temperature_c)
+        for effect in effects:
+            columns = _columns(
+                hand,
+                effect,
+                tau=None,
+                force=force,
+                rate=rate,
+                time=turn.time,
+                temperature_c=turn.temperature_c,
+            )
             columns_at_rest = at_rest[effect.name]
             further.append(columns - 0.5 * (columns_at_rest[i] + columns_at_rest[j]))
 
@@ -280,7 +295,7 @@ def _turn_block(
         row = np.zeros((2, space.size + 1))
         row[:, hand.hand_model.gyro_matrix] = by_psi @ integrated.by_matrix.reshape(3, 9)
         start = 0
-        for effect in moving:
+        for effect in effects:
             end = start + effect.size
             row[:, space.parts[effect.name]] = by_psi @ integrated.by_further[:, start:end]
             start = end

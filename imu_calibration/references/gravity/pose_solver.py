@@ -72,8 +72,9 @@ def solve_joint(
         GravityRows(model, poses, turns),
         first_state(model, poses),
         fallback=np.square(SCATTER_SD),
-        withheld=model.withheld,
+        withheld=model.held,
     )
+    # Its memory has the turns as integrated at the estimate, none from earlier steps.
     reference = GravityRows(model, poses, turns)
     scale = common_scale(model.model, estimate.state.values)
     terms = {
@@ -98,10 +99,15 @@ def _model_error(reference: GravityRows, estimate: RowEstimate) -> ModelError:
     rows = reference.linearise(estimate.state)
     # The rows of poses and turns, without those that directions and parameters need; the bias of
     # the gyroscope is determined at rest.
-    of_poses_and_turns = np.isin(rows.component, (0, 2)).sum()
+    components = [COMPONENTS.index('pose'), COMPONENTS.index('turn')]
+    of_poses_and_turns = np.isin(rows.component, components).sum()
     spare = of_poses_and_turns - 2 * count - free.sum() + free[model.gyro_bias].sum()
     if min(count, spare) < MIN_SCATTER_BLOCKS or not free.any():
-        return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
+        return ModelError(
+            factor=np.ones(model.size),
+            drift_variance=np.zeros(model.size),
+            scatter_variance=np.zeros(model.size),
+        )
     return model_error_of_rows(rows, estimate, model.model, block=np.minimum(rows.group, count - 1))
 
 
@@ -118,15 +124,15 @@ def first_state(model: HandModel, poses: Poses) -> State:
     values = model.nominal.copy()
     if 'accelerometer' not in model.absent:
         index = model.base_index('accelerometer')
-        index = index[~model.withheld[index]]
+        index = index[~model.held[index]]
         squares = _NormsAndPriors(model, poses.force, poses.conditions, index)
-        least = np.inf
+        least_cost = np.inf
         for start in _starting_points(model, poses):
             end = gauss_newton(squares, start, n_steps=MAX_NEWTON_STEPS)
             cost = squares.cost(end) if squares.is_possible(end) else np.inf
-            if cost < least:
+            if cost < least_cost:
                 values = end
-                least = cost
+                least_cost = cost
     linear = model.linear(values)
     true = np.linalg.solve(linear.force_matrix, (poses.force - linear.force_bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)
@@ -301,7 +307,7 @@ def without_outlying_poses(
     rows = GravityRows(model, poses, turns, integrated or {}).linearise(estimate.state)
     residual, basis = _whitened(rows, estimate)
     pose = rows.group
-    # The turn that begins in a pose.
+    # Pose -> number of the turn that begins in it; each has at most one.
     turn_of = {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
 
     of_poses, of_drifts, of_turns = COMPONENTS
@@ -313,9 +319,8 @@ def without_outlying_poses(
         for number in np.unique(pose[of_kind]).tolist():
             tested = of_kind & (pose == number)
             misfit = _misfit(residual[tested], basis[tested], LEAST_ERROR_SHARE)
-            p_values[turn_of[number] if kind == of_turns else number] = _p_value(
-                misfit, misfit_of_kind
-            )
+            outlier = turn_of[number] if kind == of_turns else number
+            p_values[outlier] = _p_value(misfit, misfit_of_kind)
         most = max(1, int(MAX_POSE_OUTLIERS * len(p_values)))
         outlying = find_outliers(p_values, n_tests=len(p_values), most=most).numbers
         if outlying:

@@ -67,8 +67,8 @@ def average_poses(
 
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
-    length = 1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start])
-    creep = _creep(forces, length, force_noise)
+    duration = 1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start])
+    creep = _creep(forces, duration, force_noise)
     mean_temperature_c = None
     if temperature_c is not None:
         mean_temperature_c = np.array([temperature_c[a:b].mean() for a, b in ranges])
@@ -82,8 +82,8 @@ def average_poses(
         time=time,
         temperature_c=mean_temperature_c,
         noise={'accelerometer': force_noise, 'gyroscope': rate_noise},
-        half_turn=0.5 * length[:, None] * creep,
-        sway=sway_at_rest(forces, rates, length),
+        half_turn=0.5 * duration[:, None] * creep,
+        sway=sway_at_rest(forces, rates, duration),
         period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9,
         hidden=_hidden_rates(imu.rate_s, rates, mean_rate),
     )
@@ -126,7 +126,7 @@ def _hidden_rates(
     return HiddenRates(tuple(bands.tolist()), tuple(rounding_sd.tolist()), tuple(step.tolist()))
 
 
-def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: SensorNoise) -> np.ndarray:
+def _creep(forces: Sequence[np.ndarray], duration: np.ndarray, noise: SensorNoise) -> np.ndarray:
     """
     Return the rates across gravity at which the attitude creeps in each pose, rad/s, shape (k, 3).
 
@@ -137,7 +137,7 @@ def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: SensorNoise)
     ----------
     forces : sequence of array, shape (n, 3)
         Readings of the accelerometer in each pose, m/s^2.
-    length : array, shape (k,)
+    duration : array, shape (k,)
         Duration of each pose, s.
     noise : SensorNoise
         Noise of the accelerometer.
@@ -146,7 +146,7 @@ def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: SensorNoise)
     rates = np.zeros((len(forces), 3))
     # Squares of the slopes across gravity over their variances, two for each pose.
     squares = 0.0
-    for pose, (force, seconds) in enumerate(zip(forces, length)):
+    for pose, (force, seconds) in enumerate(zip(forces, duration)):
         time = np.linspace(-0.5, 0.5, len(force)) * seconds
         slope = time @ force / (time @ time)
         mean_force = force.mean(axis=0)
@@ -179,20 +179,22 @@ def _pooled_noise(
     n samples times n over the variance of single readings, from `pieces` pieces of each interval,
     if it exceeds 1 by two standard deviations.
     """
+    # Readings without any scatter get a weight that is finite.
     floor = 1e-9 * max(1e-3, max(np.max(np.abs(part)) for part in parts))
     median_variance = np.median([part.var(0, ddof=1) for part in parts], axis=0)
     sd = np.sqrt(np.maximum(median_variance, rounding)) + floor
     ratios = []
     for part in parts:
-        length = len(part) // pieces
-        if length >= 4:
-            means = part[: length * pieces].reshape(pieces, length, 3).mean(1)
+        n_samples = len(part) // pieces
+        if n_samples >= 4:
+            means = part[: n_samples * pieces].reshape(pieces, n_samples, 3).mean(1)
             # Differences of neighbours: a slow drift belongs to the scatter between poses, not
-            # here.
-            ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * length / sd**2)
+            # here. They have twice the variance of the means.
+            ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * n_samples / sd**2)
     if not ratios:
         return SensorNoise(sd**2, np.ones(3))
     ratio = np.mean(ratios, axis=0)
+    # The mean of n squared differences of neighbours has the relative variance 3 / n.
     margin = 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
     return SensorNoise(sd**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
@@ -255,6 +257,7 @@ def collect_turns(
     rate = imu.rate_s
     max_gap = max(MAX_TURN_GAP, 5 * poses.period)
     clipped = at_range_end(rate)
+    # Power density of the noise of rates, (rad/s)^2/Hz: its integral has the variance density * T.
     density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
     for first in range(len(poses) - 1):
         # From the last sample of one pose to the first sample of the next one.
@@ -268,12 +271,12 @@ def collect_turns(
         noise_variance += _slow_rounding_variance(time[piece], rate[piece], poses.hidden)
         turns.append(
             TurnData(
-                time[piece],
-                rate[piece],
-                imu.force_s[piece],
-                first,
-                first + 1,
-                noise_variance,
+                time=time[piece],
+                rate=rate[piece],
+                force=imu.force_s[piece],
+                first=first,
+                last=first + 1,
+                noise_variance=noise_variance,
                 temperature_c=None if temperature_c is None else temperature_c[piece],
             )
         )
@@ -411,9 +414,9 @@ def known_turn_data(
     density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
     noise_variance = density * (time[piece][-1] - time[piece][0])
     return TurnData(
-        time[piece],
-        imu.rate_s[piece],
-        imu.force_s[piece],
+        time=time[piece],
+        rate=imu.rate_s[piece],
+        force=imu.force_s[piece],
         noise_variance=noise_variance,
         rotation=turn.angle * axis,
         rotation_cov=cov,
@@ -509,10 +512,11 @@ def rising(time: np.ndarray) -> np.ndarray:
     """
     if np.all(np.diff(time) > 0):
         return time
-    kept = np.concatenate([[True], np.diff(time) > 0])
-    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(
-        len(time)
-    )
+    number = np.arange(len(time))
+    is_later = np.concatenate([[True], np.diff(time) > 0])
+    spread = np.interp(number, np.flatnonzero(is_later), time[is_later])
+    # Equal stamps at the end have no following step: each sample is a nanosecond later.
+    return spread + 1e-9 * number
 
 
 def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> float:
@@ -525,7 +529,7 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
     Parameters
     ----------
     state : State
-        Directions of gravity from the norms.
+        With the directions of gravity in the poses (`first_state`).
     poses : Poses
     turns : sequence of TurnData
 

@@ -34,13 +34,13 @@ class HandStore:
     Parameters
     ----------
     most : int
-        Samples kept at most.
+        Largest number of samples.
 
     """
 
     def __init__(self, most: int):
         self.most = most
-        # The samples, in order of time.
+        # The samples in order of time, one part for each call of `add` since they were joined.
         self._parts: list[ImuSamples] = []
         # Shifts the stamps after a clock reset, so that they increase.
         self._stamps = ContinuedStamps(INSERTED_PAUSE_NS)
@@ -159,7 +159,7 @@ class HandStore:
 
     def load(self, data: bytes) -> None:
         """
-        Insert saved samples before new ones, as a recording with a pause in it.
+        Replace the samples by saved ones; new samples follow after a pause.
 
         Raises
         ------
@@ -186,13 +186,9 @@ class HandStore:
                     str(arrays['frame_id']),
                     absent=absent,
                 )
-            for values, kind, shape in (
-                (imu.stamp_ns, 'i', ()),
-                (imu.force_s, 'f', (3,)),
-                (imu.rate_s, 'f', (3,)),
-            ):
-                if values.dtype.kind != kind or values.shape != (imu.stamp_ns.size, *shape):
-                    raise ValueError(f'it holds {values.dtype} of shape {values.shape}')
+            _check_array(imu.stamp_ns, 'i', shape=(imu.stamp_ns.size,))
+            _check_array(imu.force_s, 'f', shape=(imu.stamp_ns.size, 3))
+            _check_array(imu.rate_s, 'f', shape=(imu.stamp_ns.size, 3))
         except ImuCalibrationError:
             raise
         except Exception as error:  # damaged archives and arrays raise many kinds
@@ -205,6 +201,12 @@ class HandStore:
         if len(imu):
             self._parts = [imu]
             self._stamps.continue_after(int(imu.stamp_ns[-1]))
+
+
+def _check_array(values: np.ndarray, kind: str, *, shape: tuple[int, ...]) -> None:
+    """Raise ValueError where an array has another kind of number ('i', 'f') or shape."""
+    if values.dtype.kind != kind or values.shape != shape:
+        raise ValueError(f'it holds {values.dtype} of shape {values.shape}')
 
 
 def _across_holes(stamp_ns: np.ndarray, rests: Sequence[slice]) -> list[slice]:

@@ -53,7 +53,7 @@ def directions(model: HandModel, poses: Poses) -> np.ndarray:
 
     They are computed with cross terms at their prior: estimated ones, if wrong, would turn them.
     """
-    return first_state(replace(model, untested=CROSS_TERMS), poses).up
+    return first_state(replace(model, held_terms=CROSS_TERMS), poses).up
 
 
 def off_axis_lacking(up: np.ndarray) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ def off_axis_lacking(up: np.ndarray) -> tuple[str, ...]:
     Parameters
     ----------
     up : array, shape (k, 3)
-        `directions`, as for the other functions of this module.
+        Direction of gravity in each pose, with cross terms at their prior (`directions`).
 
     """
     first = placements(up)
@@ -134,44 +134,49 @@ def fit_placements(
     Parameters
     ----------
     model : HandModel
-        Its `untested` cross terms are not estimated.
+        Its `held` parameters are not estimated.
     values : array, shape (n_params,)
         Start of the iteration.
     poses : Poses
+        Mean readings of the k poses.
     up : array, shape (k, 3)
-        `directions`.
-    used : array, shape (k,)
-        True for the poses that are not outliers.
+        Direction of gravity in each pose, with cross terms at their prior (`directions`).
+    used : array of bool, shape (k,)
+        Poses that are fitted; False for outliers.
 
     """
-    # Means of the rests of each placement.
+    # Means of readings, times and temperatures over the rests of each placement.
     first = placements(up[used])
-    count = np.diff(np.append(first, np.count_nonzero(used)))
-    force = np.add.reduceat(poses.force[used], first, axis=0) / count[:, None]
+    n_rests = np.diff(np.append(first, np.count_nonzero(used)))
+    force = np.add.reduceat(poses.force[used], first, axis=0) / n_rests[:, None]
     conditions = {}
     for name, condition in poses.conditions.items():
         if condition is not None:
-            conditions[name] = np.add.reduceat(condition[used], first) / count
+            conditions[name] = np.add.reduceat(condition[used], first) / n_rests
 
-    # Gauss-Newton steps: a cross term c changes the norm by ``g c^2 / 2``, 0.1 m/s^2 for 0.15.
+    # Gauss-Newton steps, since the norm is not linear in the parameters: a cross term c also
+    # changes it by ``g c^2 / 2``, 0.1 m/s^2 for 0.15.
     index = np.concatenate([model.base_index('accelerometer'), model.extra_index('accelerometer')])
-    index = index[~model.withheld[index]]
+    index = index[~model.held[index]]
     values = values.copy()
-    values[model.withheld] = model.nominal[model.withheld]
+    values[model.held] = model.nominal[model.held]
     squares = _PlacementSquares(model, force, conditions, index)
     values = gauss_newton(squares, values, n_steps=PLACEMENT_STEPS)
 
-    # Variance of a placement from the errors, with the widening of Student's t.
+    # Variance of a placement from the errors. Few of them estimate it poorly, so that it is
+    # widened by the factor of Student's t.
     errors, columns = squares.rows(values)
-    cost = float(errors @ errors)
+    sum_of_squares = float(errors @ errors)
     rank = int(np.linalg.matrix_rank(columns))
     spare = len(errors) - rank
     covariance = None
     if spare >= FEWEST_SPARE and rank == len(index):
         information = columns.T @ columns
-        variance = float(student_factor(np.array([spare]))[0]) * cost / spare
+        variance = float(student_factor(np.array([spare]))[0]) * sum_of_squares / spare
         covariance = variance * np.linalg.inv(information)
-    return PlacementFit(index, values, cost, spare, covariance)
+    return PlacementFit(
+        index=index, values=values, squares=sum_of_squares, spare=spare, covariance=covariance
+    )
 
 
 def placements_demand(
