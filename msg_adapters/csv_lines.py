@@ -62,24 +62,29 @@ def sensor_of_label(label: str) -> str:
 
 
 def _with_serial_column(lines: Sequence[str]) -> list[str]:
-    """Return lines with the time of arrival as first column, where a serial monitor printed it."""
-    stamped = [SERIAL_STAMP.fullmatch(line) for line in lines[:MOST_LINES]]
-    if not _are_most(stamped):
+    """
+    Return lines whose first column is the time of arrival that a serial monitor printed.
+
+    Lines of another origin are unchanged.
+    """
+    matches = [SERIAL_STAMP.fullmatch(line) for line in lines[:MOST_LINES]]
+    if not _are_most(matches):
         return list(lines)
-    texts = [match[2] for match in stamped if match]
+
+    # The device printed its columns with the most frequent of these delimiters.
+    texts = [match[2] for match in matches if match]
     delimiter = max('\t;, ', key=lambda mark: sum(text.count(mark) for text in texts))
-    plain = []
+
+    lines_with_time = []
     for line in lines:
         match = SERIAL_STAMP.fullmatch(line)
-        time, text = 'time', line
-        if match:
-            time = match[1]
-            text = match[2]
-        # The time of the header is its name.
-        if not any(character.isdigit() for character in text):
-            time = 'time'
-        plain.append(f'{time}{delimiter}{text}')
-    return plain
+        text = match[2] if match else line
+        # The header, a line without digits, gets the name of the column in place of its time, as
+        # does a line without a time.
+        has_time = match is not None and any(character.isdigit() for character in text)
+        time = match[1] if has_time else 'time'
+        lines_with_time.append(f'{time}{delimiter}{text}')
+    return lines_with_time
 
 
 def _with_header_of_labels(lines: list[str]) -> list[str]:

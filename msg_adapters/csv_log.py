@@ -299,12 +299,12 @@ def read_csv(
     table = _Table(path)
 
     # A log with a row per sensor: both sensors are read apart, or one of them is the log.
-    rows = _rows_of_sensors(table, where)
-    if len({each.sensor for each in rows}) == 2:
-        return _read_sensor_rows(path, rows, columns, where, raw=raw)
-    if rows:
-        table = _Table(path, rows[0].sensor)
-        where = (*where, rows[0].condition)
+    row_groups = _rows_of_sensors(table, where)
+    if len({group.sensor for group in row_groups}) == 2:
+        return _read_sensor_rows(path, row_groups, columns, where, raw=raw)
+    if row_groups:
+        table = _Table(path, row_groups[0].sensor)
+        where = (*where, row_groups[0].condition)
 
     # Columns of the user, then those of the header for the other quantities and joints.
     chosen = [table.stated(_parse(text)) for text in columns]
@@ -344,14 +344,14 @@ def read_csv(
             angles[joint.joint] = table.values(joint.names)[:, 0] * unit_rad
     used += joints
     return CsvLog(
-        tuple(used),
-        readings.imu,
-        JointSamples.of_angles(stamp_ns, angles) if angles else None,
-        temperature,
-        tuple(_unused_names(table, used)),
-        table.n_dropped,
-        counted.n_overflows,
-        counted.size_ns,
+        columns=tuple(used),
+        imu=readings.imu,
+        joints=JointSamples.of_angles(stamp_ns, angles) if angles else None,
+        temperature=temperature,
+        unused=tuple(_unused_names(table, used)),
+        n_dropped=table.n_dropped,
+        n_overflows=counted.n_overflows,
+        counter_size_ns=counted.size_ns,
         joined=readings.joined,
         text=_text_of(table, used, stamp_ns, readings.joined),
     )
@@ -397,13 +397,13 @@ def _text_of(
         stamps, first = np.unique(stamp_ns[rows_of_sensor], return_index=True)
         rows = rows_of_sensor[first[np.searchsorted(stamps, joined.imu.stamp_ns)]]
     return LogText(
-        table.path,
-        tuple(table.names),
-        used,
-        places,
-        tuple(table.lines),
-        rows,
-        table.delimiter,
+        path=table.path,
+        names=tuple(table.names),
+        columns=used,
+        places=places,
+        lines=tuple(table.lines),
+        row_of_sample=rows,
+        delimiter=table.delimiter,
         decimal_comma=table.decimal_comma,
     )
 
@@ -615,8 +615,8 @@ def _log_of_two(force: _SensorLog, rate: _SensorLog) -> CsvLog:
     of_force, of_rate = readings.columns
     assert readings.joined is not None
     return CsvLog(
-        (force.time, of_force, rate.time, of_rate),
-        readings.imu,
+        columns=(force.time, of_force, rate.time, of_rate),
+        imu=readings.imu,
         joints=None,
         temperature=None,
         unused=(),
@@ -642,71 +642,78 @@ class _SensorRows:
 
 def _rows_of_sensors(table: _Table, where: Sequence[str]) -> list[_SensorRows]:
     """
-    Return the `_SensorRows` of a log with a row per sensor; [] for another log.
+    Return the groups of rows, one for each name of a sensor in the first column with such names.
 
-    The first column with names of sensors counts. Rows with "uncalibrated" in their name are left
-    out where the sensor has other rows.
+    Groups with "uncalibrated" in their name are left out where the sensor has others. [] for a log
+    without such a column.
     """
-    for name in table.word_columns:
-        cells = table.values_of(name, where)
-        rows = []
+    for column in table.word_columns:
+        cells = table.values_of(column, where)
+        groups = []
         for cell in cells:
             sensor = sensor_of_label(cell)
             if sensor:
-                rows.append(_SensorRows(sensor, cell, f'{name}={cell}'))
-        if not rows:
+                groups.append(_SensorRows(sensor, cell, f'{column}={cell}'))
+        if not groups:
             continue
         # One name in all rows is only needed where no name of a column has the sensor.
-        if len(cells) == 1 and any(each.quantity in SENSOR_OF for each in _guess(table)):
+        if len(cells) == 1 and any(guess.quantity in SENSOR_OF for guess in _guess(table)):
             continue
-        calibrated = [each for each in rows if 'uncal' not in each.name.lower()]
-        sensors = {each.sensor for each in calibrated}
-        return calibrated + [each for each in rows if each.sensor not in sensors]
+        calibrated = [group for group in groups if 'uncal' not in group.name.lower()]
+        sensors = {group.sensor for group in calibrated}
+        return calibrated + [group for group in groups if group.sensor not in sensors]
     return []
 
 
 def _read_sensor_rows(
     path: Path,
-    rows: list[_SensorRows],
+    row_groups: list[_SensorRows],
     columns: Sequence[str],
     where: Sequence[str],
     *,
     raw: Sequence[str],
 ) -> CsvLog:
     """
-    Return the CsvLog of a log with a row per sensor; `rows`: of both sensors.
+    Return the CsvLog of a log with a row per sensor.
 
-    The other arguments are those of `read_csv`.
+    `row_groups` are the rows of accelerometer and gyroscope, where a sensor may have several groups
+    (raw and corrected readings). The other arguments are those of `read_csv`.
     """
     stated = [_parse(text) for text in columns]
-    other = [each for each in stated if each.quantity not in ('time', *SENSOR_OF)]
-    if other:
+    unread = [each for each in stated if each.quantity not in ('time', *SENSOR_OF)]
+    if unread:
         raise InputError(
-            f'of a log with a row per sensor time, force and rate are read, got {other[0]} for'
+            f'of a log with a row per sensor time, force and rate are read, got {unread[0]} for'
             f' {path}; omit it, or join the rows of each time',
             key='columns',
             code='sensor_rows',
         )
+
+    # Each group of rows is read like a log of one sensor.
     logs_of: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
-    n_rows_of = Counter(each.sensor for each in rows)
-    for each in rows:
-        quantity = 'force' if each.sensor == 'acc' else 'rate'
-        stated_for_rows = [given for given in stated if given.quantity in ('time', quantity)]
-        table = _Table(path, each.sensor)
+    n_groups_of = Counter(group.sensor for group in row_groups)
+    for group in row_groups:
+        quantity = 'force' if group.sensor == 'acc' else 'rate'
+        stated_for_rows = [each for each in stated if each.quantity in ('time', quantity)]
+        table = _Table(path, group.sensor)
         try:
-            log = _sensor_log(table, (*where, each.condition), stated_for_rows, raw)
+            log = _sensor_log(table, (*where, group.condition), stated_for_rows, raw)
         except InputError:
-            if n_rows_of[each.sensor] == 1:
+            # A group that cannot be read, such as linear accelerations of unknown unit, is left
+            # out where the sensor has another one.
+            if n_groups_of[group.sensor] == 1:
                 raise
-            continue  # such as linear accelerations of unknown unit
+            continue
         if log is None:
             raise InputError(
                 f'{path} must have a column of {quantity} per axis and one of time in the rows'
-                f' {each.condition}, got {shortened(", ".join(table.names), 300)}; {REMEDY}',
+                f' {group.condition}, got {shortened(", ".join(table.names), 300)}; {REMEDY}',
                 key='columns',
                 code='sensor_rows',
             )
-        logs_of[quantity].append(replace(log, condition=each.condition))
+        logs_of[quantity].append(replace(log, condition=group.condition))
+
+    # One log of each sensor must remain.
     logs_of['force'] = _with_gravity_only(logs_of['force'])
     for quantity, logs in logs_of.items():
         if len(logs) != 1:
@@ -1255,20 +1262,20 @@ class _Table:
             value = value.strip()
             # A value may contain a comma.
             accepted = (value, *value.split(','))
-            kept = []
+            selected = []
             cell_counts = Counter()
             for line, cell in self._column_of(lines, name.strip()):
                 cell_counts[cell] += 1
                 if any(_same(cell, each) for each in accepted):
-                    kept.append(line)
-            if not kept:
+                    selected.append(line)
+            if not selected:
                 usual = ', '.join(cell for cell, _ in cell_counts.most_common(5))
                 raise InputError(
                     f'rows of {self.path} must fulfil {condition}, got none; {name} is'
                     f' {shortened(usual, 100)}; correct the column or its value',
                     code='where',
                 )
-            lines = kept
+            lines = selected
         return lines
 
     def values(self, names: Sequence[str]) -> np.ndarray:
@@ -1450,7 +1457,8 @@ def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
 
     Raises InputError for several sets of axes of one sensor.
     """
-    # Quantity -> set of axes (`_Reading.group`) -> axis -> (name, unit or None).
+    # Columns with one axis: quantity -> set of axes (`_Reading.group`) -> axis -> (name, unit or
+    # None). Other quantities have one column.
     axes: dict[str, dict[str, dict[str, tuple[str, str | None]]]] = {'force': {}, 'rate': {}}
     columns = []
     sensor_of_file = _words(table.path.stem)[0]
@@ -1480,11 +1488,15 @@ def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
                 columns.append(Columns(quantity, (name,), unit))
         if joint:
             columns.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
+
+    # Time: seconds and nanoseconds, a column with a usual name, or another one that may be it.
     pair = _seconds_and_nanoseconds(table)
     if pair:
         columns = [pair, *(each for each in columns if each.quantity != 'time')]
     if not any(each.quantity == 'time' for each in columns):
         columns += _unnamed_time(table)
+
+    # Force and rate: the only set with three axes.
     for quantity, groups in axes.items():
         if quantity in stated:
             continue

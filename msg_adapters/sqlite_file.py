@@ -217,26 +217,29 @@ class SqliteFile(StorageFile):
         self.connection.close()
 
     def _stretches(self, topics: Sequence[str]) -> Iterator[Stretch]:
-        """Yield the Stretches of the rows of some topics, in the order of the ids."""
+        """Yield the messages of some topics in Stretches of many rows, in the order of the ids."""
         wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
+        # A scan begins.
         self._n_calls = 0
         self._n_steps = 0
         """Steps behind damage in the present scan."""
-        enough_rows = RANGE_IDS // 2 if len(wanted) == 1 else STRETCH_ROWS
-        # Bytes of the scan; rows and bytes of the present stretch.
+        rows_of_stretch = RANGE_IDS // 2 if len(wanted) == 1 else STRETCH_ROWS
+        # Bytes of the messages of the scan.
         n_scanned = 0
+        # Parts of the present stretch, their rows and bytes.
+        parts: list[Part] = []
         n_rows = 0
         n_bytes = 0
-        parts: list[Part] = []
         for part in self._parts(wanted):
             n_scanned += len(part.messages)
+            # More messages than the file can hold: damaged rows refer to the same pages.
             if n_scanned > self.size:
                 self._lose(f'rest {UNKNOWN_EXTENT} after rows that share their pages', 1)
                 break
             parts.append(part)
             n_rows += len(part.sizes)
             n_bytes += len(part.messages)
-            if n_rows >= enough_rows or n_bytes >= STRETCH_BYTES:
+            if n_rows >= rows_of_stretch or n_bytes >= STRETCH_BYTES:
                 yield _stretch(parts)
                 parts = []
                 n_rows = 0
@@ -368,10 +371,11 @@ class SqliteFile(StorageFile):
         if joined is not None:
             yield Part(joined, _sizes(messages), np.array(topic_ids), lambda: times)
             return
-        kept = []
-        messages = []
+        usable_rows = []
+        usable_messages = []
         n_bytes = 0
         for row_id, topic_id, received_ns, message in rows:
+            # The statement gives no large messages.
             if message is None and topic_id in wanted:
                 message = self._large(row_id)
             if topic_id not in wanted or not isinstance(message, bytes):
@@ -380,16 +384,16 @@ class SqliteFile(StorageFile):
             if self._is_cut(message):
                 self._lose('rows of the incomplete last page', 1)
                 continue
-            kept.append((topic_id, received_ns))
-            messages.append(message)
+            usable_rows.append((topic_id, received_ns))
+            usable_messages.append(message)
             n_bytes += len(message)
             if n_bytes >= STRETCH_BYTES:
-                yield _part(kept, messages)
-                kept = []
-                messages = []
+                yield _part(usable_rows, usable_messages)
+                usable_rows = []
+                usable_messages = []
                 n_bytes = 0
-        if kept:
-            yield _part(kept, messages)
+        if usable_rows:
+            yield _part(usable_rows, usable_messages)
 
     def _large(self, row_id: int) -> Any:
         """Return a message above `SMALL_BYTES`, None where it cannot be read."""
