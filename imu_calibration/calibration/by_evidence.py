@@ -86,25 +86,25 @@ def _with_significant(
 
     """
     main_search, *other_searches = searches
-    rivals = _findings_of_others_only(main_search, other_searches)
+    other_findings = _findings_of_others_only(main_search, other_searches)
     while True:
         # An effect of the requested model is judged with the added effects in the solution: the
         # misfit of a missing delay or encoder zero widens every standard deviation.
-        added = _missing_effects((*main_search.adopted, *rivals), first.model)
+        added = _missing_effects((*main_search.adopted, *other_findings), first.model)
         solved = _solved_with(source, options, first, added, (*other_searches, main_search))
 
         # Findings of other recordings first: they may be collinear with those of the largest one,
         # which can become significant without them.
         significant = []
-        for rival in rivals:
-            if not _is_insignificant(solved.solution, rival, main_search.settings):
-                significant.append(rival)
-        if len(significant) < len(rivals):
-            rivals = significant
+        for finding in other_findings:
+            if not _is_insignificant(solved.solution, finding, main_search.settings):
+                significant.append(finding)
+        if len(significant) < len(other_findings):
+            other_findings = significant
             continue
 
         main_search = _without_insignificant(main_search, solved.solution, first.model)
-        remaining = _missing_effects((*main_search.adopted, *rivals), first.model)
+        remaining = _missing_effects((*main_search.adopted, *other_findings), first.model)
         if len(remaining) == len(added):  # all added effects are significant
             return solved, [main_search, *other_searches]
 
@@ -136,13 +136,14 @@ def _solved_with(
     return replace(source.solved(extension.options(options)), extension=extension)
 
 
-def ask_kept(
+def search_again(
     solved: Solved[Estimate], options: CalibrationOptions, *, known: ModelExtension
 ) -> Solved[Estimate]:
     """
-    Return the solution with the effects that a search supports, if columns cannot be recomputed.
+    Return a solution with the result of a new search, where no effect can be added to the model.
 
-    Supported effects that the model lacks are reported, and widen the covariance.
+    The columns of further effects cannot be computed from what is stored. Supported effects that
+    the model lacks are therefore reported, and widen the covariance.
 
     Parameters
     ----------
@@ -194,6 +195,7 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
         for sensor, residual in search.unexplained_rests().items():
             if residual.significant:
                 unexplained[sensor] = residual.entry
+    # The first recording with a change of parameters.
     changed_at = None
     for search in searches:
         if changed_at is None:
@@ -209,7 +211,7 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
 
 
 def _missing_effects(findings: Iterable[Question], model: SensorModel) -> list[Question]:
-    """Return the findings whose effects a model lacks."""
+    """Return those of the findings whose effects a model lacks."""
     return [question for question in findings if question.effect.key not in model.slices]
 
 
@@ -265,7 +267,7 @@ def stands_out(solution: Solution, question: Question, *, joint_test: bool = Tru
     """
     Return whether an effect belongs into the model of a solution.
 
-    Its size is plausible, one amplitude is significant, and so are all together (`joint_test`).
+    Its size is plausible, one amplitude is significant, and with `joint_test` so are all together.
     The covariance C of the amplitudes a includes all allowances. With the prior means m::
 
         chi^2 = (a - m)^T C^+ (a - m),   degrees of freedom: rank of C
@@ -320,5 +322,6 @@ def _moves(
     """
     moves = []
     for question in (*search.unstable, *search.rejected, *search.implausible, *missing):
-        moves.append((search.search.moved_by(search.named, question, search.param_names), 1.0))
+        change = search.search.moved_by(search.named, question, search.param_names)
+        moves.append((change, 1.0))  # each choice has the full weight
     return (*moves, *search.further_moves)

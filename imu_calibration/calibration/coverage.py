@@ -189,7 +189,11 @@ class Coverage:
 
 
 NOTHING_SEEN = Coverage(
-    np.ones(len(DIRECTIONS)), np.zeros((0, 3)), None, Step('move the table'), float('nan')
+    worth=np.ones(len(DIRECTIONS)),
+    seen=np.zeros((0, 3)),
+    up=None,
+    next=Step('move the table'),
+    seconds=float('nan'),
 )
 """Before anything is known."""
 

@@ -80,15 +80,15 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
         between[k] = _angle(axes[i], axes[j])
         between_sd[k] = _between_sd(axes, tangent, covariance, i, j)
     return Derived(
-        sensor,
-        scale,
-        scale_sd,
-        angles_of(axes),
-        angles_sd,
-        between,
-        between_sd,
-        calibration.of(sensor, Role.OFFSET),
-        calibration.sd[calibration.model.part(sensor, Role.OFFSET)],
+        sensor=sensor,
+        scale=scale,
+        scale_sd=scale_sd,
+        angles=angles_of(axes),
+        angles_sd=angles_sd,
+        between=between,
+        between_sd=between_sd,
+        bias=calibration.of(sensor, Role.OFFSET),
+        bias_sd=calibration.sd[calibration.model.part(sensor, Role.OFFSET)],
     )
 
 

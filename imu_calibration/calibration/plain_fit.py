@@ -109,7 +109,13 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
         error = judged.rms(held_out.errors(sensor, folds))
         # Estimates of the table and the clock have to pay: the residual may have moved them.
         if chosen is None or error < CLEARLY_BETTER * chosen.error:
-            chosen = PlainFit(sensor, estimate, error, solution_error, judged.unit)
+            chosen = PlainFit(
+                sensor=sensor,
+                estimate=estimate,
+                error=error,
+                error_of_solution=solution_error,
+                unit=judged.unit,
+            )
     return chosen
 
 
@@ -197,7 +203,9 @@ def plan_of(solution: Solution, sensor: str, reference: np.ndarray) -> PlainEsti
     fitted &= ~uninformed
     replaced &= ~uninformed
     start = np.where(uninformed, solution.values, reference)
-    return PlainEstimate(replaced, fitted, tuple(dropped), start, [])
+    return PlainEstimate(
+        replaced=replaced, fitted=fitted, dropped=tuple(dropped), values=start, folds=[]
+    )
 
 
 def is_of_reference(effect: Effect) -> bool:

@@ -94,7 +94,7 @@ def entry_of(
     Errors of different rows are independent. `seconds`: length of the data.
     """
     n, components = before.shape
-    judged = JudgedData(np.ones((n, 1)), unit, n, components)
+    judged = JudgedData(counts=np.ones((n, 1)), unit=unit, windows=n, components=components)
     entry = proof_entry(judged, errors_of_rows(before), errors_of_rows(after))
     return replace(entry, seconds=seconds)
 

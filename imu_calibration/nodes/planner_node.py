@@ -64,7 +64,12 @@ from imu_calibration.nodes.lifecycle import (
 )
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.robot_stand import RobotSettings, live_reference
-from imu_calibration.planning.campaign import Campaign, CampaignSettings, Suspect, separator_of
+from imu_calibration.planning.campaign import (
+    Campaign,
+    CampaignSettings,
+    CollinearFinding,
+    separator_of,
+)
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.motion_library import up_at
 from imu_calibration.planning.planner import Planner, make_planner
@@ -323,12 +328,12 @@ class PlannerNode(Node):
         return Campaign(
             planner,
             self._campaign_settings,
-            lambda suspect: self._make_separator(suspect, noise),
+            lambda finding: self._make_separator(finding, noise),
             first=lambda position: planner.probe(position, self.driver.first_reach),
             unwind=planner.unwinding,
         )
 
-    def _make_separator(self, suspect: Suspect, noise: dict) -> Planner:
+    def _make_separator(self, finding: CollinearFinding, noise: dict) -> Planner:
         """Return the planner of motions that separate a model error from its collinear effects."""
         calibration = self._latest()
         if calibration is None:
@@ -339,7 +344,7 @@ class PlannerNode(Node):
         return separator_of(
             self._table,
             calibration,
-            suspect,
+            finding,
             noise=noise,
             rate=self.settings.imu_rate,
             options=self._options,
@@ -471,7 +476,7 @@ class PlannerNode(Node):
             self._received.wait_for(lambda: self._n_documents > n_before, timeout=2.0)
         return self._latest()
 
-    def _diagnose(self) -> list[Suspect] | None:
+    def _diagnose(self) -> list[CollinearFinding] | None:
         """Request a diagnosis; return its model errors, None without a result in time."""
         n_before = self._diagnosis_values.get('diagnoses', '0')
         response = self._ask('diagnose')

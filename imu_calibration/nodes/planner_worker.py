@@ -15,7 +15,7 @@ from typing import Any
 from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.nodes.diagnostics import LOG_ERROR, LOG_INFO
-from imu_calibration.planning.campaign import Campaign, Suspect
+from imu_calibration.planning.campaign import Campaign, CollinearFinding
 from imu_calibration.planning.driver import Driver, DriveState
 from imu_calibration.planning.planner import Decision
 from imu_calibration.references.turntable.live_diagnosis import FOUND, MATES_KEY, SIZE_KEY
@@ -43,7 +43,7 @@ class Peers:
     """Returns the calibration (a document) of all data so far."""
     latest: Callable[[], Any]
     """Returns the last calibration that was heard of."""
-    diagnose: Callable[[], list[Suspect] | None]
+    diagnose: Callable[[], list[CollinearFinding] | None]
     """Returns the detected model errors, the strongest first."""
     send: Callable[[Any], None]
     """Sends a trajectory."""
@@ -268,7 +268,7 @@ class PlannerWorker(threading.Thread):
         )
 
 
-def findings_from(values: dict[str, str]) -> list[Suspect]:
+def findings_from(values: dict[str, str]) -> list[CollinearFinding]:
     """
     Return the model errors that calibration_node has detected, the strongest first.
 
@@ -285,7 +285,7 @@ def findings_from(values: dict[str, str]) -> list[Suspect]:
     """
     if values.get('outcome') != FOUND:
         return []
-    suspects = []
+    findings = []
     for key, value in values.items():
         if not key.startswith(MATES_KEY):
             continue
@@ -294,8 +294,8 @@ def findings_from(values: dict[str, str]) -> list[Suspect]:
         sizes = {}
         for name in (effect, *mates):
             sizes |= _sizes_of(name, values)
-        suspects.append(Suspect(effect, mates, sizes))
-    return suspects
+        findings.append(CollinearFinding(effect, mates, sizes))
+    return findings
 
 
 def _sizes_of(effect: str, values: dict[str, str]) -> dict[str, float]:

@@ -50,7 +50,7 @@ def make_separator(
     calibration : Calibration
         Calibration of the extended model of a diagnosis, with the size of the first cause.
     causes : sequence of (sensor, effect name)
-        The finding, then its collinear alternatives.
+        The finding, then its mates: the effects that are collinear with it.
     noise : mapping
         Sensor -> NoiseModel of single samples at `rate`.
     rate : float
@@ -58,8 +58,8 @@ def make_separator(
     options : CalibrationOptions
         Its tolerances and catalogue.
     sizes : mapping, optional
-        Parameter -> value, SI, of the alternatives as estimated in the diagnosis in place of the
-        first; without an estimate, as large as they must be to pass for it on a usual session.
+        Parameter -> value, SI, of the mates as estimated in the diagnosis in place of the finding;
+        without an estimate, as large as they must be to imitate it on a usual session.
     limits : MotionLimits, optional
         Default: the limits of the table.
 
@@ -70,39 +70,41 @@ def make_separator(
 
     """
     # The model with all causes, at the values of the calibration.
-    first, *mates = causes
-    if first not in calibration.model.slices:
+    finding, *mates = causes
+    if finding not in calibration.model.slices:
         raise InputError(
-            f"the calibration must contain '{first[1]}', which is to be separated; give that of the"
-            ' diagnosis',
+            f"the calibration must contain '{finding[1]}', which is to be separated; give that of"
+            ' the diagnosis',
             key='calibration',
         )
     model = calibration.model
     for sensor, name in mates:
         if (sensor, name) not in model.slices:
             model = model.with_effect(sensor, name)
-    for key in causes:
-        effect = model.catalogue.find(*key, model.joint_names)
+    for cause in causes:
+        effect = model.catalogue.find(*cause, model.joint_names)
         if special(effect) or effect.smooth or 'temperature' in effect.needs:
             raise InputError(
-                f"effects that motion separates must depend on it, '{key[1]}' depends on time,"
+                f"effects that motion separates must depend on it, '{cause[1]}' depends on time,"
                 ' temperature or range; omit it'
             )
     values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
     problem = PlanningProblem(MotionLibrary(table, limits), coordinates, dict(noise), rate=rate)
+    # The goal: each cause is found and preferred in a search among all effects of the catalogue.
     n_candidates = len(model.catalogue.effects(model.joint_names))
-    collinear = suspected(problem, causes, table, sizes=sizes or {})
+    collinear = causes_with_sizes(problem, causes, table, sizes=sizes or {})
     problem.goal = ToldApart(coordinates, collinear, n_candidates)
-    # Without the first cause, because its estimate assumes that it is the true one.
+    # The information of the calibration about all parameters but those of the finding, whose
+    # estimate assumes that it is the true cause.
     rows = {name: k for k, name in enumerate(calibration.param_names)}
-    for k in _indices(calibration.model, first):
+    for k in _indices(calibration.model, finding):
         del rows[calibration.param_names[k]]
     problem.known_information = coordinates.information_from(rows, calibration.covariance)
     return Planner(problem)
 
 
-def suspected(
+def causes_with_sizes(
     problem: PlanningProblem,
     causes: Sequence[tuple[str, str]],
     table: Table,
@@ -110,10 +112,10 @@ def suspected(
     sizes: Mapping[str, float],
 ) -> list[CollinearEffect]:
     """
-    Return the causes with their sizes.
+    Return the causes with their sizes: the first has its value in the model.
 
-    The first with its value in the model; the other ones with the values of `sizes` (parameter ->
-    SI), without which with the size that imitates the first one (`_imitating_sizes`).
+    The other ones have the values of `sizes` (parameter -> SI), or where these lack one the size
+    that imitates the first cause (`_imitating_sizes`).
     """
     coordinates = problem.coordinates
     names = coordinates.model.param_names
@@ -214,7 +216,7 @@ class CampaignSettings:
 
 
 @dataclass(frozen=True)
-class Suspect:
+class CollinearFinding:
     """A finding of a diagnosis and the effects that are collinear with it."""
 
     effect: str
@@ -234,7 +236,7 @@ class Campaign:
     planner : Planner
     settings : CampaignSettings
     make_separator : callable, optional
-        Returns a planner of motions that separate a Suspect from its mates, or raises an
+        Returns a planner of motions that separate a CollinearFinding from its mates, or raises an
         ImuCalibrationError if none exists.
     first : callable, optional
         Returns the first motion from a position, None for none.
@@ -248,7 +250,7 @@ class Campaign:
         self,
         planner: Planner,
         settings: CampaignSettings = CampaignSettings(),
-        make_separator: Callable[[Suspect], Planner] | None = None,
+        make_separator: Callable[[CollinearFinding], Planner] | None = None,
         *,
         first: Callable[[np.ndarray], Any] = lambda position: None,
         unwind: Callable[[np.ndarray], Any] = lambda position: None,
@@ -258,10 +260,10 @@ class Campaign:
         self._make_separator = make_separator
         self._unwind = unwind
         self._first: Callable[[np.ndarray], Any] | None = first
-        """None after the first decision."""
+        """Returns the first motion; None after the first decision."""
         self._separator: Planner | None = None
         """Planner of the present separating motions; None while there are none."""
-        self.findings: list[Suspect] | None = None
+        self.findings: list[CollinearFinding] | None = None
         """Findings of the last diagnosis, the strongest first; None before the first diagnosis."""
         self.separations = 0
         """Number of separations that were begun."""
@@ -286,7 +288,7 @@ class Campaign:
         excess = self.planner.excess.values()
         self._distances.append(sum(max(math.log(ratio), 0.0) for ratio in excess if ratio > 0))
 
-    def take_findings(self, findings: list[Suspect] | None) -> str:
+    def take_findings(self, findings: list[CollinearFinding] | None) -> str:
         """
         Store the findings of a diagnosis, None if it failed.
 
@@ -298,10 +300,10 @@ class Campaign:
         self.findings = findings
         if self.separations >= self.settings.separations or self._make_separator is None:
             return ''
-        # The strongest finding with a collinear effect.
-        finding = next((each for each in findings if each.mates), None)
-        if finding is None:
+        collinear = [finding for finding in findings if finding.mates]
+        if not collinear:
             return ''
+        finding = collinear[0]  # the strongest
         reason = (
             f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion so far'
         )
@@ -311,6 +313,7 @@ class Campaign:
             return f'{reason}, and no motion is known that separates them: {error}'
         self.separations += 1
         self.told_apart = (finding.effect, *finding.mates)
+        # A separating motion need not reduce the distances to the tolerances.
         self._distances.clear()
         return f'{reason}: planning the motion that separates them'
 
@@ -415,7 +418,7 @@ Longest plan that separates causes, s; causes that need more count as one cause 
 def separator_of(
     table: Table,
     calibration: Calibration,
-    suspect: Suspect,
+    finding: CollinearFinding,
     *,
     noise: dict[str, NoiseModel],
     rate: float = 100.0,
@@ -423,14 +426,14 @@ def separator_of(
     limits: MotionLimits | None = None,
 ) -> Planner:
     """
-    Return the planner of the motion that separates a suspect from its mates.
+    Return the planner of the motion that separates a finding from its mates.
 
     Parameters
     ----------
     table : Table
     calibration : Calibration
-        The calibration, of a model that may lack the suspect.
-    suspect : Suspect
+        The calibration, of a model that may lack the finding.
+    finding : CollinearFinding
     noise : mapping
         Sensor -> NoiseModel of single samples at `rate`.
     rate : float
@@ -448,23 +451,23 @@ def separator_of(
     """
     causes = [
         (options.catalogue.owner_of(name, table.joint_names), name)
-        for name in (suspect.effect, *suspect.mates)
+        for name in (finding.effect, *finding.mates)
     ]
     planner = make_separator(
         table,
-        with_suspect(calibration, causes[0], suspect.sizes),
+        with_finding(calibration, causes[0], finding.sizes),
         causes,
         noise=noise,
         rate=rate,
         options=options,
-        sizes=suspect.sizes,
+        sizes=finding.sizes,
         limits=limits,
     )
-    planner.within(LONGEST_SEPARATION)
+    planner.drop_inseparable(LONGEST_SEPARATION)
     return planner
 
 
-def with_suspect(
+def with_finding(
     calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]
 ) -> Calibration:
     """
@@ -479,6 +482,7 @@ def with_suspect(
     effect = next(each for each in model.effects if (each.sensor, each.name) == cause)
     values = model.start_from(calibration.model, calibration.values)
     values[model.slices[cause]] = [sizes.get(name, 0.0) for name in effect.param_names()]
+    # The known covariance and status, those of the prior for the parameters of the effect.
     places = [model.param_names.index(name) for name in calibration.param_names]
     covariance = np.diag(model.prior()[1] ** 2)
     status = [HELD] * len(values)

@@ -218,12 +218,14 @@ class ToldApart:
     coordinates : Coordinates
         Of the baseline with all causes.
     causes : sequence of CollinearEffect
-    questions : int
-        Candidate effects of the search.
+    n_candidates : int
+        Number of effects among which the search finds a cause.
 
     """
 
-    def __init__(self, coordinates: Coordinates, causes: Sequence[CollinearEffect], questions: int):
+    def __init__(
+        self, coordinates: Coordinates, causes: Sequence[CollinearEffect], n_candidates: int
+    ):
         self.coordinates = coordinates
         self.causes = tuple(causes)
         self.pairs = list(permutations(self.causes, 2))
@@ -231,7 +233,7 @@ class ToldApart:
         self.words = ' and '.join(cause.key[1] for cause in causes)
         """Causes that are to be separated, as text."""
         self.sufficient = {
-            cause.key: sufficient_noncentrality(len(cause.places), questions)
+            cause.key: sufficient_noncentrality(len(cause.places), n_candidates)
             for cause in self.causes
         }
         """Key of the true cause -> noncentrality that suffices."""
@@ -308,22 +310,23 @@ Goal = WithinTolerances | ToldApart
 """Requirement on the covariance of z."""
 
 
-def sufficient_noncentrality(size: int, questions: int) -> float:
+def sufficient_noncentrality(n_params: int, n_candidates: int) -> float:
     """
     Return the noncentrality with which an effect is found and preferred to another one.
 
-    Each with SEPARATION_PROBABILITY. Found: its chi-square with `size` parameters exceeds the
-    threshold of a search among `questions` effects. Preferred: of two models of which one is right
-    the logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance
+    Each with SEPARATION_PROBABILITY. Found: its chi-square with `n_params` parameters exceeds the
+    threshold of a search among `n_candidates` effects. Preferred: of two models of which one is
+    right the logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance
     ``lambda``; it must exceed the search's TIE.
     """
     from scipy.stats import ncx2  # here, because its import is slow
 
-    threshold = chi2_isf(FAMILY_WISE / questions, size)
+    threshold = chi2_isf(FAMILY_WISE / n_candidates, n_params)
+    # The smallest value of a grid, in steps of half a per cent, that suffices.
     to_be_found = next(
         value
         for value in np.geomspace(1.0, 1e4, 2000)
-        if ncx2.sf(threshold, size, value) >= SEPARATION_PROBABILITY
+        if ncx2.sf(threshold, n_params, value) >= SEPARATION_PROBABILITY
     )
     # lambda / 2 - quantile sqrt(lambda) = TIE
     quantile = ndtri(SEPARATION_PROBABILITY)

@@ -153,11 +153,11 @@ class Driver:
         self.ignored: dict[str, int] = {}
         """Joint -> number of joint states that were ignored because its position was not finite."""
         # Times of the joints are by their stamps, "steady" ones by the clock of this process; s.
-        self._time = 0.0
+        self._stamp = 0.0
         """Stamp of the last joint state."""
-        self._heard = -np.inf
+        self._heard_at = -np.inf
         """Steady time of the last joint state."""
-        self._advanced = -np.inf
+        self._advanced_at = -np.inf
         """Steady time of the last joint state with another stamp than the one before."""
         self._watch: PathWatch | None = None
         """Progress along the present trajectory; None without one."""
@@ -167,9 +167,9 @@ class Driver:
         """Stamp since which the joints rest."""
         self._settling_since = 0.0
         """Stamp at which the joints reached the end of the trajectory."""
-        self._stopped: tuple[float, float] | None = None
+        self._last_stop: tuple[float, float] | None = None
         """(stamp, steady time) of the last stop in mid-motion; None without one."""
-        self._slow = True
+        self._next_is_slow = True
         """Whether the next motion is slow, because none larger than `first_reach` was made."""
 
     def change(self, settings: DriverSettings) -> None:
@@ -199,7 +199,7 @@ class Driver:
         """Whether the joints have rested for the settling time and no command is pending."""
         return (
             self._rested_at is not None
-            and self._time - self._rested_since >= self.settings.settling_time
+            and self._stamp - self._rested_since >= self.settings.settling_time
             and not self.awaits_stop
         )
 
@@ -211,20 +211,20 @@ class Driver:
         A controller may need `stall_patience` to execute a command, by its clock and by ours: a
         rest before that is no evidence.
         """
-        if self._stopped is None:
+        if self._last_stop is None:
             return False
-        seconds = min(self._time - self._stopped[0], self._heard - self._stopped[1])
+        seconds = min(self._stamp - self._last_stop[0], self._heard_at - self._last_stop[1])
         return seconds < self.settings.stall_patience
 
     def is_silent(self, now: float) -> bool:
         """Whether the time since the last joint state exceeds `silence`, by a steady clock."""
-        return now - self._heard > self.settings.silence
+        return now - self._heard_at > self.settings.silence
 
     def stamp_fault(self, now: float) -> str:
         """
         Return a line if joint states arrive whose stamps have not changed for `silence`, else ''.
         """
-        constant = self._heard - self._advanced
+        constant = self._heard_at - self._advanced_at
         if self.is_silent(now) or not constant > self.settings.silence:
             return ''
         return (
@@ -234,7 +234,7 @@ class Driver:
 
     def start(self) -> None:
         """Allow motions, once the joints rest; the first one will be slow."""
-        self._slow, self._rested_at = True, None
+        self._next_is_slow, self._rested_at = True, None
         self._become(DriveState.IDLE, 'started')
 
     def begin(self, points: TrajectoryPoints, words: str, now: float) -> TrajectoryPoints:
@@ -268,14 +268,14 @@ class Driver:
                 ' when they rest',
                 code='joints_moving',
             )
-        speed_share = self.settings.first_speed if self._slow else 1.0
+        speed_share = self.settings.first_speed if self._next_is_slow else 1.0
         points = points.ordered(self.joint_names).slowed(speed_share)
         self._require_within_limits(points)
         small_excursion = self.first_reach + MAX_REST_MOVEMENT * self.tolerance
         is_small = np.all(np.abs(points.position - self.position) <= small_excursion)
         self._watch = PathWatch(self.position, points, self.tolerance)
         # Motions are slow up to and including the first one that is larger.
-        self._slow = self._slow and bool(is_small)
+        self._next_is_slow = self._next_is_slow and bool(is_small)
         self.motions += 1
         self._become(DriveState.MOVING, words)
         return points
@@ -322,12 +322,12 @@ class Driver:
                 self.ignored[name] = self.ignored.get(name, 0) + 1
             return False
         # After a clock step backwards the wait starts again.
-        if self._stopped is not None and time < self._time:
-            self._stopped = time, now
-        if time != self._time or self.position is None:
-            self._advanced = now
-        self._time = time
-        self._heard = now
+        if self._last_stop is not None and time < self._stamp:
+            self._last_stop = time, now
+        if time != self._stamp or self.position is None:
+            self._advanced_at = now
+        self._stamp = time
+        self._heard_at = now
         self.position = np.asarray(position, float)
         if self.is_driving and (fault := self.stamp_fault(now)):
             return self.stop(fault)
@@ -354,7 +354,7 @@ class Driver:
         """Check the time limits; return whether all joints must stop."""
         if self.is_driving and self.is_silent(now):
             return self.stop(
-                f'no usable joint state for {now - self._heard:.1f} s: stopped; see that joint'
+                f'no usable joint state for {now - self._heard_at:.1f} s: stopped; see that joint'
                 ' states are published' + self.ignored_words()
             )
         return False
@@ -377,7 +377,7 @@ class Driver:
     def stop(self, why: str) -> bool:
         """Stop for a reason, from any state; return True."""
         if self.state is DriveState.MOVING:
-            self._stopped = self._time, self._heard
+            self._last_stop = self._stamp, self._heard_at
         self._watch = None
         self._become(DriveState.STOPPED, why)
         return True
@@ -425,7 +425,7 @@ class Driver:
         # Called only during a motion.
         assert watch is not None and self.position is not None
         if watch.has_strayed:
-            joint = watch.suspect()
+            joint = watch.hindered_joint()
             distance = watch.deviation.max() * watch.tolerance[joint]
             return (
                 f'joint {self._place_of(joint, self.position)} does not follow: the joints are'
@@ -439,27 +439,28 @@ class Driver:
                 f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the'
                 ' controller refused it or does not listen, see its log'
             )
+        name = self.joint_names[watch.hindered_joint()]
         return (
-            f'joint {self.joint_names[watch.suspect()]} has made no progress for {watch.waited:.1f}'
-            ' s: stopped; see whether something holds it'
+            f'joint {name} has made no progress for {watch.waited:.1f} s: stopped; see whether'
+            ' something holds it'
         )
 
     def _note_rest(self) -> None:
         """Restart the timer of rest when the joints have moved, or their clock was set back."""
         if (
             self._rested_at is None
-            or self._time < self._rested_since
+            or self._stamp < self._rested_since
             or np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)
         ):
             self._rested_at = self.position
-            self._rested_since = self._time
+            self._rested_since = self._stamp
 
     def _settle(self) -> bool:
         """Begin to measure once the joints rest; return whether all joints must stop."""
         if self.rests:
             self._watch = None
             self._become(DriveState.MEASURING, self.reason)
-        elif self._time - self._settling_since > self.settings.settling_patience:
+        elif self._stamp - self._settling_since > self.settings.settling_patience:
             return self.stop(
                 f'the joints do not rest within {self.settings.settling_patience:g} s: stopped;'
                 ' find the cause of the motion'

@@ -290,11 +290,11 @@ class MotionLibrary:
         self.table = table
         limits = limits or limits_of(table)
         self.limits = MotionLimits(
-            limits.lower,
-            limits.upper,
-            LIMIT_SHARE * limits.speed,
-            LIMIT_SHARE * limits.acceleration,
-            limits.turns,
+            lower=limits.lower,
+            upper=limits.upper,
+            speed=LIMIT_SHARE * limits.speed,
+            acceleration=LIMIT_SHARE * limits.acceleration,
+            turns=limits.turns,
         )
         self.names = tuple(table.joint_names)
         self.spread = choose_places(table, self.limits)
@@ -404,42 +404,56 @@ class MotionLibrary:
         return MotionBuilder(len(self.names), limits=self.limits, start=place)
 
     def _whole_turns(self, place: np.ndarray, rates: np.ndarray, seconds: float) -> MotionParts:
-        """Turn at constant rates for at least `seconds`, until endless joints have returned."""
+        """
+        Return a spin at constant rates that ends after whole turns, where it began.
+
+        `place`: start, rad, shape (n_joints,); `rates`: of the joints that turn, all equally fast,
+        rad/s, shape (n_joints,), 0 for the others; `seconds`: least time at these rates.
+        """
         speed = np.abs(rates).max()
-        # Angle of the ramps: that of a spin of one second without this second.
-        one_second = self._spun(place, rates, 1.0)
-        angle = np.abs(sum(segment.end - segment.start for segment in one_second)).max()
-        ramps = angle - speed
-        turns = np.ceil((seconds * speed + ramps) / (2 * np.pi))
-        held = (2 * np.pi * turns - ramps) / speed
-        ending = 'turn' if turns == 1 else 'turns'
-        text = f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}'
-        return place, self._spun(place, rates, held), text
+
+        # Angle of both ramps: that of a spin with one second at the rate, less that second.
+        spin_of_one_second = self._spun(place, rates, 1.0)
+        turned = sum(segment.end - segment.start for segment in spin_of_one_second)
+        ramp_angle = np.abs(turned).max() - speed
+
+        # Fewest whole turns that contain the ramps and the least time; the rate is held for longer
+        # to complete the last one.
+        n_turns = np.ceil((seconds * speed + ramp_angle) / (2 * np.pi))
+        seconds_at_rate = (2 * np.pi * n_turns - ramp_angle) / speed
+        noun = 'turn' if n_turns == 1 else 'turns'
+        text = f'spin {self._rate_words(rates)} for {n_turns:.0f} whole {noun}'
+        return place, self._spun(place, rates, seconds_at_rate), text
 
     def _sweep(self, place: np.ndarray, rates: np.ndarray) -> MotionParts | None:
         """
-        Turn a limited joint at a constant rate through its range and back.
+        Return a turn of a limited joint at a constant rate through its range and back.
 
-        Slower where the time at the rate is too short for a window; None if it always is.
+        It is slower where the time at the rate is too short for a window; None if it always is.
         """
         joint = int(np.argmax(np.abs(rates)))
         lower = self.limits.lower[joint]
         upper = self.limits.upper[joint]
         start = place.copy()
+        # 2 % of the range remain free at each end.
         start[joint] = lower + 0.02 * (upper - lower)
         to_and_fro = np.stack([rates, -rates])
         for share in (1.0, 0.6, 0.35, 0.2, 0.1):
-            longest = self._longest(start, share * to_and_fro, joint)
+            longest = self._longest_at_rate(start, share * to_and_fro, joint)
             if longest >= SPIN_TIME[0]:
-                held = min(longest, SPIN_TIME[1])
-                segments = self._spun(start, share * to_and_fro, held)
-                text = f'sweep {self._rate_words(share * rates)} for {held:.1f} s and back'
+                seconds_at_rate = min(longest, SPIN_TIME[1])
+                segments = self._spun(start, share * to_and_fro, seconds_at_rate)
+                text = (
+                    f'sweep {self._rate_words(share * rates)} for {seconds_at_rate:.1f} s and back'
+                )
                 return start, segments, text
         return None
 
-    def _longest(self, start: np.ndarray, rates: np.ndarray, joint: int) -> float:
+    def _longest_at_rate(self, start: np.ndarray, rates: np.ndarray, joint: int) -> float:
         """
-        Return the time at a rate through 96 % of the range of a joint, with both ramps, s.
+        Return how long a joint can turn at a rate if it moves through 96 % of its range, s.
+
+        Both ramps are in this range too.
 
         `rates`: of all joints on the way out and back, shape (2, n_joints).
         """
@@ -457,7 +471,7 @@ class MotionLibrary:
         self, place: np.ndarray, swings: np.ndarray, frequency: np.ndarray | float, seconds: float
     ) -> MotionParts:
         """
-        Swing with the largest amplitude within range, speed and acceleration.
+        Return a swing with the largest amplitude within range, speed and acceleration.
 
         `swings`: whether each joint swings, shape (n_joints,); `frequency` in Hz, of each or all.
         """

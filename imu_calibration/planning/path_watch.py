@@ -67,31 +67,31 @@ class PathWatch:
         # The rate of the spline may vanish where an oscillation reverses: rest means no motion over
         # several steps.
         moved = np.max(np.abs(np.diff(self._path, axis=0, prepend=self._path[:1])), axis=1)
-        self._rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
+        self._path_rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
         """Whether the path rests at each instant, shape (n,)."""
-        moving = np.append(np.flatnonzero(~self._rests), len(self._time) - 1)
+        moving = np.append(np.flatnonzero(~self._path_rests), len(self._time) - 1)
         self._rest_end = moving[np.searchsorted(moving, np.arange(len(self._time)))]
         """First instant from each one on at which the path moves, or the last, shape (n,)."""
-        self._at = 0
+        self._instant = 0
         """Instant of the path at which the joints are."""
         self._start = np.asarray(start, float) / tolerance
         """Where the joints rested before, in tolerances."""
-        self._last: float | None = None
+        self._last_time: float | None = None
         """Time of the joints at the last position, s; None before the first one."""
-        self._now = 0.0
+        self._steady_now = 0.0
         """Steady time of the last position, s."""
-        self._further = 0.0
+        self._advanced_at = 0.0
         """Steady time of the last progress, s."""
         # The pace is the ratio of both, over the progress in motion so far.
-        self._came = 0.0
+        self._path_seconds = 0.0
         """Time of the path, s."""
-        self._took = 0.0
+        self._joint_seconds = 0.0
         """Time of the joints, s."""
         self._remainder = 0.0
         """Expected progress that is less than a step, s of the time of the path."""
         self._recent: deque = deque([(0.0, self._start)])
         """(time of the joints, position in tolerances) in the last `STALLED_SECONDS`."""
-        self._most = np.zeros(len(start))
+        self._largest_movement = np.zeros(len(start))
         """Largest distance of each joint from its start, in tolerances."""
         self.has_begun = False
         """Whether the joints have left their start."""
@@ -103,19 +103,19 @@ class PathWatch:
     @property
     def progress(self) -> float:
         """Progress of the joints along the path, s of the time of the path."""
-        return float(self._time[self._at])
+        return float(self._time[self._instant])
 
     @property
     def at_end(self) -> bool:
         """Whether the joints have reached the last point of the path."""
-        return self._at == len(self._time) - 1
+        return self._instant == len(self._time) - 1
 
     @property
     def pace(self) -> float:
         """Speed of the joints along the path as a share of the speed of the path."""
-        if self._took <= 0:
+        if self._joint_seconds <= 0:
             return 1.0
-        return float(np.clip(self._came / self._took, MIN_PACE, 1.0))
+        return float(np.clip(self._path_seconds / self._joint_seconds, MIN_PACE, 1.0))
 
     @property
     def has_stalled_for(self) -> float:
@@ -125,21 +125,21 @@ class PathWatch:
         By their clock or by the steady one, the smaller time: a simulated clock that runs faster
         gives the controller less time than its stamps show.
         """
-        return min(self.waited, self._now - self._further) * self.pace
+        return min(self.waited, self._steady_now - self._advanced_at) * self.pace
 
     def observe(self, time: float, position: np.ndarray, *, now: float) -> None:
         """Process joint positions at `time`, s of their clock, and `now`, s of a steady clock."""
-        elapsed = 0.0 if self._last is None else max(time - self._last, 0.0)
-        self._last = time
+        elapsed = 0.0 if self._last_time is None else max(time - self._last_time, 0.0)
+        self._last_time = time
         place = position / self.tolerance
         self._remember(time, place)
 
         # The part of the path that may be reached by now. Joints may end a rest before the
         # scheduled time, so its end is evaluated as well.
-        path_rests = self._rests[self._at]
-        latest = self._time[self._rest_end[self._at]] + elapsed + MAX_LEAD_SECONDS
+        path_rests = self._path_rests[self._instant]
+        latest = self._time[self._rest_end[self._instant]] + elapsed + MAX_LEAD_SECONDS
         stop = np.searchsorted(self._time, latest, side='right')
-        ahead = slice(self._at, max(stop, self._at + 1))
+        ahead = slice(self._instant, max(stop, self._instant + 1))
 
         # Of the points that fit the position, the one nearest to the expected time.
         distance = np.max(np.abs(self._path[ahead] - place), axis=1)
@@ -147,27 +147,27 @@ class PathWatch:
         # The remainder below a step is kept; otherwise a slow pace would never end a rest.
         pace = self.pace if path_rests else 1.0
         expected = self.progress + self._remainder + elapsed * pace
-        before = self._at
+        before = self._instant
         nearest = np.argmin(np.abs(self._time[ahead][fits] - expected))
-        self._at += int(fits[nearest])
+        self._instant += int(fits[nearest])
         remainder = expected - self.progress
         self._remainder = float(np.clip(remainder, -PATH_STEP_SECONDS, PATH_STEP_SECONDS))
-        self.deviation = np.abs(self._path[self._at] - place)
+        self.deviation = np.abs(self._path[self._instant] - place)
 
         # Scheduled and elapsed time in motion give the pace.
-        advances = self._at > before or self.at_end
+        advances = self._instant > before or self.at_end
         if advances and not path_rests and self.has_begun:
-            self._came += float(self._time[self._at] - self._time[before])
-            self._took += elapsed + self.waited
-        self._now = now
+            self._path_seconds += float(self._time[self._instant] - self._time[before])
+            self._joint_seconds += elapsed + self.waited
+        self._steady_now = now
         self.waited = 0.0 if advances else self.waited + elapsed
         if self.waited == 0.0:
-            self._further = now
+            self._advanced_at = now
 
     def _remember(self, time: float, place: np.ndarray) -> None:
         """Update the distances from the start and the recent positions, in tolerances."""
-        self._most = np.maximum(self._most, np.abs(place - self._start))
-        self.has_begun = self.has_begun or bool(np.max(self._most) > MIN_BEGUN_MOVEMENT)
+        self._largest_movement = np.maximum(self._largest_movement, np.abs(place - self._start))
+        self.has_begun = self.has_begun or bool(np.max(self._largest_movement) > MIN_BEGUN_MOVEMENT)
         self._recent.append((time, place))
         while len(self._recent) > 2 and time - self._recent[0][0] > STALLED_SECONDS:
             self._recent.popleft()
@@ -177,21 +177,22 @@ class PathWatch:
         """Whether a joint has left the path."""
         return bool(np.max(self.deviation) > 1.0)
 
-    def suspect(self) -> int:
+    def hindered_joint(self) -> int:
         """
         Return the joint whose recent motion is smallest, compared with the commanded motion.
 
-        Commanded before the present point of the path after a deviation, after it in a stall.
+        After a deviation the commanded motion is that before the present point of the path, in a
+        stall that after it.
         """
         n_steps = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1
         place = self._recent[-1][1]
         if self.has_strayed:
-            path = self._path[max(self._at - n_steps, 0) : self._at + 1]
+            path = self._path[max(self._instant - n_steps, 0) : self._instant + 1]
             commanded = np.ptp(path, axis=0)
         else:
             # Distance to the following path: of joints with equal motion, a joint that has arrived
             # is not the cause.
-            path = self._path[self._at : self._at + n_steps + 1]
+            path = self._path[self._instant : self._instant + n_steps + 1]
             commanded = np.max(np.abs(path - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
-        return int(np.argmax(commanded - moved - LATENESS_TIE * self._most))
+        return int(np.argmax(commanded - moved - LATENESS_TIE * self._largest_movement))

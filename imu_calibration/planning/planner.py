@@ -39,7 +39,7 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 MAX_PLAN_MOTIONS = 400
 """Motions of a plan at most."""
-FURTHER = 1.02
+MARGIN_STEP = 1.02
 """
 Factor on the standard deviations of the search, applied when they meet the goal and the exact
 covariance does not.
@@ -97,6 +97,7 @@ class CandidateMotions:
         """Distance to the goal after each motion; mandatory motions are chosen without it."""
         size = self._posterior.size
         covariance = self._posterior.after(self.information, self.seconds)
+        # Of the state, the first elements are z.
         return self._goal.distance(covariance[:, :size, :size], self._margin)
 
     @cached_property
@@ -104,7 +105,7 @@ class CandidateMotions:
         """Reduction of the distance to the goal by each motion."""
         return np.where(self.possible, self._distance - self.distance_after, 0.0)
 
-    def hopeless(self, number: int) -> bool:
+    def is_hopeless(self, number: int) -> bool:
         """Return whether a motion has almost no gain and does not reach the goal."""
         return bool(self.gain[number] < self.min_gain and self.distance_after[number] > 0)
 
@@ -158,7 +159,7 @@ def greedy(
             number = first[len(chosen)]
         else:
             number = candidates.best
-            if candidates.hopeless(number):
+            if candidates.is_hopeless(number):
                 break
             if spent + float(candidates.seconds[number]) > longest:
                 break
@@ -177,7 +178,7 @@ def greedy(
                 break
             # The posterior has constant biases within a motion; if that was optimistic, the target
             # must be lower.
-            margin *= FURTHER
+            margin *= MARGIN_STEP
     return chosen
 
 
@@ -354,11 +355,10 @@ class Planner:
         missing = self.problem.goal.missing(self._posterior.covariance_z)
         place = self.problem.place_near(position)
         if self._first is None:
-            self._first = (
-                []
-                if self.problem.known_information is not None
-                else self.problem.first_rests(place)
-            )
+            # After an earlier calibration no motion is mandatory.
+            self._first = []
+            if self.problem.known_information is None:
+                self._first = self.problem.first_rests(place)
         is_mandatory = bool(self._first)
         covariance = self._posterior.covariance_z
         if not is_mandatory and not self.problem.goal.distance(covariance[None])[0] > 0:
@@ -370,7 +370,7 @@ class Planner:
         else:
             number = candidates.best
             reason = f'it gains most per second for {", ".join(missing[:3])}'
-            if self._visited and candidates.hopeless(number):
+            if self._visited and candidates.is_hopeless(number):
                 return Decision(why=STUCK)
         self._posterior.take(candidates.information[number], float(candidates.seconds[number]))
         motion = self._visit(number)
@@ -397,12 +397,12 @@ class Planner:
             .segments
         )
         return PlannedMotion(
-            MotionKind.MOVE,
-            library.names,
-            np.asarray(position, float),
-            segments,
-            'a small motion of every joint and back',
-            limits,
+            kind=MotionKind.MOVE,
+            joint_names=library.names,
+            place=np.asarray(position, float),
+            segments=segments,
+            text='a small motion of every joint and back',
+            limits=limits,
         )
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
@@ -420,7 +420,14 @@ class Planner:
         if not np.any(is_wound):
             return None
         target = np.where(is_wound, middle, position)
-        return PlannedMotion(MotionKind.MOVE, library.names, target, (), 'unwinding', limits)
+        return PlannedMotion(
+            kind=MotionKind.MOVE,
+            joint_names=library.names,
+            place=target,
+            segments=(),  # the move to the place
+            text='unwinding',
+            limits=limits,
+        )
 
     def plan(
         self,
@@ -446,7 +453,7 @@ class Planner:
         start = problem.library.spread[0] if position is None else np.asarray(position, float)
         place = problem.place_near(start)
         first = () if problem.known_information is not None else problem.first_rests(place)
-        self.within(longest)
+        self.drop_inseparable(longest)
         sequence = self._sequence(place, first, longest)
         bound = float('nan')
         goal = problem.goal
@@ -473,8 +480,8 @@ class Planner:
         sequence = greedy(self.problem, place, first=first, longest=longest)
         return shortened_plan(self.problem, sequence, place, fixed=len(first))
 
-    def within(self, seconds: float) -> None:
-        """Drop causes that no plan of this time separates."""
+    def drop_inseparable(self, seconds: float) -> None:
+        """Drop pairs of causes that no plan of this time separates."""
         if isinstance(self.problem.goal, ToldApart) and np.isfinite(seconds):
             self.problem.goal.leave_out_of_reach(self.problem.best_covariance(seconds))
 
@@ -497,17 +504,17 @@ class Planner:
         cautious, _ = problem.covariance_after(sequence, place, cautious=True)
         self._visited.clear()
         return Plan(
-            coordinates.model,
-            tuple(self._visit(number) for number in sequence),
-            np.array(ends[1:]),
-            coordinates.sd(covariances[-1]),
-            coordinates.tolerances,
-            coordinates.wanted,
-            coordinates.excess(np.array(covariances)),
-            problem.goal.missing(cautious),
-            start,
-            bound,
-            problem.goal.words,
+            model=coordinates.model,
+            motions=tuple(self._visit(number) for number in sequence),
+            ends=np.array(ends[1:]),
+            sd=coordinates.sd(covariances[-1]),
+            tolerances=coordinates.tolerances,
+            wanted=coordinates.wanted,
+            history=coordinates.excess(np.array(covariances)),
+            missing=problem.goal.missing(cautious),
+            start=start,
+            lower_bound_seconds=bound,
+            told_apart=problem.goal.words,
         )
 
     def _visit(self, number: int) -> PlannedMotion:
@@ -604,14 +611,14 @@ def plan_by_hand(
     wanted = ~model.fixed
     missing = np.array(model.model.param_names)[wanted & (history[-1] > tolerances)].tolist()
     return Plan(
-        model.model,
-        tuple(steps),
-        np.cumsum([step.seconds for step in steps]),
-        history[-1],
-        tolerances,
-        wanted,
-        np.array(history)[:, wanted] / tolerances[wanted],
-        tuple(missing),
+        model=model.model,
+        motions=tuple(steps),
+        ends=np.cumsum([step.seconds for step in steps]),
+        sd=history[-1],
+        tolerances=tolerances,
+        wanted=wanted,
+        history=np.array(history)[:, wanted] / tolerances[wanted],
+        missing=tuple(missing),
         noun='poses and turns',
         scope='by hand',
         most_printed=None,

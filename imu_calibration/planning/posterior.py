@@ -76,17 +76,17 @@ def relax(
     per_second = np.sum(information / seconds[:, None, None], axis=0)
     if _largest_variance(prior + MAX_REACHABLE_SECONDS * per_second, rows) > 1.0:
         return Relaxation(np.nan, weights)
-    # M_i of all motions, and of the useful ones, whose indexes are `kept`; one row each.
+    # M_i of all motions, and of those with the indexes `useful`; one row each.
     flat = information.reshape(len(seconds), -1)
-    flat_kept = flat
-    kept = np.arange(len(seconds))
+    flat_useful = flat
+    useful = np.arange(len(seconds))
     root = np.linalg.cholesky(prior)
     whitened_rows = scipy.linalg.solve_triangular(root, rows.T, lower=True).T
     # Visits up to a common factor, at first with equal times.
     visits = 1.0 / len(seconds) / seconds
     best = Relaxation(0.0, weights)
     for number in range(MAX_WEIGHT_STEPS):
-        direction = np.tensordot(visits[kept], flat_kept, 1).reshape(prior.shape)
+        direction = np.tensordot(visits[useful], flat_useful, 1).reshape(prior.shape)
         scale = _scale(direction, root, whitened_rows)
         # Nearly singular in unreachable directions.
         covariance = inverse_normal(prior + scale * direction)
@@ -95,7 +95,7 @@ def relax(
         prices = (columns_of_rows * weights) @ columns_of_rows.T
         # Worth of a second of each motion: tr(M_i K) / seconds_i.
         worth = np.zeros(len(seconds))
-        worth[kept] = flat_kept @ prices.ravel() / seconds[kept]
+        worth[useful] = flat_useful @ prices.ravel() / seconds[useful]
         plan_seconds = scale * float(visits @ seconds)
         if number % 25 == 0 or number == MAX_WEIGHT_STEPS - 1:
             # The certificate needs the worth of all motions, the steps only of the useful ones.
@@ -106,15 +106,16 @@ def relax(
                 best = Relaxation(float(bound), weights)
             if plan_seconds < CERTIFICATE_RATIO * best.seconds:
                 break
+            # Useful motions have a third of the largest worth, or a share of the time.
             is_visited = visits * seconds > 1e-4 * (visits @ seconds)
-            kept = np.flatnonzero((worth > 0.3 * worth.max()) | is_visited)
-            flat_kept = flat[kept]
+            useful = np.flatnonzero((worth > 0.3 * worth.max()) | is_visited)
+            flat_useful = flat[useful]
         # Step of the visits, relative to the mean worth of the time spent; then of the weights.
-        spent = visits[kept] * seconds[kept]
-        mean_worth = worth[kept] @ spent / spent.sum()
-        visits[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / mean_worth)
+        spent = visits[useful] * seconds[useful]
+        mean_worth = worth[useful] @ spent / spent.sum()
+        visits[useful] *= np.sqrt(np.maximum(worth[useful], 1e-12) / mean_worth)
         # Early steps keep the visits of the other motions, which may become useful again.
-        visits = np.where(np.isin(np.arange(len(visits)), kept) | (number <= 50), visits, 0.0)
+        visits = np.where(np.isin(np.arange(len(visits)), useful) | (number <= 50), visits, 0.0)
         weights = weights * variance / variance.max()
         weights /= weights.sum()
     return best
@@ -203,7 +204,7 @@ class _Cut:
 WINDOW_SETTINGS = WindowSettings()
 """How the calibration will cut windows."""
 WanderOf = Callable[[str, int, float], tuple[np.ndarray, np.ndarray]]
-"""`WindowPredictor._wander` with a cache."""
+"""`WindowPredictor._bias_wander` with a cache."""
 
 
 class WindowPredictor:
@@ -241,7 +242,7 @@ class WindowPredictor:
         # The columns of several windows at a time, which limits the memory.
         blocks = np.cumsum([len(cut.motion) for cut in cuts]) // BELIEF_BLOCK_ROWS
         # Many motions last equally long, at least a move and its reverse.
-        wander_of = cache(self._wander)
+        wander_of = cache(self._bias_wander)
         windows = []
         for block in np.unique(blocks):
             cuts_of_block = [cuts[k] for k in np.flatnonzero(blocks == block)]
@@ -286,7 +287,9 @@ class WindowPredictor:
                 yield _Cut(motion, kind, middle, segment.duration, seconds)
             begin += segment.duration
 
-    def _wander(self, sensor: str, count: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    def _bias_wander(
+        self, sensor: str, count: int, seconds: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return (eigenvalues, eigenvectors) of the covariance of the bias in a half of a window.
 

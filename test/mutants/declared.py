@@ -1100,8 +1100,8 @@ LIVE = _of(
     (
         'joints rest as soon as they are started',
         'Driver.start',
-        'self._slow, self._rested_at = (True, None)',
-        'self._slow = True',
+        'self._next_is_slow, self._rested_at = (True, None)',
+        'self._next_is_slow = True',
         'test_driver.py',
     ),
     (
@@ -1114,14 +1114,14 @@ LIVE = _of(
     (
         'a stop is taken by one clock alone',
         'Driver.awaits_stop',
-        'min(..., self._heard - self._stopped[1])',
+        'min(..., self._heard_at - self._last_stop[1])',
         '...',
         'test_driver.py',
     ),
     (
         'a stall is told by one clock alone',
         'PathWatch.has_stalled_for',
-        'min(self.waited, self._now - self._further)',
+        'min(self.waited, self._steady_now - self._advanced_at)',
         'self.waited',
         'test_driver.py',
     ),
@@ -1129,13 +1129,13 @@ LIVE = _of(
         'a stall is counted from where nothing had moved',
         'PathWatch.observe',
         'self.waited == 0.0',
-        'self._further == 0.0',
+        'self._advanced_at == 0.0',
         'test_driver.py',
     ),
     (
         'a stop is awaited by a clock that was set back',
         'Driver.observe',
-        'self._stopped = (_1, _2)',
+        'self._last_stop = (_1, _2)',
         'pass',
         'test_driver.py',
     ),
@@ -1156,7 +1156,7 @@ LIVE = _of(
     (
         'a clock set back counts as rest for ever',
         'Driver._note_rest',
-        '... or self._time < self._rested_since or ...',
+        '... or self._stamp < self._rested_since or ...',
         '... or ...',
         'test_driver.py',
     ),

@@ -61,8 +61,8 @@ def test_positions_that_are_not_finite_are_ignored_and_counted_by_joint(bench):
             table.look()
     table.position[1] = 0.0
     table.rate = [float('nan'), float('inf')]  # not measured, which is usual
-    seen = table.planner.driver._heard
-    table.looks(lambda: table.planner.driver._heard > seen, 'the next joint state')
+    seen = table.planner.driver._heard_at
+    table.looks(lambda: table.planner.driver._heard_at > seen, 'the next joint state')
     assert (
         table.planner.driver.ignored == {'inner': 6}
         and table.planner.driver.state is DriveState.MOVING

@@ -21,7 +21,7 @@ from imu_calibration.nodes.planner_worker import (
     PlannerWorker,
     findings_from,
 )
-from imu_calibration.planning.campaign import Suspect
+from imu_calibration.planning.campaign import CollinearFinding
 from imu_calibration.planning.driver import DriverSettings, DriveState
 from imu_calibration.references.turntable.live_diagnosis import FOUND
 
@@ -49,8 +49,8 @@ def test_findings_are_read_from_the_values_of_the_status():
     }
     sizes = {'gyroscope.gyro_quadratic.x': 1e-3, 'gyroscope.gyro_rate_product.xyz': 0.5}
     assert findings_from(told) == [
-        Suspect('gyro_quadratic', ('gyro_scale_asymmetry', 'gyro_rate_product'), sizes),
-        Suspect('time_offset', (), {'t': -2e-5}),
+        CollinearFinding('gyro_quadratic', ('gyro_scale_asymmetry', 'gyro_rate_product'), sizes),
+        CollinearFinding('time_offset', (), {'t': -2e-5}),
     ]
     assert findings_from(told | {'outcome': 'nothing found'}) == findings_from({}) == []
 

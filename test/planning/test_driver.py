@@ -25,9 +25,9 @@ from imu_calibration.planning.campaign import (
     TIME_OVER,
     Campaign,
     CampaignSettings,
-    Suspect,
+    CollinearFinding,
     separator_of,
-    with_suspect,
+    with_finding,
 )
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.path_watch import PathWatch
@@ -456,8 +456,8 @@ class OldHand:
         )
         self.separable = True
 
-    def separator(self, suspect):
-        self.separated.append(suspect)
+    def separator(self, finding):
+        self.separated.append(finding)
         if not self.separable:
             raise InputError('no joint turns')
         return OldHand(2)
@@ -504,8 +504,8 @@ def test_a_campaign_moves_asks_what_is_wrong_separates_and_ends_with_its_reason(
     hand = OldHand()
     campaign, alike, alone = (
         Campaign(hand, make_separator=hand.separator),
-        Suspect('gyro_quadratic', ('gyro_scale_asymmetry',), {'x': 1e-3}),
-        Suspect('gyro_scale_asymmetry'),
+        CollinearFinding('gyro_quadratic', ('gyro_scale_asymmetry',), {'x': 1e-3}),
+        CollinearFinding('gyro_scale_asymmetry'),
     )
     decided = carried_out(campaign, [[alike], [alone]])
     assert decided[:-1] == ['move'] * 4 + ['diagnose', 'move', 'move', 'diagnose'] and decided[
@@ -572,14 +572,14 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
         f'gyroscope.gyro_scale_asymmetry.{axis}': size
         for axis, size in zip('xyz', (2e-3, -2e-3, 2e-3), strict=True)
     }
-    wider = with_suspect(known, ('gyroscope', 'gyro_scale_asymmetry'), sizes)
+    wider = with_finding(known, ('gyroscope', 'gyro_scale_asymmetry'), sizes)
     part = wider.model.slices['gyroscope', 'gyro_scale_asymmetry']
     np.testing.assert_array_equal(wider.values[part], [2e-3, -2e-3, 2e-3])
     places = [wider.param_names.index(name) for name in known.param_names]
     np.testing.assert_array_equal(wider.covariance[np.ix_(places, places)], known.covariance)
     noise = noise_of_grade(GRADES['industrial'].noise, 100.0)
-    suspect = Suspect('gyro_scale_asymmetry', ('gyro_quadratic',), sizes)
-    separator, motions, position = separator_of(table, known, suspect, noise=noise), [], np.zeros(3)
+    finding = CollinearFinding('gyro_scale_asymmetry', ('gyro_quadratic',), sizes)
+    separator, motions, position = separator_of(table, known, finding, noise=noise), [], np.zeros(3)
     while (step := separator.next_motion(position)).motion is not None and len(motions) < 40:
         motions.append(step.motion)
         position = step.motion.points(position).position[-1]
@@ -591,7 +591,7 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
     told = separator_of(
         table,
         known,
-        Suspect('gyro_scale_asymmetry', ('gyro_quadratic',), sizes | mate),
+        CollinearFinding('gyro_scale_asymmetry', ('gyro_quadratic',), sizes | mate),
         noise=noise,
     ).problem
     imitating = separator.problem.goal.causes[1]
@@ -603,7 +603,7 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
     np.testing.assert_allclose(quadratic, [1e-3, -1e-3, 1e-3])
     assert not np.allclose(told.goal.causes[1].size, imitating.size, rtol=0.1)
     with refused(InputError, 'effect_unknown', 'gremlins'):
-        separator_of(table, known, Suspect('gyro_quadratic', ('gremlins',)), noise=noise)
+        separator_of(table, known, CollinearFinding('gyro_quadratic', ('gremlins',)), noise=noise)
 
 
 def test_of_joints_that_move_alike_the_one_that_stands_still_is_named():
@@ -619,7 +619,7 @@ def test_of_joints_that_move_alike_the_one_that_stands_still_is_named():
     for time in np.arange(0.0, 6.0, 0.05):
         part = 0.1 * min(time / 2.0, 1.0)
         watch.observe(time, np.array([part, 0.0, part]), now=time)
-    assert not watch.has_strayed and watch.has_stalled_for > 1.0 and watch.suspect() == 1
+    assert not watch.has_strayed and watch.has_stalled_for > 1.0 and watch.hindered_joint() == 1
 
 
 def test_after_a_motion_there_and_back_the_joint_that_never_moved_is_named():
@@ -634,4 +634,4 @@ def test_after_a_motion_there_and_back_the_joint_that_never_moved_is_named():
     for time in np.arange(0.0, 9.0, 0.05):
         part = 0.1 * max(1.0 - abs(time / 2.0 - 1.0), 0.0)
         watch.observe(time, np.array([part, 0.0, part]), now=time)
-    assert watch.suspect() == 1
+    assert watch.hindered_joint() == 1

@@ -116,7 +116,8 @@ class DistanceSums:
         self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
         # Sums of the noise variance of window means.
         self._noise = {sensor: np.zeros(3) for sensor in SENSORS}
-        # Of each window: samples, at rest, then before and after: squares within it, of its mean.
+        # For each window: number of samples, whether it is at rest, then before and after the sum of
+        # squares within it and the square of its mean.
         self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
         # Degrees of freedom by band, of all windows and of windows at rest.
         self._freedom = np.zeros((2, count))
@@ -152,8 +153,8 @@ class DistanceSums:
         for sensor, sensor_noise in noise.items():
             self._noise[sensor] += sensor_noise.low_variance / n
             row = [n, at_rest]
-            for k, of_model in enumerate(residuals):
-                residual = of_model[sensor]
+            for k, residual_of in enumerate(residuals):  # before, after
+                residual = residual_of[sensor]
                 mean = residual.mean(axis=0)
                 squares = np.abs(np.fft.rfft(residual, axis=0)[1:]) ** 2 * freedom[:, None] / n
                 power = np.stack(
@@ -199,7 +200,7 @@ class DistanceSums:
         """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
         n, at_rest, *squares = np.array(self._rows[sensor]).T
         is_at_rest = at_rest > 0
-        # For before and after: sums of squares in each window, and their numbers of values.
+        # For before and after: (sums of squares, numbers of values) of each window.
         samples, means, within_windows, means_at_rest = [], [], [], []
         for within, mean in (squares[:2], squares[2:]):
             samples.append((within + n * mean, 3 * n))

@@ -276,7 +276,14 @@ def hand_coverage(
     without_gravity = 'accelerometer' in scan.absent
     seen = ups_of(None if without_gravity else scan.poses)
     up = seen[-1] if len(seen) else None
-    no_gain = Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
+    no_gain = Coverage(
+        worth=np.zeros(len(DIRECTIONS)),
+        seen=seen,
+        up=up,
+        next=Step(''),
+        seconds=0.0,
+        frame_id=frame_id,
+    )
     if result is not None:
         if is_done(result):
             return replace(no_gain, done=True)
@@ -293,11 +300,11 @@ def hand_coverage(
         return no_gain
     first = steps[0]
     return Coverage(
-        knowledge.best().gains,
-        seen,
-        up,
-        Step(first.words, first.up, first.axis, first.angle),
-        sum(step.seconds for step in steps),
+        worth=knowledge.best().gains,
+        seen=seen,
+        up=up,
+        next=Step(first.words, first.up, first.axis, first.angle),
+        seconds=sum(step.seconds for step in steps),
         frame_id=frame_id,
     )
 

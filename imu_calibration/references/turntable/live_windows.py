@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.by_evidence import ask_kept, solve_by_evidence
+from imu_calibration.calibration.by_evidence import search_again, solve_by_evidence
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.coverage import (
     NOTHING_SEEN,
@@ -107,7 +107,7 @@ class LiveSnapshot:
         """Return the solution with the supported effects, as `calibrate_by_evidence`."""
         if self.store.complete:
             return solve_by_evidence(self, self.options)
-        return ask_kept(
+        return search_again(
             self.solved(self.extension.options(self.options)), self.options, known=self.extension
         )
 
