@@ -9,7 +9,7 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from errno import EINVAL
 from functools import cache
@@ -182,9 +182,10 @@ def parsed(text: str, name: str, aliases: bool = False) -> Any:
     import yaml
 
     loader = _with_floats('SafeLoader')
-    _within_limits(len(text), MAX_DOCUMENT_CHARACTERS, name, 'characters')
+    _require_at_most(len(text), MAX_DOCUMENT_CHARACTERS, name, 'characters')
     try:
-        _look_through(yaml.parse(text, Loader=loader), name, aliases)
+        # The text is parsed twice: the events show its size before any part of it is stored.
+        _refuse_large(yaml.parse(text, Loader=loader), name, aliases)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
         raise DocumentError(
@@ -207,17 +208,18 @@ class _OpenPart:
     """Whether the next part of a mapping is a key, not a value."""
 
 
-def _look_through(events, name, aliases):
+def _refuse_large(events: Iterable[Any], name: str, aliases: bool) -> None:
     """
-    Refuse documents that need much time or memory.
+    Raise DocumentError for a document that needs much time or memory, or repeats a key.
 
-    From the events of the parser, which need neither. Arguments as for `parsed`.
+    `events` of PyYAML's parser are read one by one and need neither. `name` and `aliases` as for
+    `parsed`.
     """
     # Number of parts with aliases expanded.
     count = 0
-    # Anchor -> number of its parts.
+    # Anchor -> number of parts of the part that has it.
     sizes = {}
-    # From the outermost to the innermost.
+    # Lists and mappings around the present event, from the outermost to the innermost.
     open_parts: list[_OpenPart] = []
     for event in events:
         kind = type(event).__name__
@@ -241,19 +243,21 @@ def _look_through(events, name, aliases):
         if kind == 'ScalarEvent':
             sizes[event.anchor] = 1
             if event.implicit[0] or event.tag:  # false for a quoted text
-                _within_limits(len(event.value), MAX_SCALAR_CHARACTERS, name, 'characters in a row')
+                _require_at_most(
+                    len(event.value), MAX_SCALAR_CHARACTERS, name, 'characters in a row'
+                )
                 if NUMBER_START.fullmatch(event.value):
-                    _within_limits(
+                    _require_at_most(
                         len(event.value), MAX_NUMBER_CHARACTERS, name, 'characters in a number'
                     )
         elif kind != 'AliasEvent':
             keys = set() if kind == 'MappingStartEvent' else None
             open_parts.append(_OpenPart(event.anchor, count, keys))
-        _within_limits(len(open_parts), MAX_DOCUMENT_DEPTH, name, 'levels')
-        _within_limits(count, MOST_PARTS, name, 'parts')
+        _require_at_most(len(open_parts), MAX_DOCUMENT_DEPTH, name, 'levels')
+        _require_at_most(count, MOST_PARTS, name, 'parts')
 
 
-def _check_key(event, mapping, name):
+def _check_key(event: Any, mapping: _OpenPart, name: str) -> None:
     """
     Refuse a key that the open mapping has already, and one that merges another mapping into it.
 
@@ -275,7 +279,7 @@ def _check_key(event, mapping, name):
         mapping.keys.add(key)
 
 
-def _within_limits(number, limit, name, unit):
+def _require_at_most(number: int, limit: int, name: str, unit: str) -> None:
     """Raise where a document has more than `limit` of a unit, such as characters."""
     if number > limit:
         raise DocumentError(

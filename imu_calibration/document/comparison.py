@@ -127,6 +127,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
             code='nothing_in_common',
         )
     notes = _notes(first, second)
+
+    # Axes of the readings, where both files state them.
     mat_flu_first = first.readings.mat_flu_source()
     mat_flu_second = second.readings.mat_flu_source()
     if mat_flu_first is not None and mat_flu_second is not None:
@@ -134,6 +136,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         if not np.array_equal(mat_first_second, np.eye(3)):
             notes.append(f'both are compared in the axes {first.readings.axes} of the first one')
             second = _in_other_readings(second, mat_first_second)
+
+    # Axes of the true quantities.
     axes = {first.gauge.get('axes'), second.gauge.get('axes')}
     if axes == {MOUNT_AXES, ACCELEROMETER_AXES}:
         note = 'both are compared in the axes of the accelerometer'
@@ -161,6 +165,7 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
     values = _turned(model, calibration.values)
     jacobian = np.empty((len(values),) * 2)
     for k, sd in enumerate(calibration.sd):
+        # Small against the uncertainty, large against rounding.
         step = np.zeros(len(values))
         step[k] = max(1e-3 * sd, 1e-7)
         above = _turned(model, calibration.values + step)
@@ -401,7 +406,7 @@ def _compared(
             'agreement of the calibrations cannot be tested: the uncertainties of imported values'
             ' are unknown'
         )
-        return Comparison(tuple(rows), None, tuple(lines))
+        return Comparison(rows=tuple(rows), agree=None, lines=tuple(lines))
     reference_agree = None
     if of_reference:
         reference_agree = not rejected_reference
@@ -412,12 +417,20 @@ def _compared(
             'agreement of the calibrations cannot be tested: no parameter of the IMU is determined'
             ' in both'
         )
-        return Comparison(tuple(rows), None, tuple(lines), reference_agree)
+        return Comparison(
+            rows=tuple(rows), agree=None, lines=tuple(lines), reference_agree=reference_agree
+        )
     verdict = 'the calibrations disagree' if rejected else 'the calibrations agree'
     if in_other_axes.any():
         verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'
     lines.append(verdict)
-    return Comparison(tuple(rows), not rejected, tuple(lines), reference_agree, tuple(differences))
+    return Comparison(
+        rows=tuple(rows),
+        agree=not rejected,
+        lines=tuple(lines),
+        reference_agree=reference_agree,
+        differences=tuple(differences),
+    )
 
 
 def _ratio(difference: float, sd: float) -> float:

@@ -157,9 +157,16 @@ def columns_at(
     model: SensorModel, effect: Effect, times: Sequence[float] | np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the columns of an effect in time at `times`, s: group -> shape (n, width)."""
-    # Such an effect depends on no motion.
-    zero = np.zeros((len(times), 3))
-    ref = Reference(np.asarray(times, float), np.zeros((len(times), 3, 3)), zero, zero, zero, 0.0)
+    # The motion is a placeholder: such an effect depends on time only.
+    no_motion = np.zeros((len(times), 3))
+    ref = Reference(
+        time=np.asarray(times, float),
+        mat_sn=np.zeros((len(times), 3, 3)),
+        force_s=no_motion,
+        rate_s=no_motion,
+        alpha_s=no_motion,
+        gravity=0.0,
+    )
     return {group.name: group.columns(ref, model.full_point()) for group in effect.groups}
 
 

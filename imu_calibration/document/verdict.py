@@ -492,6 +492,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
 
     """
     decisions = _decisions(calibration)
+    # The exit code follows from the decisions as the document will have them.
     texts = {sensor: str(decision) for sensor, decision in decisions.items()}
     complete = not shortcomings(replace(calibration, decision=texts))
 
@@ -503,6 +504,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     limiting = ('', 0.0)
     if count.requested:
         limiting = (calibration.param_names[worst], float(share[worst]))
+    # The common scale of the accelerometer is in none of these sds.
     common = calibration.common_scale
     if common:
         common_share = common['sd'] / common['tolerance']
@@ -531,12 +533,12 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         + unsteady(calibration, tolerances)
     )
     return Verdict(
-        decisions,
-        (*reasons, *_left_out(calibration), *_dropped(calibration)),
-        count.determined,
-        count.requested,
-        limiting,
-        complete,
+        decisions=decisions,
+        reasons=(*reasons, *_left_out(calibration), *_dropped(calibration)),
+        within=count.determined,
+        requested=count.requested,
+        limiting=limiting,
+        complete=complete,
     )
 
 

@@ -160,26 +160,31 @@ def _checked(node: Any, depth: int) -> Any:
     raise _Refused(node.col_offset, 'an operation that is not arithmetic')
 
 
-def _folded(node: Any, source: Any) -> Any:
+def _folded(operation: Any, source: Any) -> Any:
     """
     Return an operation, or its value as a constant if all its operands are constants.
 
-    `source` is the node of the text, whose position it gets.
+    `operation` is made of checked operands; `source` is the same operation in the tree of the text,
+    for its position there. Raises _Refused for a division by zero and a value that is too large.
     """
-    match node:
+    match operation:
+        # The divisor may be the value of a folded operation: 1 / (2 - 2).
         case ast.BinOp(op=ast.Div(), right=ast.Constant(value=0.0)):
             raise _Refused(source.col_offset, 'a division by zero')
         case ast.BinOp():
-            operands = [node.left, node.right]
+            operands = [operation.left, operation.right]
         case ast.UnaryOp():
-            operands = [node.operand]
-        case _:
-            operands = node.args
+            operands = [operation.operand]
+        case _:  # a call
+            operands = operation.args
     if not all(isinstance(operand, ast.Constant) for operand in operands):
-        return ast.copy_location(node, source)
+        return ast.copy_location(operation, source)
+
+    # No operand is a name, so that the operation has a value without any quantity.
+    value_of = array_function([operation])
     with np.errstate(all='ignore'):
-        value = float(array_function([node])({})[0])
-    if not abs(value) < MAX_COLUMN_NUMBER:
+        value = float(value_of({})[0])
+    if not abs(value) < MAX_COLUMN_NUMBER:  # also for NaN
         raise _Refused(source.col_offset, 'a number that is not finite')
     return ast.copy_location(ast.Constant(value), source)
 

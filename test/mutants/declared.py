@@ -948,7 +948,7 @@ FILES = _of(
     ('no limit to nesting', 'MAX_DOCUMENT_DEPTH', '20', '10 ** 9', 'test_documents.py'),
     (
         'aliases allowed',
-        '_look_through',
+        '_refuse_large',
         "_1 == 'AliasEvent' and (not (_2 and _3.anchor in _4))",
         'False',
         'test_documents.py',

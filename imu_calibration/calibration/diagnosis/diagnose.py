@@ -60,7 +60,7 @@ def diagnose_recording(
     if result.search is None:
         raise reference.too_few(result)
 
-    # Causes, gains and alternatives of these effects, and the residual that none explains.
+    # Causes, gains and mates of these effects, and the residual that none explains.
     diagnosis = reference.identify(result)
 
     # The formulas of the residual join the model.
@@ -139,10 +139,12 @@ def helpful_formulas(
         after = extended.proof.get(effect.sensor)
         if before is None or after is None:
             continue
+        # Plain least squares predicts better: the formula is in no applied model.
         if effect.sensor in extended.statistics.get('least_squares', ()):
             continue
         if after.after > CLEARLY_BETTER * before.after:
             continue
+        # A formula of one motion may harm in another one.
         is_larger_in_a_regime = False
         for name, errors in after.regimes.items():
             if name in before.regimes and errors.after > HARM * before.regimes[name].after:

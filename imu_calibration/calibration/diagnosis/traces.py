@@ -116,8 +116,8 @@ class DistanceSums:
         self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
         # Sums of the noise variance of window means.
         self._noise = {sensor: np.zeros(3) for sensor in SENSORS}
-        # For each window: number of samples, whether it is at rest, then before and after the sum of
-        # squares within it and the square of its mean.
+        # For each window: number of samples, whether it is at rest, then before and after the sum
+        # of squares within it and the square of its mean.
         self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
         # Degrees of freedom by band, of all windows and of windows at rest.
         self._freedom = np.zeros((2, count))

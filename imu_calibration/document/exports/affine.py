@@ -41,8 +41,8 @@ class Capability:
             return False
         return self.role is not Role.TERM or effect.groups == self.groups
 
-    def held(self, values: np.ndarray) -> np.ndarray:
-        """Return an effect's values as represented: off-diagonal values may become zero."""
+    def represented(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of an effect that the program has: off-diagonal ones may be zero."""
         if not self.own_axis:
             return values
         diagonal = np.diag(values.reshape(3, 3))
@@ -125,7 +125,7 @@ class AffineImu:
         return self.cross if capability in G_SENSITIVITY else self.arms
 
 
-def held_values(
+def represented_values(
     calibration: Calibration, effect: Effect, capability: Capability | None
 ) -> np.ndarray:
     """
@@ -134,7 +134,7 @@ def held_values(
     Without a capability the program has no such effect: the values are its prior.
     """
     values = calibration.values[calibration.model.slices[effect.key]]
-    return effect.prior_values() if capability is None else capability.held(values)
+    return effect.prior_values() if capability is None else capability.represented(values)
 
 
 def imu_of_corrections(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineImu:
@@ -180,7 +180,7 @@ def affine_of(calibration: Calibration, capabilities: tuple[Capability, ...]) ->
     )
     for capability in capabilities:
         for effect in filter(capability.covers, calibration.model.effects):
-            values = held_values(calibration, effect, capability)
+            values = represented_values(calibration, effect, capability)
             imu.value(capability)[...] = values.reshape(effect.shape)
     return imu
 

@@ -125,16 +125,21 @@ def export(
         used = Usable(calibration)
     else:
         used = usable(calibration, anyway=anyway)
-    # Without the corrections of refused sensors; the loss below is against the complete one.
+    # Without the corrections of refused sensors; the loss below is against the complete
+    # calibration.
     applied = used.calibration
     if rate is not None and not 0 < rate < np.inf:
         raise InputError(
             f'the rate must be above zero, got {rate:g} Hz; correct it', code='rate_not_positive'
         )
+
+    # Numbers of the file, and their loss.
     noise_numbers, noise_notes = _noise_numbers(applied, target, noise, rate)
     placement, numbers = placed_numbers(applied, target)
     motion = motion or standard_motion(applied)
     loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
+
+    # Lines for the user, which the file has as comments.
     notes = [f'the {sensor} was not calibrated' for sensor in applied.absent]
     notes += [f'of the calibration: {line}' for line in (*used.lines, *caveats(applied))]
     notes += [*target.ignored(numbers), *noise_notes]
@@ -155,12 +160,12 @@ def export(
     assert target.write is not None  # `find_target` gives no other
     content = target.write(Page(numbers, noise_numbers, [*head, *lines], applied, rate))
     return Export(
-        content.encode() if isinstance(content, str) else content,
-        numbers,
-        placement,
-        loss,
-        tuple(lines),
-        used,
+        content=content.encode() if isinstance(content, str) else content,
+        numbers=numbers,
+        placement=placement,
+        loss=loss,
+        lines=tuple(lines),
+        used=used,
     )
 
 
@@ -258,6 +263,7 @@ def _noise_of(
         return None
     # Density of white noise: sd of a sample / sqrt(rate).
     root = float(np.sqrt(rate))
+    # The random walk is unknown: `walk_known` marks the zero as a placeholder.
     accelerometer = Densities(sample_sd['accelerometer'] / root, 0.0, 'bound')
     gyroscope = Densities(sample_sd['gyroscope'] / root, 0.0, 'bound')
     return Noise(accelerometer, gyroscope, rate, walk_known=False)
@@ -305,7 +311,8 @@ def _worked_sample(
     raw_force = np.array([[0.5, -0.3, 9.7]])
     raw_rate = np.array([[0.1, -0.2, 0.3]])
     force, rate = placement.readings(raw_force, raw_rate)
-    corrected = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
+    readings = Readings(force, rate, alpha=np.zeros((1, 3)), temperature_c=temperature)
+    corrected = target.corrected(numbers, readings)
     texts = []
     for vectors in (force, rate, *corrected):  # shape (1, 3)
         components = ', '.join(f'{value:.9g}' for value in vectors[0])

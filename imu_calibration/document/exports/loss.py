@@ -53,8 +53,15 @@ def motion_of(
 ) -> TrialMotion:
     """Return a motion from its arrays, shapes (n, 3) and (n,)."""
     attitude = np.broadcast_to(np.eye(3), (len(force), 3, 3))
+    # Time and attitude are placeholders: compensation inverts no effect that depends on them.
     reference = Reference(
-        np.zeros(len(force)), attitude, force, rate, alpha, STANDARD_GRAVITY, temperature_c
+        time=np.zeros(len(force)),
+        mat_sn=attitude,
+        force_s=force,
+        rate_s=rate,
+        alpha_s=alpha,
+        gravity=STANDARD_GRAVITY,
+        temperature_c=temperature_c,
     )
     return TrialMotion(reference, text)
 
@@ -220,6 +227,7 @@ def loss_of(
         if affine.capability_of(effect, target.estimates):
             estimated.append(effect)
             values_unestimated[model.slices[effect.key]] = effect.prior_values()
+    # In the frame of the program: true quantities, and readings by the formula of the program.
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
     # The whole document represents all effects of the full compensation.
     corrected = true
@@ -230,7 +238,12 @@ def loss_of(
             sensor_output(model, 'accelerometer', values_unestimated, ref=ref),
             sensor_output(model, 'gyroscope', values_unestimated, ref=ref),
         )
-        readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, ref.temperature_c)
+        readings = Readings(
+            force=force,
+            rate=rate,
+            alpha=ref.alpha_s @ placement.mat_ts.T,
+            temperature_c=ref.temperature_c,
+        )
         corrected = target.corrected(numbers, readings)
         for effect in model.effects:
             if effect not in estimated:
@@ -243,7 +256,13 @@ def loss_of(
         remaining[sensor] = _rms(corrected[index] - true[index])
         raw = sensor_output(model, sensor, values, ref=ref)
         raw_error[sensor] = _rms(raw - (ref.force_s, ref.rate_s)[index])
-    return Loss(tuple(lost), tuple(estimated), remaining, raw_error, motion.text)
+    return Loss(
+        effects=tuple(lost),
+        estimated=tuple(estimated),
+        remaining=remaining,
+        raw=raw_error,
+        motion=motion.text,
+    )
 
 
 def _lost_effect(
@@ -253,20 +272,20 @@ def _lost_effect(
     motion: TrialMotion,
 ) -> LostEffect | None:
     """
-    Return the loss by an effect: readings with all its values against those with the held values.
+    Return the loss by an effect: readings with all its values against those that a program has.
 
     None if the target represents the whole effect.
     """
     capability = affine.capability_of(effect, holds)
-    held = affine.held_values(calibration, effect, capability)
-    if np.array_equal(held, calibration.values[calibration.model.slices[effect.key]]):
+    represented = affine.represented_values(calibration, effect, capability)
+    if np.array_equal(represented, calibration.values[calibration.model.slices[effect.key]]):
         return None
     model, values = invertible_values(calibration)
-    held_only = values.copy()
-    held_only[model.slices[effect.key]] = held
+    values_of_program = values.copy()
+    values_of_program[model.slices[effect.key]] = represented
     output = sensor_output(model, effect.sensor, values, ref=motion.reference)
-    output_of_held = sensor_output(model, effect.sensor, held_only, ref=motion.reference)
-    return LostEffect(effect, capability is not None, _rms(output - output_of_held))
+    output_of_program = sensor_output(model, effect.sensor, values_of_program, ref=motion.reference)
+    return LostEffect(effect, in_part=capability is not None, rms=_rms(output - output_of_program))
 
 
 def _rms(values: np.ndarray) -> float:
@@ -370,12 +389,12 @@ def _document(
         readings = IMPORTED_FROM_AUTOPILOT
     return check_numbers(
         Calibration(
-            model,
-            values,
-            np.diag(sd**2),
-            tuple(status),
-            frame_id,
-            gauge,
+            model=model,
+            values=values,
+            covariance=np.diag(sd**2),
+            status=tuple(status),
+            frame_id=frame_id,
+            gauge=gauge,
             statistics=statistics,
             conditions=conditions,
             provenance=provenance,

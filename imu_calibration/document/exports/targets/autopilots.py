@@ -176,7 +176,7 @@ def read_ardupilot(content: bytes, _path: str | Path) -> Read:
         lacks += of('accelerometer', SCALES)
     if parameters.get(f'{TCAL}_ENABLE') == 1:
         refuse_curved(parameters, curved)
-    return Read(parameters, lacks)
+    return Read(numbers=parameters, lacks=lacks)
 
 
 def ignored_ardupilot(parameters: Numbers) -> list[str]:
@@ -334,7 +334,7 @@ def read_px4(content: bytes, _path: str | Path) -> Read:
         if not present[sensor]:
             lacks += of(sensor, OFFSETS + SCALES)
     refuse_curved(parameters, curved)
-    return Read(parameters, lacks)
+    return Read(numbers=parameters, lacks=lacks)
 
 
 def ignored_px4(parameters: Numbers) -> list[str]:

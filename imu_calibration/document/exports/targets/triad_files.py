@@ -115,7 +115,7 @@ def read_imu_tk(content: bytes, path: str | Path) -> Read:
     for sensor in ENDINGS:
         if sensor not in numbers:
             lacks += of(sensor, OFFSETS + MATRICES)
-    return Read(numbers, lacks)
+    return Read(numbers=numbers, lacks=lacks)
 
 
 def _numbers(content: bytes) -> list[float]:
@@ -230,7 +230,7 @@ def read_autoware(content: bytes, _path: str | Path) -> Read:
             f' {shortened(str(error))}; correct it'
         ) from error
     lacks = () if scale else of('gyroscope', SCALES)
-    return Read({**offsets, SCALE_KEY: values}, lacks)
+    return Read(numbers={**offsets, SCALE_KEY: values}, lacks=lacks)
 
 
 AUTOWARE = (

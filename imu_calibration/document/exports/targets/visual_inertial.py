@@ -142,7 +142,7 @@ def read_kalibr(content: bytes, _path: str | Path) -> Read:
         'accelerometers': {'M': accel_matrix, **arms},
         'gyroscopes': gyro_matrices,
     }
-    return Read(numbers, () if arms else ARMS, read_densities(mapping))
+    return Read(numbers=numbers, lacks=() if arms else ARMS, sample_sd=read_densities(mapping))
 
 
 def accelerometer_lower_at_x(imu: AffineImu) -> Placement:
@@ -250,7 +250,7 @@ def read_openvins(content: bytes, _path: str | Path) -> Read:
             numbers[name] = numbers_at(chain, name, (3, 3), what=what)
         else:
             numbers[name] = np.zeros((3, 3)) if name == 'Tg' else np.eye(3)
-    return Read(numbers, (), read_densities(chain))
+    return Read(numbers=numbers, sample_sd=read_densities(chain))
 
 
 def _target(name: str, model: str, shape: str) -> Target:
@@ -361,7 +361,7 @@ def read_basalt(content: bytes, _path: str | Path) -> Read:
             if name in values:
                 densities = numbers_at(values, name, (3,), what=what)
                 sample_sd[sensor] = float(np.max(densities) * np.sqrt(rate))
-    return Read(numbers, (), sample_sd)
+    return Read(numbers=numbers, sample_sd=sample_sd)
 
 
 BASALT = (
