@@ -381,7 +381,7 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     model = calibration.model
     names: dict[str, tuple[str, ...]] = {section: () for section in SECTIONS}
     for effect in model.effects:
-        if _is_kept(effect, sensors):
+        if _remains(effect, sensors):
             names[effect.sensor] += (effect.name,)
     reduced = replace(
         model,
@@ -413,7 +413,7 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     )
 
 
-def _is_kept(effect: Effect, sensors: Sequence[str]) -> bool:
+def _remains(effect: Effect, sensors: Sequence[str]) -> bool:
     """Return whether an effect remains when `sensors` are not corrected."""
     if effect.sensor in sensors:
         return effect.role in (Role.OFFSET, Role.LINEAR, Role.LIMIT)
@@ -605,12 +605,12 @@ def true_calibration(
     `simulated` describes the simulation in its provenance.
     """
     return Calibration(
-        model.at(values),
-        values,
-        np.zeros((len(values),) * 2),
-        (DETERMINED,) * len(values),
-        frame_id,
-        {'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
+        model=model.at(values),
+        values=values,
+        covariance=np.zeros((len(values),) * 2),
+        status=(DETERMINED,) * len(values),
+        frame_id=frame_id,
+        gauge={'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
         provenance={'simulated': simulated},
         **BY_DEFINITION,
     )

@@ -367,9 +367,9 @@ def _model(document: Mapping[str, Any]) -> SensorModel:
                 )
             members[sensor].append(name)
     return SensorModel(
-        tuple(members['accelerometer']),
-        tuple(members['gyroscope']),
-        tuple(members['reference']),
+        accelerometer=tuple(members['accelerometer']),
+        gyroscope=tuple(members['gyroscope']),
+        reference=tuple(members['reference']),
         joint_names=joint_names,
         temperature_ref_c=float(document.get('reference_temperature_c', 25.0)),
         catalogue=catalogue,

@@ -240,6 +240,7 @@ class MotionBuilder:
         self.home = np.clip(np.zeros(n_joints), self.limits.lower, self.limits.upper)
         """Zero, or the nearest position within the limits, shape (n_joints,)."""
         self._position = self.home if start is None else np.asarray(start, float)
+        """Position at the end of the last segment, rad or m, shape (n_joints,)."""
 
     @property
     def n_joints(self) -> int:
@@ -355,12 +356,12 @@ class MotionBuilder:
         """Append a Segment from the present position; None: zeros, `sines`: its other fields."""
         zero = np.zeros(self.n_joints)
         segment = Segment(
-            kind,
-            float(duration),
-            self._position,
-            zero if rate_from is None else rate_from,
-            zero if rate_to is None else rate_to,
-            zero if shift is None else shift,
+            kind=kind,
+            duration=float(duration),
+            start=self._position,
+            rate_from=zero if rate_from is None else rate_from,
+            rate_to=zero if rate_to is None else rate_to,
+            shift=zero if shift is None else shift,
             **sines,
         )
         self.segments += (segment,)
@@ -385,7 +386,7 @@ def stretch(build: Callable, duration: float) -> tuple[Segment, ...]:
         When `duration` is below the time of moves and ramps with the shortest dwells.
 
     """
-    # The length is linear in the dwell.
+    # The length is linear in the dwell: `change` is its slope.
     length = sum(segment.duration for segment in build(1.0))
     change = sum(segment.duration for segment in build(2.0)) - length
     shortest = length - (1.0 - SHORTEST_DWELL) * change

@@ -298,7 +298,8 @@ class TableController:
                 f' {beyond:.3g} rad or m; see the limits in the description of the table',
                 code='joint_range',
             )
-        # A motion that is slower by this factor keeps both limits.
+        # A motion that is slower by this factor keeps both limits: the acceleration falls with its
+        # square.
         slowing = max(speed, np.sqrt(acceleration))
         if slowing <= 1.0 + LIMIT_ROUNDING:
             return trajectory
@@ -347,7 +348,9 @@ class TableController:
         """Return the motion of the joints before the first trajectory, at times of shape (m,)."""
         if self._profile is None:
             zero = np.zeros((len(time), len(self.joint_names)))
-            return JointMotion(time, zero + self._home, zero, zero, zero)
+            return JointMotion(
+                time, position=zero + self._home, rate=zero, acceleration=zero, jerk=zero
+            )
         if not self._repeat:
             return self._profile.at(time)
         # Each repetition starts from the position at the end of the previous one.
