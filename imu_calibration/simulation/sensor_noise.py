@@ -86,8 +86,10 @@ GRADES = {
         scale=0.02,
         misalignment=0.01,
         arm=3e-3,
-        source='MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed,'
-        ' the sheet has none',
+        source=(
+            'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability'
+            ' assumed, the sheet has none'
+        ),
     ),
     'industrial': ImuGrade(
         SimulatedNoise(
@@ -102,8 +104,10 @@ GRADES = {
         scale=5e-3,
         misalignment=3e-3,
         arm=3e-3,
-        source='Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h; matrix and'
-        ' arms before factory calibration',
+        source=(
+            'Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h;'
+            ' matrix and arms before factory calibration'
+        ),
     ),
     'tactical': ImuGrade(
         SimulatedNoise(
@@ -120,8 +124,10 @@ GRADES = {
         scale=5e-3,
         misalignment=0.87e-3,
         arm=5e-3,
-        source='ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run 15'
-        ' mg and 0.5 deg/s, axis to axis 0.05 deg',
+        source=(
+            'ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run'
+            ' 15 mg and 0.5 deg/s, axis to axis 0.05 deg'
+        ),
     ),
     'navigation': ImuGrade(
         SimulatedNoise(
@@ -136,8 +142,10 @@ GRADES = {
         scale=1e-4,
         misalignment=3e-5,
         arm=0.02,
-        source='assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h,'
-        ' run-to-run 50-100 ug and 0.01-0.03 deg/h',
+        source=(
+            'assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h,'
+            ' run-to-run 50-100 ug and 0.01-0.03 deg/h'
+        ),
     ),
 }
 """Grades by name."""

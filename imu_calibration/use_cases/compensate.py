@@ -198,7 +198,14 @@ def compensate_recording(
     }
     readings = readings_for(calibration, units)
     mask = ExclusionMask(parse_exclusions(exclude) if exclude else ())
-    correction = _Correction(calibration, used, transfer, shift_ns, readings, mask)
+    correction = _Correction(
+        calibration=calibration,
+        used=used,
+        transfer=transfer,
+        shift_ns=shift_ns,
+        readings=readings,
+        mask=mask,
+    )
 
     # Samples in memory, and text logs.
     if isinstance(recording, (ImuSamples, SampleBlock)):
@@ -209,7 +216,13 @@ def compensate_recording(
             code='exists_already',
         )
     log = log_options(readings, units | {'columns': columns, 'where': where})
-    topics = Topics(imu_topic, None, temperature_topic, frame_id, gyroscope_topic, log)
+    topics = Topics(
+        imu=imu_topic,
+        temperature=temperature_topic,
+        frame=frame_id,
+        gyroscope=gyroscope_topic,
+        log=log,
+    )
     if output is not None and is_text_log(output):
         return _into_text_log(recording, output, correction, topics)
     _refuse_corrected_log(recording)
@@ -232,6 +245,7 @@ def compensate_recording(
         frame = target_frame or joined.frame_id
         if split.topic == gyroscope_topic:
             topics = topics._replace(imu=gyroscope_topic, frame=None)
+
     # A bag, block by block: into memory, or into another bag.
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
@@ -364,11 +378,11 @@ class _CorrectionRun:
                 ' the range of the converter: their corrected readings are wrong; move less fast or'
                 ' choose a wider range'
             )
-        # Both sensors are frozen in one part where the IMU is: it counts once.
+        # Where the IMU is frozen, both sensors have the same part: it counts once.
         samples_of_part = {(part.start, part.stop): part.samples for part in frozen}
         return Compensated(
-            imu,
-            stream.count,
+            imu=imu,
+            count=stream.count,
             warnings=lines + stream.warnings(),
             lost=lost,
             refused=refused,
@@ -517,7 +531,7 @@ class RawChecks:
         matrix = self._calibration.of('gyroscope', Role.LINEAR)
         if evidence.turning is None or matrix is None or 'gyroscope' in self._calibration.absent:
             return
-        # Corrected rate over the true one.
+        # Corrected rate over the true one: the factor is that of true over raw rates.
         ratio = 1.0 / (evidence.turning.factor * float(np.mean(np.diag(matrix))))
         text = corrected_rates_text(ratio)
         if scale_range(ratio) is IMPOSSIBLE:
@@ -546,6 +560,7 @@ def _in_memory(recording: ImuSamples | SampleBlock, correction: _Correction) -> 
     checks.require()
     corrected = correction.samples(imu, run.stream.correct(correction.readings.apply(imu)))
     if not kept.all():
+        # One row for each sample, as the caller gave them.
         force, rate = np.full((2, len(kept), 3), np.nan)
         force[kept] = corrected.force_s
         rate[kept] = corrected.rate_s

@@ -258,13 +258,14 @@ def _summary(
         recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
         recording.close()
     source = source_of(bag, topics, reference.joint_names)
-    lenient = source_of(bag, topics, want_joints='optional', want_temperature='optional')
+    # The checks of the streams read what there is; the calibration refuses missing joints.
+    available = source_of(bag, topics, want_joints='optional', want_temperature='optional')
     (source,) = sources_without([source], [bag], exclude)
-    (lenient,) = sources_without([lenient], [bag], exclude)
-    inspection = reference.inspect(source, lenient, options)
+    (available,) = sources_without([available], [bag], exclude)
+    inspection = reference.inspect(source, available, options)
     return RecordingSummary(
-        recording,
-        inspection.preflight.streams,
+        recording=recording,
+        streams=inspection.preflight.streams,
         findings=(*inspection.findings, *_axes_question(bag, options)),
         lost=inspection.preflight.lost,
         calibrated=inspection.calibrated,

@@ -144,7 +144,13 @@ def identify_recording(
     }
     readings = readings_of(units)
     log = log_options(readings, units | {'columns': columns, 'where': where})
-    topics = Topics(imu_topic, None, temperature_topic, frame_id, gyroscope_topic, log)
+    topics = Topics(
+        imu=imu_topic,
+        temperature=temperature_topic,
+        frame=frame_id,
+        gyroscope=gyroscope_topic,
+        log=log,
+    )
     (source,) = sources_without([source_of(recording, topics)], [recording], exclude)
     result = identify_noise(source, readings)
 

@@ -186,9 +186,9 @@ def simulate(
     )
     frame_id = options_of(table).get('imu_link') or LIKELY_LINK
     options = SimulationOptions(
-        imu_rate,
-        joint_rate,
-        noise,
+        imu_rate=imu_rate,
+        joint_rate=joint_rate,
+        noise=noise,
         frame_id=frame_id,
         temperature_start_c=25.0 if warms_up else None,
     )
@@ -198,7 +198,7 @@ def simulate(
     truth = true_calibration(
         model, values, options.frame_id, simulated={'seed': seed, 'profile': profile}
     )
-    return Simulated(samples, moved_table, truth, motion.duration)
+    return Simulated(samples, moved_table, truth, duration=motion.duration)
 
 
 def replay(
@@ -241,6 +241,7 @@ def replay(
     )
     calibration = files.given_calibration(calibration)
     require_joints(calibration.model, given_table)
+    # The noise of the calibration, if it has that of both sensors.
     statistics = calibration.statistics
     noise = None
     if all('noise_sd' in statistics.get(sensor, {}) for sensor in SENSORS):
@@ -259,4 +260,5 @@ def replay(
         readings=RawReadings(axes=calibration.readings.axes),
     )
     stamp_ns = cast(ImuSamples, samples.imu).stamp_ns
-    return Simulated(samples, given_table, truth, 1e-9 * float(stamp_ns[-1] - stamp_ns[0]), lost)
+    duration = 1e-9 * float(stamp_ns[-1] - stamp_ns[0])
+    return Simulated(samples, given_table, truth, duration=duration, lost=lost)

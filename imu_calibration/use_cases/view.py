@@ -139,6 +139,7 @@ def residual_spectrum(
     ]
     if not windows:
         return np.zeros(0), {sensor: np.zeros((0, 3)) for sensor in SENSORS}
+    # All spectra have the frequencies of one segment length, so that shorter windows are omitted.
     segment = min(LONGEST_SEGMENT, int(np.median([len(window) for window in windows])))
     windows = [window for window in windows if len(window) >= segment]
     rate = 1 / float(np.median([window.period for window in windows]))
@@ -487,9 +488,9 @@ def view(
             lines.append({'frequency': float(line_frequency), **_by_sensor(density, k)})
         contents[SPECTRUM_TOPIC] = {'lines': lines}
     return View(
-        result.calibration,
-        contents,
-        calibrated.reference.coverage(result),
+        calibration=result.calibration,
+        contents=contents,
+        coverage=calibrated.reference.coverage(result),
         seconds=contents[RESIDUAL_TOPIC]['windows'][-1]['time'],
     )
 

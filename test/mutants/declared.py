@@ -1290,7 +1290,7 @@ BY_SENSOR = _of(
     ),
     (
         'what a refused sensor reads still corrects the other one',
-        '_is_kept',
+        '_remains',
         'not any(...)',
         'True',
         'test_verdict_by_sensor.py::test_what_the_refused_sensor_would_correct_goes_as_well',
