@@ -81,8 +81,8 @@ def _with_serial_column(lines: Sequence[str]) -> list[str]:
         text = match[2] if match else line
         # The header, a line without digits, gets the name of the column in place of its time, as
         # does a line without a time.
-        has_time = match is not None and any(character.isdigit() for character in text)
-        time = match[1] if has_time else 'time'
+        has_digits = any(character.isdigit() for character in text)
+        time = match[1] if match and has_digits else 'time'
         lines_with_time.append(f'{time}{delimiter}{text}')
     return lines_with_time
 

@@ -263,6 +263,7 @@ def _check_key(event: Any, mapping: _OpenPart, name: str) -> None:
 
     Called for the event of each key and value of the `_OpenPart`, in turn.
     """
+    assert mapping.keys is not None  # it is no list
     is_key = mapping.expects_key
     mapping.expects_key = not is_key
     if not is_key:

@@ -385,7 +385,7 @@ def combined(
     return base
 
 
-def _axes_matrix(axes):
+def _axes_matrix(axes: str) -> np.ndarray:
     """Return the matrix from axes of the source to forward-left-up, shape (3, 3)."""
     matrix = np.zeros((3, 3))
     if axes in AXES_OF_CONVENTION:
@@ -402,7 +402,7 @@ def _axes_matrix(axes):
     return matrix
 
 
-def _axes_error(axes):
+def _axes_error(axes: str) -> InputError:
     """Return the error for axes that are no convention and no signed permutation."""
     return InputError(
         'axes must be flu, frd or the axes of the source that point forward, left and up, such as'
@@ -412,13 +412,13 @@ def _axes_error(axes):
     )
 
 
-def _spelled(sensor, text):
+def _spelled(sensor: str, text: str) -> str:
     """Return a unit in its first spelling; another text without spaces at its ends."""
     text = text.strip()
     return READING_SPELLINGS[sensor].get(text.lower(), text)
 
 
-def _positive(text):
+def _positive(text: str) -> float:
     """Return a number above zero; NaN for another text."""
     try:
         number = float(text)
@@ -427,13 +427,13 @@ def _positive(text):
     return number if number > 0.0 else math.nan
 
 
-def _of_scale(sensor, scale, offset):
+def _of_scale(sensor: str, scale: Number, offset: Number) -> SensorUnit:
     """Return the unit of readings that a scale describes; SI where it is 1 without an offset."""
     unit = SensorUnit(COUNTS, _number(scale), _number(offset))
     return replace(unit, unit=SI_UNITS[sensor]) if unit.is_si else unit
 
 
-def _sensor_unit(sensor, entry, place):
+def _sensor_unit(sensor: str, entry: Mapping[str, Any], place: str) -> SensorUnit:
     """Return the unit in a mapping of unit, scale and offset, each optional; `place`: its name."""
     place = f'{place}.{sensor}'
     scale = _number_or_none(entry.get('scale'))
@@ -463,12 +463,12 @@ def _sensor_unit(sensor, entry, place):
     return stated if offset is None else replace(stated, offset=offset)
 
 
-def _number_or_none(value):
-    """Return a `Number`, or None for None."""
+def _number_or_none(value: Any) -> Number | None:
+    """Return the `Number` of a value; None for None."""
     return None if value is None else _number(value)
 
 
-def _number(value):
+def _number(value: Any) -> Number:
     """Return a `Number` of a number, or of a list with one or three."""
     if np.size(value) > 1:
         x, y, z = (float(number) for number in value)
@@ -476,6 +476,6 @@ def _number(value):
     return float(np.squeeze(value))
 
 
-def _plain(value):
+def _plain(value: Number) -> float | list[float]:
     """Return a `Number` as plain data: a float, or a list of three."""
     return list(value) if isinstance(value, tuple) else float(value)

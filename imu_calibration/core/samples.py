@@ -277,6 +277,7 @@ class SampleBlock:
             When shapes differ, or times are not finite or in another unit.
 
         """
+        # Numbers of one shape for each name.
         times = _times_of(time)
         given = {'time': times, 'force': force, 'rate': rate}
         for name, values in (joints or {}).items():
@@ -310,9 +311,9 @@ class SampleBlock:
         angles = {name: arrays[f"joint '{name}'"] for name in joints or {}}
         heat = arrays.get('temperature_c')
         return cls(
-            ImuSamples(stamp_ns, arrays['force'], arrays['rate'], 'imu_link'),
-            JointSamples.of_angles(stamp_ns, angles) if angles else None,
-            None if heat is None else TemperatureSamples(stamp_ns, heat),
+            imu=ImuSamples(stamp_ns, arrays['force'], arrays['rate'], 'imu_link'),
+            joints=JointSamples.of_angles(stamp_ns, angles) if angles else None,
+            temperature=None if heat is None else TemperatureSamples(stamp_ns, heat),
         )
 
 

@@ -346,13 +346,13 @@ def axis_readings(
         for i, sensor in enumerate('xyz'):
             lines.append(
                 AxisReading(
-                    ('+' if minus_sign < 0 else '-') + 'xyz'[line_axis],
-                    float(line_rate),
-                    int(np.sum(chosen)),
-                    sensor,
-                    float(mean_reference[i]),
-                    float(mean_measured[i]),
-                    float(mean_compensated[i]),
+                    position=('+' if minus_sign < 0 else '-') + 'xyz'[line_axis],
+                    rate_deg_s=float(line_rate),
+                    n_windows=int(np.sum(chosen)),
+                    sensor=sensor,
+                    theoretical_g=float(mean_reference[i]),
+                    before_g=float(mean_measured[i]),
+                    after_g=float(mean_compensated[i]),
                 )
             )
     return lines
@@ -500,6 +500,7 @@ def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np
     windows = [w for w in result.gathered.kept if len(w) >= 100]
     if not windows:
         return {}
+    # The longer half of them: a short window has few pairs at the largest lags.
     typical = np.median([len(w) for w in windows])
     windows = [w for w in windows if len(w) >= typical][:MOST_WINDOWS]
     period = float(np.median([w.period for w in windows]))

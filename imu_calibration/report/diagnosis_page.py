@@ -51,8 +51,9 @@ def diagnosis_report(result: DiagnosisResult) -> str:
 
     """
     diagnosis = result.diagnosis
-    # Sensor -> significant residual variance that no finding explains.
+    # Sensor -> significant residual that no finding explains.
     rests = {sensor: rest for sensor, rest in diagnosis.unexplained.items() if rest.significant}
+    # Colour of the headline: a residual without a formula, with one, or none.
     word = 'good'
     if any(rest.proposal is None for rest in rests.values()):
         word = 'bad'

@@ -155,7 +155,10 @@ def expected_growth(
     }
     velocity_variance = sum(part.velocity**2 for part in parts.values())
     position_variance = sum(part.position**2 for part in parts.values())
-    return Growth(time, np.sqrt(velocity_variance), np.sqrt(position_variance)), parts
+    expected = Growth(
+        time, velocity=np.sqrt(velocity_variance), position=np.sqrt(position_variance)
+    )
+    return expected, parts
 
 
 def _constant_variances(uncertainty: Uncertainty, force: np.ndarray) -> tuple[float, float]:
@@ -179,8 +182,8 @@ def _constant_growth(time: np.ndarray, variances: np.ndarray, gravity: float) ->
     force, rate = np.sqrt(np.maximum(variances, 0)).T[:, :, None]
     return Growth(
         time,
-        np.hypot(force * time, gravity * rate * time**2 / 2),
-        np.hypot(force * time**2 / 2, gravity * rate * time**3 / 6),
+        velocity=np.hypot(force * time, gravity * rate * time**2 / 2),
+        position=np.hypot(force * time**2 / 2, gravity * rate * time**3 / 6),
     )
 
 
@@ -261,7 +264,14 @@ def _at_origin(calibration: Calibration, ref: Reference) -> Reference:
     if arm is None:
         return ref
     force = ref.force_s + lever_matrix(ref.rate_s, ref.alpha_s) @ arm
-    return Reference(ref.time, ref.mat_sn, force, ref.rate_s, ref.alpha_s, ref.gravity)
+    return Reference(
+        time=ref.time,
+        mat_sn=ref.mat_sn,
+        force_s=force,
+        rate_s=ref.rate_s,
+        alpha_s=ref.alpha_s,
+        gravity=ref.gravity,
+    )
 
 
 def _growths(figure, before, after, parts):
