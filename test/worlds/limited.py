@@ -17,11 +17,17 @@ LIMIT_BYTES = 3 << 30
 LIMIT_SECONDS = 20
 """Processor time."""
 PRELOAD = [
+    'backports.zstd',
+    'imu_calibration.cli.inspect',
     'imu_calibration.cli.main',
+    'imu_calibration.cli.parser',
+    'imu_calibration.cli.show',
+    'imu_calibration.cli.terminal',
     'imu_calibration.use_cases.calibrate',
     'imu_calibration.use_cases.inspect',
+    'lz4.frame',
     'msg_adapters.bag',
-    'rosbags.typesys',
+    'rosbags.typesys.stores.ros2_jazzy',
     'scipy.optimize',
     'scipy.signal',
     'scipy.spatial.transform',
