@@ -9,6 +9,8 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.use_cases.noise import identify_recording
 
+from worlds.noise_worlds import identifying
+
 HZ, SECONDS = 50.0, 200.0
 FORCE_SD, RATE_SD = 0.02, 0.0015
 """Standard deviations of a reading, SI."""
@@ -23,7 +25,8 @@ def still(seed):
 
 
 def identified(stamps, force, rate):
-    return identify_recording(SampleBlock(ImuSamples(stamps, force, rate, 'imu_link')))
+    with identifying(0):  # one sensor is left, and its axes are alike
+        return identify_recording(SampleBlock(ImuSamples(stamps, force, rate, 'imu_link')))
 
 
 def contains(axes, density):

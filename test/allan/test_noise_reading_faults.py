@@ -11,6 +11,8 @@ from imu_calibration.allan.reading_faults import FaultSearch
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.base import SENSORS
 
+from worlds.noise_worlds import identifying
+
 RATE = 125.0
 DENSITY = {'accelerometer': 1.9e-3, 'gyroscope': 1.5e-4}
 """White noise, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz)."""
@@ -49,8 +51,9 @@ def white_interval(result, column):
 
 
 def test_torn_reads_change_neither_the_noise_nor_the_rest():
-    values = torn_readings(500.0, 0.04, (513.0, -766.0, 8188.0))
-    result = identify_noise(recording(values, RATE))
+    values = torn_readings(250.0, 0.04, (513.0, -766.0, 8188.0))
+    with identifying(0, 1, 2, 3):
+        result = identify_noise(recording(values, RATE))
     for column in range(6):
         low, high = white_interval(result, column)
         # 95 % intervals of six axes: the truth is at most half a width outside
@@ -65,7 +68,8 @@ def test_torn_reads_within_the_noise_widen_the_interval():
     """Noise of 64 steps, errors of 4 sd: too small for outliers, 9 % more noise on x."""
     times = 64.0 / (DENSITY['accelerometer'] * RATE**0.5 * SCALE['accelerometer'])
     values = torn_readings(200.0, 0.03, (1030.0, -895.0, 8188.0 + 128.0), times)
-    result = identify_noise(recording(values, RATE))
+    with identifying(0, 1, 2):
+        result = identify_noise(recording(values, RATE))
     density = times * DENSITY['accelerometer']
     for column in range(3):
         low, high = white_interval(result, column)
@@ -85,7 +89,8 @@ def test_heavy_tails_widen_the_interval():
     values = rng.normal(0, 1, (n, 6)) * sd + [0.0, 0.0, 9.8, 0.0, 0.0, 0.0]
     doubtful = rng.random(n) < 0.03
     values[doubtful, :2] += rng.normal(0, 4, (doubtful.sum(), 2)) * sd[:2]
-    result = identify_noise(recording(values, RATE))
+    with identifying(0, 2, 3):
+        result = identify_noise(recording(values, RATE))
     for column in range(6):
         low, high = white_interval(result, column)
         margin = 0.5 * (high - low)
@@ -113,7 +118,8 @@ def test_repeated_readings_of_one_sensor_are_named_with_their_effect():
     assert not faults.named.any()
     # The interval of a recording of five minutes holds the density of the sensor.
     part = values[: int(300 * RATE)]
-    result = identify_noise(recording(part, RATE))
+    with identifying(0, 3):
+        result = identify_noise(recording(part, RATE))
     new_rate = RATE / 1.5
     for column in (3, 4, 5):
         low, high = white_interval(result, column)
@@ -142,16 +148,16 @@ def test_gaussian_readings_are_without_faults():
 def test_independent_errors_are_bounded(size, widest):
     """Errors in a twentieth of the readings, whose noise they raise by sqrt(1 + 0.05 size^2)."""
     rng = np.random.default_rng(9731)
-    readings = rng.normal(0, 1, (40, 25_600))
+    readings = rng.normal(0, 1, (20, 25_600))
     wrong = rng.random(readings.shape) < 0.05
     readings += size * wrong * rng.choice([-1.0, 1.0], readings.shape)
-    blocks = readings.reshape(40, -1, 32)
-    deviations = (blocks - blocks.mean(axis=2, keepdims=True)).reshape(40, -1)
+    blocks = readings.reshape(20, -1, 32)
+    deviations = (blocks - blocks.mean(axis=2, keepdims=True)).reshape(20, -1)
     excesses = [excess_of_errors(deviation, 32) for deviation in deviations]
     ratios = np.array([excess.ratio for excess in excesses])
     true = np.sqrt(1 + 0.05 * size**2)
-    # One-sided 95 %: 5 of 40 too small have a chance of 1 %; 0.5 % is the scatter of `true`.
-    assert np.sum(ratios < 0.995 * true) <= 5
+    # One-sided 95 %: 4 of 20 too small have a chance of 2 %; 0.5 % is the scatter of `true`.
+    assert np.sum(ratios < 0.995 * true) <= 3
     assert ratios.mean() < widest
     significant = [excess.sds > 3.0 for excess in excesses]
     if size > 1.2:

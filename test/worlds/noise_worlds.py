@@ -4,13 +4,17 @@ Noise of known coefficients, by its physics.
 Steps of a converter, white noise, flicker, a walk, a process that forgets, and grades made of them.
 """
 
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import count
+from unittest.mock import patch
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len
 from scipy.signal import lfilter
 
+from imu_calibration.allan import identify
 from imu_calibration.allan.curve import AllanSums
 from imu_calibration.simulation.sensor_noise import GRADES
 
@@ -74,6 +78,25 @@ def _folded_flicker(length, period):
 def quantisation(n, period, coefficient, rng):
     """Rates from an angle that is read with independent errors."""
     return np.diff(coefficient * rng.standard_normal(n + 1)) / period
+
+
+@contextmanager
+def identifying(*axes):
+    """
+    Identify these axes of a recording only: 0, and those whose noise is not that of the one before.
+
+    Counted are the axes with a curve. The others get the figures of the one before, and keep their
+    curves and faults of readings.
+    """
+    calls, identify_axis, known = count(), identify.identify_axis, []
+
+    def identified(moments):
+        if next(calls) in axes:
+            known.append(identify_axis(moments))
+        return known[-1]
+
+    with patch.object(identify, 'identify_axis', identified):
+        yield
 
 
 @dataclass(frozen=True)
