@@ -25,7 +25,6 @@ from imu_calibration.planning.planner import Decision, make_planner
 from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import limit_excess, trajectory_from
-from imu_calibration.use_cases.resources import config_file
 
 from worlds.arms import SIX_AXES
 
@@ -176,11 +175,16 @@ def test_a_plan_without_limits_warns_and_exits_with_3(tmp_path, capsys):
 
 
 def test_a_plan_keeps_to_the_neighbourhood_of_a_pose(tmp_path, capsys):
-    pose = dict(outer=20.0, middle=-60.0, inner=100.0)
+    pose = dict(outer=20.0, inner=100.0)
+    joints = [
+        {'name': 'outer', 'axis': [0, 1, 0], 'range_deg': [-170, 170]},
+        {'name': 'inner', 'axis': [0, 0, 1], 'endless': True},
+    ]
+    (tmp_path / 'table.yaml').write_text(yaml.safe_dump({'joints': joints, 'gravity': 9.81}))
     arm = [
         'plan',
         '--table',
-        str(config_file('table_simulated.yaml')),
+        str(tmp_path / 'table.yaml'),
         '--no-bound',
         '--no-report',
         '--output',

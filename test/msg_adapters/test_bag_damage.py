@@ -31,7 +31,7 @@ KINDS = {
     'mcap_lz4': {'storage': 'mcap', 'compression': 'lz4'},
 }
 quick = settings(
-    max_examples=25,
+    max_examples=12,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

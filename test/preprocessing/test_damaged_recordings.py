@@ -16,8 +16,6 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
-from worlds.candidates import FEW
-
 TABLE_FILE = config_file('table_simulated.yaml')
 TABLE = Table.from_mapping(yaml.safe_load(TABLE_FILE.read_text(encoding='utf-8')))
 MODEL = SensorModel(
@@ -36,7 +34,7 @@ def bags(tmp_path_factory):
         VALUES,
         TABLE,
         profile=make_profile('quick', 6, TABLE),
-        options=SimulationOptions(200.0, 100.0),
+        options=SimulationOptions(100.0, 50.0),
         seed=6,
     )
     for storage in STORAGES:
@@ -52,7 +50,7 @@ def storage_file(bag):
 def calibrate(bag, output):
     """Return (exit code, calibration document)."""
     arguments = ['calibrate', str(bag), '--table', str(TABLE_FILE), '--output', str(output)]
-    code = main([*arguments, '--no-report', '--candidates', FEW])
+    code = main([*arguments, '--no-report', '--model-as-asked'])
     return code, yaml.safe_load((output / 'calibration.yaml').read_text())
 
 

@@ -351,10 +351,9 @@ def frozen(block, *, joint, start, stop):
     return replace(block, joints=replace(block.joints, position=position, velocity=velocity))
 
 
-@pytest.mark.parametrize('joint', [0, 2])
-def test_one_joint_that_stands_still_is_named_with_the_time(gimbals, joint):
+def test_one_joint_that_stands_still_is_named_with_the_time(gimbals):
     block, table = gimbals
-    count = len(block.joints.position)
+    count, joint = len(block.joints.position), 1
     with refused(InputError, 'frozen', table.joint_names[joint], ' s to '):
         calibrate_recordings(
             frozen(block, joint=joint, start=count // 3, stop=3 * count // 4), table

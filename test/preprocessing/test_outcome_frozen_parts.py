@@ -22,6 +22,7 @@ from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.calibrated_by_hand import OPTIONS, calibrated
 from worlds.hand_sessions import GRAVITY
+from worlds.noise_worlds import identifying
 from worlds.physics import make_session
 from worlds.physics_hand import hold_and_turn
 
@@ -106,7 +107,8 @@ def test_noise_is_that_of_the_readings():
     force = np.array([0.1, -0.2, GRAVITY]) + rng.normal(0, 0.01, (n, 3))
     imu = ImuSamples(stamp_ns, force, rng.normal(0, 0.001, (n, 3)), 'imu')
     dead = without_output(imu, 200.0, 420.0, 0.0)
-    result = identify_noise([SampleBlock(dead)])
+    with identifying(0, 3):
+        result = identify_noise([SampleBlock(dead)])
     figures = figures_of(result)
     for sensor, sd in (('accelerometer', 0.01), ('gyroscope', 0.001)):
         density = np.array([axis.white for axis in figures.sensor(sensor)])
