@@ -132,7 +132,7 @@ def test_it_is_asked_only_where_the_temperature_turned(cycled):
 
 @pytest.mark.parametrize('hidden', ['accel_thermal_hysteresis', 'gyro_thermal_bias'])
 def test_it_is_found_and_told_from_what_follows_the_temperature(hidden):
-    recording = record(21212, {hidden: None}, through_bag=False, temperature='cycle')
+    recording = record(21212, {hidden: None}, through_bag=False, **SHORT)
     found = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
     assert [finding.effect for finding in found.findings] == [hidden] and not found.findings[
         0

@@ -34,7 +34,6 @@ from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu, write_session
 
-from worlds.candidates import FEW
 from worlds.physics import make_session, write_bag
 from worlds.physics_hand import hold_and_turn
 
@@ -375,7 +374,8 @@ def test_a_dead_gyroscope_leaves_the_accelerometer_calibrated(tmp_path, session,
     write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
     more = [] if by_hand else ['--table', str(table)]
     arguments = ['calibrate', str(tmp_path / 'bag'), *more, '--no-report', '--output']
-    assert main([*arguments, str(tmp_path / 'out'), '--candidates', FEW]) == 3
+    few = 'accel_quadratic+gyro_bias_drift'
+    assert main([*arguments, str(tmp_path / 'out'), '--candidates', few]) == 3
     found = calibration_from_text((tmp_path / 'out' / 'calibration.yaml').read_text())
     assert found.absent == ('gyroscope',)
     statuses = found.status_by_name
@@ -778,7 +778,8 @@ def test_inspect_says_what_the_recording_determines_by_hand(capsys, tmp_path):
 def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, table, bad):
     with BagWriter(tmp_path / 'bag') as bag:
         for k in range(2):
-            imu = in_g(session.imu, None, None)[0] if k == bad else session.imu
+            imu = session.imu.select(slice(0, 4000))
+            imu = in_g(imu, None, None)[0] if k == bad else imu
             topic = bag.add_topic(f'/imu_{k}', standard_definition(IMU_TYPE))
             bag.write(np.full(len(imu), topic), imu.stamp_ns, Packed.of_rows(encode_imu(imu)))
     assert main(['inspect', str(tmp_path / 'bag')]) == 3
@@ -811,14 +812,9 @@ def test_a_bag_without_imu_lists_what_it_holds(capsys, tmp_path, session):
 
 REAL = {
     ('shaft_pitch_slow', '/imu/data_raw'): [('stamps', WARNING)],
-    ('shaft_pitch_slow', '/imu_fixed/data_raw'): [('stamps', WARNING)],
-    ('shaft_yaw_medium', '/imu/data_raw'): [('stamps', WARNING)],
     ('shaft_yaw_medium', '/imu_fixed/data_raw'): [('stamps', WARNING)],
-    **{
-        (name, f'/imu_{k}/data_raw'): [('clipping', WARNING)]
-        for name in ('array_2', 'array_5')
-        for k in (1, 7)
-    },
+    ('array_2', '/imu_1/data_raw'): [('clipping', WARNING)],
+    ('array_5', '/imu_7/data_raw'): [('clipping', WARNING)],
     ('xsens_counts', None): [('force_unit', REFUSE), ('rate_unit', REFUSE)],
     ('mpu9150_0', None): [],
     ('mpu9150_3', None): [],

@@ -243,7 +243,7 @@ def test_outcome_does_not_depend_on_how_the_streams_arrive(reset):
     assert {window.kind for window in expected} == {'static', 'spin', 'dynamic', 'unused'}
     assert len(expected) > 25
 
-    @settings(max_examples=12, deadline=None, derandomize=True)
+    @settings(max_examples=6, deadline=None, derandomize=True)
     @given(CUTS, CUTS, st.randoms(use_true_random=False), st.sampled_from([1, 50, 100000]))
     def check(imu_cuts, joint_cuts, random, largest):
         queue = (
