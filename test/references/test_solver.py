@@ -71,13 +71,13 @@ def test_noise_free_session_gives_the_truth(session):
 
 def test_reported_standard_deviations_match_the_scatter(session):
     """
-    Sixteen sessions with white noise and wandering biases; 120 are a section of `make validate`.
+    Eight sessions with white noise and wandering biases; 120 are a section of `make validate`.
 
-    The sd of the mean square of some 500 errors is 0.06, that of the coverage 1 %.
+    The sd of the mean square of some 250 errors is 0.09, that of the coverage 1.4 %.
     """
-    found = scatter(session, range(16))
-    assert 0.85 <= found.mean_square <= 1.15
-    assert 0.92 <= found.coverage <= 0.98
+    found = scatter(session, range(8))
+    assert 0.8 <= found.mean_square <= 1.2
+    assert 0.91 <= found.coverage <= 0.985
     assert found.widest_share < 0.05
     assert found.over_bound <= 1.10
 
@@ -182,14 +182,17 @@ def test_columns_are_the_derivative_of_the_prediction(session, name):
         w for w in session if w.kind == 'spin'
     ][:2]
     for window in windows:
+        designs = {
+            sensor: columns(References(model, TABLE, window.motion), sensor)
+            for sensor in ('accelerometer', 'gyroscope')
+        }
         for index in range(part.start, part.stop):
             step = np.zeros(len(values))
             step[index] = 0.02 * effect.tolerance
             high, low = (
                 predict(model, values + s * step, TABLE, motion=window.motion) for s in (1, -1)
             )
-            for sensor, up, down in zip(('accelerometer', 'gyroscope'), high, low):
-                design = columns(References(model, TABLE, window.motion), sensor)
+            for (sensor, design), up, down in zip(designs.items(), high, low):
                 derivative = design @ (
                     coefficients(model, sensor, values + step)
                     - coefficients(model, sensor, values - step)
