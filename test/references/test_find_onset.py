@@ -16,14 +16,15 @@ from worlds.candidates import with_candidates
 from worlds.hiding import record
 from worlds.moments import Clock, Moment, Wander
 
-FEW = 'time_offset+clock_rate+clock_step+encoder_zero+table_tilt+gyro_g_sensitivity'
+CLOCKS = 'time_offset+clock_rate+clock_step+encoder_zero'
+MOMENTS = 'time_offset+encoder_zero'
 SEED = 6
 
 
-def investigated(cause):
+def investigated(cause, candidates=MOMENTS):
     rates = {'imu_rate': 50.0, 'joint_rate': 50.0}
     recording = record(SEED, None, 'realistic', through_bag=False, cause=cause, **rates)
-    model = with_candidates(recording.model, FEW)
+    model = with_candidates(recording.model, candidates)
     return recording, investigate(recording.windows, recording.table, model)
 
 
@@ -86,7 +87,6 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     'shock, what, axes',
     [
         (((0.03, 0.0, 0.0), (0.0, 2e-3, 0.0)), 'accelerometer and gyroscope', 'xy'),
-        (((0.0, 0.0, 0.0), (0.0, 2e-3, 0.0)), 'gyroscope', 'y'),
         # A wander of all axes alike followed such a step, and nothing was found.
         (
             ((0.02, -0.03, 0.025), (1.4e-3, 0.9e-3, -1.7e-3)),
@@ -121,13 +121,13 @@ def test_a_wandering_bias_is_no_onset():
 
 @pytest.mark.parametrize('cause', [None, Moment('creep'), Clock(share=0.35, bend=4e-3)])
 def test_no_change_and_a_gradual_change_are_no_onset(cause):
-    found = investigated(cause)[1]
+    found = investigated(cause, CLOCKS)[1]
     assert found.onset is None
     assert 'clock_step' not in {question.name for question in found.named}
 
 
 def test_a_clock_of_another_rate_is_named():
-    _, found = investigated(Clock(rate=200e-6))
+    _, found = investigated(Clock(rate=200e-6), CLOCKS)
     assert [question.name for question in found.named] == ['clock_rate'] and found.onset is None
     (value,) = found.problem.values(found.named)[list(found.named[0].parameters)]
     # Stamps run at this rate by themselves.
@@ -135,7 +135,7 @@ def test_a_clock_of_another_rate_is_named():
 
 
 def test_a_step_of_the_clock_is_named_with_its_time():
-    recording, found = investigated(Clock(step=8e-3))
+    recording, found = investigated(Clock(step=8e-3), CLOCKS)
     assert [question.name for question in found.named] == ['clock_step'] and found.onset is None
     step, time = found.problem.values(found.named)[list(found.named[0].parameters)]
     assert step == pytest.approx(8e-3, abs=1e-4) and abs(time - moment_of(recording, 0.6)) < 1.5
