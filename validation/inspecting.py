@@ -7,6 +7,9 @@ from validation.command_line import ALL, options_of, run_verb
 from validation.recordings import label
 from validation.section import Section, text
 
+SEVERAL = 'array_2'
+"""A recording with several topics of Imu messages."""
+
 
 def remarks(lines):
     """
@@ -39,13 +42,13 @@ def run(folder, plots):
                 *(f'  {line}' for line in ([error] if code == 1 else remarks(lines))),
             ]
         bare = run_verb('inspect', folder / 'xsens_counts', [])
-        several = run_verb('inspect', folder / 'array_2', [])
+        several = run_verb('inspect', folder / SEVERAL, [])
         quoted += [
             '',
             f'xsens_counts without --nominal: exit code {bare[0]}',
             *(f'  {line}' for line in remarks(bare[1])),
             '',
-            f'array_2 without --imu-topic: exit code {several[0]}',
+            f'{SEVERAL} without --imu-topic: exit code {several[0]}',
             *(f'  {line}' for line in remarks(several[1])),
         ]
     section.claim(

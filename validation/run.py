@@ -52,7 +52,7 @@ SMALLEST: dict[str, Any] = {
     'boards.BOARD': 2,
     'cross.LONGEST': 120.0,
     'cross.ONE_UNIT': 0,
-    'cross.RECORDINGS': 1,
+    'cross.RECORDINGS': slice(1, 2),
     'decisions.BY_HAND': MPU9150,
     'decisions.KINDS': 1,
     'decisions.SEEDS': 1,
@@ -61,10 +61,11 @@ SMALLEST: dict[str, Any] = {
     'held_out.LEFT_OUT': 2,
     'held_out.SPLITS': 2,
     'inspecting.ALL': slice(-1, None),
+    'inspecting.SEVERAL': 'ferraris',
     'misfit.MOST_WORLDS': 2,
     'mpu9150.LEFT_OUT': 2,
     'mpu9150.TURNS': 1,
-    'noise.RESTING': 1,
+    'noise.RESTING': slice(2, 3),
     'peers.MOST_KINDS': 1,
     'peers.ON_A_TABLE': 1,
     'peers.SEEDS': 1,
@@ -74,8 +75,8 @@ SMALLEST: dict[str, Any] = {
     'shaft.SHAFT': 1,
 }
 """
-Constant of a section -> what remains with `--smallest`: the first entries, a slice of them, or the
-number of sessions or seconds.
+Constant of a section -> what remains with `--smallest`: the first entries, a slice of them, the
+number of sessions or seconds, or another recording.
 """
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
 
@@ -103,7 +104,7 @@ def reduced_to_smallest():
             module_name, constant = place.split('.')
             module = importlib.import_module(f'validation.{module_name}')
             entries = getattr(module, constant)
-            if entries is None or isinstance(entries, (int, float)):
+            if entries is None or isinstance(entries, (int, float, str)):
                 reduced = size
             elif isinstance(size, slice):
                 reduced = entries[size]
