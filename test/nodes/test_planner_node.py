@@ -388,7 +388,8 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
                 **FEW_PARAMETERS,
             },
             # The only diagnosis is that which the planner requests.
-            FEW_PARAMETERS | {'model_as_asked': True, 'diagnosis_period': 600.0},
+            FEW_PARAMETERS
+            | {'model_as_asked': True, 'diagnosis_period': 600.0, 'candidates': 'none'},
         )
         loop.spin_for(1.0)
         # Nothing moves before start.
