@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
 PIECE_MINUTES = 10.0

@@ -20,7 +20,7 @@ if __name__ == '__main__':
     sys.path.insert(0, str(ROOT))
 
 from benchmarks.bags import iterate, long_session, run_verb, write_bench_bag  # noqa: E402
-from imu_calibration.use_cases.resources import config_file  # noqa: E402
+from imu_calibration.api.resources import config_file  # noqa: E402
 from tools.smallest import add_smallest  # noqa: E402
 
 REPETITIONS = 5

@@ -27,6 +27,7 @@ import numpy as np  # noqa: E402
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]  # simulated worlds of the tests
 
+from imu_calibration.api.calibrate import calibrate_recordings  # noqa: E402
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
@@ -53,7 +54,6 @@ from imu_calibration.simulation.session import (
     random_values,
     simulate_session,
 )  # noqa: E402
-from imu_calibration.use_cases.calibrate import calibrate_recordings  # noqa: E402
 from tools.smallest import add_smallest  # noqa: E402
 
 from worlds.random_tables import random_table  # noqa: E402

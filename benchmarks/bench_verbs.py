@@ -31,7 +31,7 @@ from benchmarks.bags import (
     run_verb,
     write_bench_bag,
 )  # noqa: E402
-from imu_calibration.use_cases.resources import config_file  # noqa: E402
+from imu_calibration.api.resources import config_file  # noqa: E402
 from tools.smallest import add_smallest  # noqa: E402
 
 REPETITIONS = 3

@@ -10,14 +10,14 @@ import numpy as np
 import yaml
 from matplotlib.figure import Figure
 
+from imu_calibration.api.compensate import compensate_recording
+from imu_calibration.api.exporting import export_calibration
+from imu_calibration.api.noise import identify_recording
+from imu_calibration.api.recordings import Topics, source_of, temperatures
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.document import files
 from imu_calibration.document.exports.export import all_targets
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.use_cases.compensate import compensate_recording
-from imu_calibration.use_cases.exporting import export_calibration
-from imu_calibration.use_cases.noise import identify_recording
-from imu_calibration.use_cases.recordings import Topics, source_of, temperatures
 
 RESULT = 'result/calibration.yaml'
 UNIT = {'accelerometer': 'm/s²', 'gyroscope': 'rad/s'}

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from error_figures import before_and_after
 
+from imu_calibration.api.recordings import source_of
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import show_table
 from imu_calibration.cli.terminal import Terminal
@@ -17,7 +18,6 @@ from imu_calibration.core.units import error_text, significant
 from imu_calibration.document import files
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.preprocessing.window_finder import session_truth
-from imu_calibration.use_cases.recordings import source_of
 
 
 def verb(*arguments):

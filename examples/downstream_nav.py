@@ -24,12 +24,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from examples.processes import NodeProcesses  # noqa: E402
+from imu_calibration.api.calibrate import calibrate_recordings  # noqa: E402
 from imu_calibration.compensation.health import StopDetector  # noqa: E402
 from imu_calibration.core.samples import ImuSamples  # noqa: E402
 from imu_calibration.document import files  # noqa: E402
 from imu_calibration.effects.forward_equations import sensor_output  # noqa: E402
 from imu_calibration.kinematics.rotations import Reference, align  # noqa: E402
-from imu_calibration.use_cases.calibrate import calibrate_recordings  # noqa: E402
 from msg_adapters.imu_stream import ImuStream  # noqa: E402
 from msg_adapters.write import write_session  # noqa: E402
 

@@ -71,7 +71,7 @@ explains the terms.
 `planning`        choice of motions, a lower bound on the time of all plans, execution with stops
                   and their reason
 `report`          HTML reports
-`use_cases`       from files to files: functions of the command line and of notebooks
+`api`             from files to files: functions of the command line and of notebooks
 `cli`, `nodes`    the command line and the ROS 2 nodes; the package `msg_adapters` handles messages
                   and bags
 ================  ==================================================================================
@@ -80,7 +80,7 @@ explains the terms.
 # The name that type checkers regard as true; ``typing`` would need most of the time of this import
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from imu_calibration.use_cases.notebook import (
+    from imu_calibration.api.notebook import (
         calibrate,
         check,
         compensate,
@@ -112,7 +112,7 @@ def __getattr__(name: str) -> object:
     """
     if name not in __all__:
         raise AttributeError(f"module 'imu_calibration' has no attribute '{name}'")
-    from imu_calibration.use_cases import notebook
+    from imu_calibration.api import notebook
 
     return getattr(notebook, name)
 

@@ -110,7 +110,7 @@ def interface():
     return {
         'api/index.md': (
             '# Python interface\n\nPublic functions and classes, from their docstrings. Start with'
-            f' [use_cases](imu_calibration.use_cases.md).\n\n{links}\n'
+            f' [api](imu_calibration.api.md).\n\n{links}\n'
         )
     } | pages
 

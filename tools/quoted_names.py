@@ -23,8 +23,8 @@ SAME_ROLE = {
     'add_arguments': 'options of a verb',
     'run': 'action of a verb, or of a motion',
     'TARGETS': 'exports that a module adds to the registry',
-    'diagnose': 'a use case, and the same in a notebook',
-    'simulate': 'a use case, and the same in a notebook',
+    'diagnose': 'a function of `api`, and the same in a notebook',
+    'simulate': 'a function of `api`, and the same in a notebook',
 }
 """Public names that several modules define -> their one meaning."""
 QUOTED = re.compile(r'(?<!`)`([A-Za-z_][\w.]*)`(?!`)')

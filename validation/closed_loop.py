@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.choices import catalogue_of
+from imu_calibration.api.diagnose import diagnose
+from imu_calibration.api.simulate import replay, simulate
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.effects.base import AXES
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.choices import catalogue_of
-from imu_calibration.use_cases.diagnose import diagnose
-from imu_calibration.use_cases.simulate import replay, simulate
 from tools.smallest import add_smallest
 from validation.section import markdown_table
 

@@ -9,12 +9,12 @@ from functools import cache
 
 import numpy as np
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.reference_effects import FAMILY, total_lags
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from validation.section import Section, text
 from validation.shaft import read
 

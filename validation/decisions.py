@@ -20,14 +20,14 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
+from imu_calibration.api.calibrate import (
+    calibrate_recordings,  # noqa: E402
+    check_recording,  # noqa: E402
+)
 from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
 from imu_calibration.core.samples import SampleBlock  # noqa: E402
 from imu_calibration.core.units import DEG, MILLI_G  # noqa: E402
 from imu_calibration.kinematics.table import Table  # noqa: E402
-from imu_calibration.use_cases.calibrate import (
-    calibrate_recordings,  # noqa: E402
-    check_recording,  # noqa: E402
-)
 from validation.recordings import BY_HAND, data_folder, gravity_of, label, load  # noqa: E402
 from validation.section import Section  # noqa: E402
 

@@ -14,12 +14,12 @@ import time
 
 import numpy as np
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.compensate import compensate_recording
+from imu_calibration.api.diagnose import diagnose
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.compensate import compensate_recording
-from imu_calibration.use_cases.diagnose import diagnose
 from tools.smallest import add_smallest
 from validation import foreign_worlds
 from validation.foreign_worlds import PLACED, TABLE, UNPLACED, least_squares, make_world

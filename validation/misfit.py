@@ -5,10 +5,10 @@ A sensor with the decision `helps` improves in a second session, and warnings na
 do not.
 """
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.decision import HARM, HELPS, harmed
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from validation.section import Section, text
 
 SEED = 31

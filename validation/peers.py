@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.forward_equations import predict
@@ -18,7 +19,6 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 from validation.hand_peers import imu_calib, imu_tk, norm_fit, six_faces, turned
 from validation.second_opinions import Forward, fit_norm
 from validation.section import Section, text

@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.api.diagnose import Diagnosed, diagnose
+from imu_calibration.api.plan import LONGEST_SEPARATION, plan
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import (
     ImuSamples,
@@ -37,8 +39,6 @@ from imu_calibration.planning.planner import Plan
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.motion_primitives import FACES, pose, pose_deg, swing
-from imu_calibration.use_cases.diagnose import Diagnosed, diagnose
-from imu_calibration.use_cases.plan import LONGEST_SEPARATION, plan
 from tools.smallest import add_smallest
 
 from worlds.hiding import Recording, Sizes

@@ -33,13 +33,13 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Estimate and print."""
+    from imu_calibration.api.choices import log_options, readings_of
+    from imu_calibration.api.recordings import Topics, open_bag, source_of, sources_without
     from imu_calibration.between_imus.arm import estimate_arm
     from imu_calibration.cli.show import warn
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, visible_findings
     from imu_calibration.preprocessing.sample_recording import read_recording
-    from imu_calibration.use_cases.choices import log_options, readings_of
-    from imu_calibration.use_cases.recordings import Topics, open_bag, source_of, sources_without
 
     # Two topics, or two frames on one topic.
     if len(options.imu_topic) != 2:

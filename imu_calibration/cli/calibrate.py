@@ -24,10 +24,10 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
+    from imu_calibration.api.calibrate import calibrate_recordings
     from imu_calibration.cli.show import show_calibration, warn
     from imu_calibration.document import files
     from imu_calibration.document.calibration_text import calibration_mapping
-    from imu_calibration.use_cases.calibrate import calibrate_recordings
 
     options.require_place(options.bags)
     with files.output_folder(options.output) as folder:

@@ -42,12 +42,12 @@ def run(options: Options) -> VerbResult:
 
     Exit code 0 when it helps change sensor and no error has changed, otherwise 3.
     """
+    from imu_calibration.api.calibrate import check_recording
     from imu_calibration.cli.show import show_table, warn
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document import files
     from imu_calibration.preprocessing.checks import visible_findings
     from imu_calibration.report.answer_page import answer_page
-    from imu_calibration.use_cases.calibrate import check_recording
 
     page = options.page('check.html')
     result = check_recording(

@@ -75,7 +75,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
-    from imu_calibration.use_cases.compensate import compensate_recording
+    from imu_calibration.api.compensate import compensate_recording
     from msg_adapters.csv_log import is_text_log
 
     compensated = compensate_recording(options.bag, **options.arguments_for(compensate_recording))

@@ -28,10 +28,10 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Diagnose into a folder that can be written, print the findings, return the exit code."""
+    from imu_calibration.api.diagnose import diagnose
+    from imu_calibration.api.view import foxglove
     from imu_calibration.cli.show import warn
     from imu_calibration.document import files
-    from imu_calibration.use_cases.diagnose import diagnose
-    from imu_calibration.use_cases.view import foxglove
 
     if options.mcap:
         foxglove()  # before the work, not after it

@@ -12,7 +12,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Print one paragraph per effect."""
-    from imu_calibration.use_cases.choices import effect_rows
+    from imu_calibration.api.choices import effect_rows
 
     rows = effect_rows(options.catalogue)
     for row in rows:

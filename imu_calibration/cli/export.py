@@ -58,9 +58,9 @@ def run(options: Options) -> VerbResult:
     for name, argument in required.items():
         if not argument:
             raise InputError(f'an export must have {name}, none was given; give it, or see --list')
-    from imu_calibration.use_cases.choices import topics_of
-    from imu_calibration.use_cases.exporting import export_calibration
-    from imu_calibration.use_cases.recordings import refuse_stand
+    from imu_calibration.api.choices import topics_of
+    from imu_calibration.api.exporting import export_calibration
+    from imu_calibration.api.recordings import refuse_stand
 
     if not options.bag:
         refuse_stand(options.stand(), 'the recording --bag BAG, none was given; give both')

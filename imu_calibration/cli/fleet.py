@@ -38,7 +38,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Calibrate all units, continuing past a bad bag."""
+    from imu_calibration.api.choices import calibration_options
     from imu_calibration.cli.fleet_run import run_fleet
-    from imu_calibration.use_cases.choices import calibration_options
 
     return run_fleet(options, calibration_options(options.choices()))

@@ -8,6 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from imu_calibration.api.choices import provenance_with, require_same_inputs, topics_of
+from imu_calibration.api.recordings import (
+    Topics,
+    jobs_for,
+    on_cluster,
+    provenance_of,
+    source_of,
+)
+from imu_calibration.api.references import reference_of
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.parser import Options, VerbResult
 from imu_calibration.cli.show import show_table, warn
@@ -35,15 +44,6 @@ from imu_calibration.references.turntable.fleet import (
 )
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.report.page import render
-from imu_calibration.use_cases.choices import provenance_with, require_same_inputs, topics_of
-from imu_calibration.use_cases.recordings import (
-    Topics,
-    jobs_for,
-    on_cluster,
-    provenance_of,
-    source_of,
-)
-from imu_calibration.use_cases.references import reference_of
 from msg_adapters.storages import suffixes
 
 

@@ -30,8 +30,8 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Read, write, and list the parameters that the file lacks."""
+    from imu_calibration.api.exporting import import_calibration
     from imu_calibration.estimation.solution import HELD
-    from imu_calibration.use_cases.exporting import import_calibration
 
     calibration = import_calibration(options.file, **options.arguments_for(import_calibration))
     held = [name for name, status in calibration.requested.items() if status == HELD]

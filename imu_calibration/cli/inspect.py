@@ -12,9 +12,9 @@ from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
 from imu_calibration.core.errors import ImuCalibrationError, with_hint
 
 if TYPE_CHECKING:
+    from imu_calibration.api.inspect import RecordingSummary
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document.calibration import Calibration
-    from imu_calibration.use_cases.inspect import RecordingSummary
 
 EXAMPLES = ('session', 'session --table table.yaml')
 TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic', 'temperature'))
@@ -40,11 +40,11 @@ def run(options: Options) -> VerbResult:
 
     With a table also the motions and the parameters that they determine.
     """
+    from imu_calibration.api.inspect import inspect_imus, split_topics
+    from imu_calibration.api.recordings import existing
     from imu_calibration.cli.show import show_findings
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.preprocessing.checks import refuse
-    from imu_calibration.use_cases.inspect import inspect_imus, split_topics
-    from imu_calibration.use_cases.recordings import existing
 
     hints = options.hints()
     summaries = inspect_imus(existing(options.bag), options.stand(), options.choices())

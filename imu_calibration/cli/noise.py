@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 
 if TYPE_CHECKING:
-    from imu_calibration.use_cases.noise import IdentifiedNoise
+    from imu_calibration.api.noise import IdentifiedNoise
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
@@ -47,11 +47,11 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Options) -> VerbResult:
     """Identify into a folder that can be written, print the figures, return the exit code."""
     from imu_calibration.allan.document import noise_mapping
+    from imu_calibration.api.choices import require_same_inputs
+    from imu_calibration.api.noise import identify_recording, noise_provenance
+    from imu_calibration.api.recordings import existing
     from imu_calibration.cli.show import warn
     from imu_calibration.document import files
-    from imu_calibration.use_cases.choices import require_same_inputs
-    from imu_calibration.use_cases.noise import identify_recording, noise_provenance
-    from imu_calibration.use_cases.recordings import existing
 
     choices = {}
     for name, value in options.arguments_for(identify_recording).items():

@@ -19,8 +19,8 @@ from imu_calibration.cli.terminal import Terminal, wrapped
 from imu_calibration.core.errors import ERROR_KEYS, did_you_mean
 
 if TYPE_CHECKING:
-    from imu_calibration.use_cases.choices import Choices
-    from imu_calibration.use_cases.recordings import Stand
+    from imu_calibration.api.choices import Choices
+    from imu_calibration.api.recordings import Stand
 
 VERBS = {
     'inspect': (
@@ -340,13 +340,13 @@ class Options(argparse.Namespace):
         """Return the table or arm, or None."""
         if self.urdf is None and self.imu_link is None:
             return self.table
-        from imu_calibration.use_cases.recordings import Arm
+        from imu_calibration.api.recordings import Arm
 
         return Arm(self.urdf, self.imu_link, self.table, self.up, self.allow_xacro)
 
     def choices(self) -> Choices:
-        """Return the choices for a use case."""
-        from imu_calibration.use_cases.choices import Choices
+        """Return the choices for a function of `api`."""
+        from imu_calibration.api.choices import Choices
 
         choices = {}
         for name, value in vars(self).items():
@@ -379,7 +379,7 @@ class Options(argparse.Namespace):
         The folder is refused if it holds the result of another verb or of other inputs.
         """
         if not self.force:
-            from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
+            from imu_calibration.api.choices import provenance_with, require_same_inputs
 
             require_same_inputs(
                 self.output,

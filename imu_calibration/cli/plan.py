@@ -9,8 +9,8 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
 
 if TYPE_CHECKING:
-    from imu_calibration.use_cases.plan import Planned
-    from imu_calibration.use_cases.recordings import Stand
+    from imu_calibration.api.plan import Planned
+    from imu_calibration.api.recordings import Stand
 
 EXAMPLES = ('--table table.yaml --output plan', '--by-hand --output plan')
 
@@ -98,9 +98,9 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Plan into a folder that can be written, print the prediction, return the exit code."""
+    from imu_calibration.api.plan import by_hand, plan, require_no_plan
     from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
-    from imu_calibration.use_cases.plan import by_hand, plan, require_no_plan
 
     require_no_plan(options.output, report=not options.no_report, force=options.force)
     with files.output_folder(options.output) as folder:
@@ -158,7 +158,7 @@ def _stand(options: Options) -> 'Stand | None':
 
 def _show(planned: 'Planned', folder: Path) -> None:
     """Print the first motions with their ends, the prediction, and where the files are."""
-    from imu_calibration.use_cases.plan import plan_summary
+    from imu_calibration.api.plan import plan_summary
 
     plan = planned.plan
     limit = plan.most_printed  # None: all motions are printed

@@ -12,7 +12,7 @@ from imu_calibration.document.calibration import NUMBER_COLUMNS, PARAMETER_HEADI
 from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding, Severity
 
 if TYPE_CHECKING:
-    from imu_calibration.use_cases.calibrate import Calibrated
+    from imu_calibration.api.calibrate import Calibrated
 
 
 def show_table(

@@ -99,7 +99,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Simulate and write."""
-    from imu_calibration.use_cases.simulate import replay, simulate
+    from imu_calibration.api.simulate import replay, simulate
 
     if options.replay is None:
         simulated = simulate(

@@ -31,8 +31,8 @@ def run(options: Options) -> VerbResult:
     """
     Write the file, print the layout to open it with and the missing parts; return the exit code.
     """
-    from imu_calibration.use_cases.resources import config_file
-    from imu_calibration.use_cases.view import foxglove, view
+    from imu_calibration.api.resources import config_file
+    from imu_calibration.api.view import foxglove, view
 
     foxglove()  # before the work, not after it
     options.require_new(options.output)

@@ -24,6 +24,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from imu_calibration.api.choices import calibration_options, provenance_with
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSession, LiveSettings
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
@@ -49,7 +50,6 @@ from imu_calibration.nodes.robot_stand import (
     words_of,
 )
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.use_cases.choices import calibration_options, provenance_with
 from msg_adapters.layout import Packed
 from msg_adapters.live import LiveGatherer
 from msg_adapters.write import encode_imu

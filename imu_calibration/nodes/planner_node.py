@@ -26,6 +26,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.core.settings import setting
@@ -75,7 +76,6 @@ from imu_calibration.planning.motion_library import up_at
 from imu_calibration.planning.planner import Planner, make_planner
 from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import decode_joints, find_joint_layout
 from msg_adapters.layout import MessageError, Packed
 

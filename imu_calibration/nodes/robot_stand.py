@@ -213,7 +213,7 @@ def live_reference(
 ) -> 'MotionReference':
     """Return the reference that a node's parameters describe; arguments as for `chain_of`."""
     # Here, because simulator_node does not need it.
-    from imu_calibration.use_cases.references import reference_of
+    from imu_calibration.api.references import reference_of
 
     return reference_of(chain_of(node, robot, table_file, **known))
 

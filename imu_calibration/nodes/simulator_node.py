@@ -21,6 +21,7 @@ from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
@@ -43,7 +44,6 @@ from imu_calibration.simulation.session import (
     true_imu,
 )
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import trajectory_from_message
 from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature

@@ -5,9 +5,9 @@ import pytest
 from refusal import refused
 
 from imu_calibration.allan.document import noise_from_text, noise_to_text
+from imu_calibration.api.noise import identify_recording
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
-from imu_calibration.use_cases.noise import identify_recording
 
 from worlds.noise_worlds import identifying
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
+from imu_calibration.api.recordings import Topics, source_of
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
@@ -24,7 +25,6 @@ from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.references.gravity.pose_readings import prove_hand_readings
 from imu_calibration.references.turntable.held_out_windows import HeldOutWindows
-from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.write import write_session
 
 from worlds.hand_sessions import GRAVITY, simulate

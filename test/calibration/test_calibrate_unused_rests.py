@@ -6,9 +6,9 @@ Sds of biases then come from motion alone.
 
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.document.decision import WARNING
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.physics import make_session
 

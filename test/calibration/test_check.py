@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
 from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.cli.main import main
 from imu_calibration.core.documents import to_text
@@ -17,7 +18,6 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.outcome import shortcomings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.window_statistics import Regime
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from msg_adapters.write import write_session
 
 from worlds.candidates import FEW

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.calibration.coverage import (
     DIRECTIONS,
     MIN_CELL_WORTH,
@@ -48,7 +49,6 @@ from imu_calibration.references.gravity.live_poses import (
 )
 from imu_calibration.references.turntable.standard_motions import MOTIONS, motions_about
 from imu_calibration.references.turntable.table_coverage import table_coverage
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY

@@ -7,13 +7,13 @@ Parameters that it does not separate are fixed, and other attitudes are unproven
 import numpy as np
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.decision import UNPROVEN, decide, reason_of
 from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.misfit_worlds import SHAFT, make_pair
 

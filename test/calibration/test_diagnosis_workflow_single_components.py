@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from imu_calibration.api.diagnose import diagnose
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.diagnose import diagnose
 
 from worlds.hide_and_seek_worlds import by_convention
 from worlds.physics import make_session

@@ -7,10 +7,10 @@ a sentence states that it does not.
 
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.decision import HELPS
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.candidates import FEW
 from worlds.misfit_coverage import COARSE

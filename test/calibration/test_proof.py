@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.document.decision import HELPS, decide, reason_of, worse_regimes
 from imu_calibration.document.proof_entry import RegimeErrors
 from imu_calibration.effects.catalogue import CATALOGUE
@@ -16,7 +17,6 @@ from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldOut
 from imu_calibration.references.turntable.window_statistics import Regime, moving_pieces
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.misfit_worlds import make_pair
 

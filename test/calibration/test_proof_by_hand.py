@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.calibration.proof import prove
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS, decide
@@ -16,7 +17,6 @@ from imu_calibration.references.gravity.held_out_poses import (
     folds_by_hand,
     values_without,
 )
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, NOMINAL, simulate

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
@@ -32,8 +34,6 @@ from imu_calibration.references.turntable.standard_motions import (
     motions_about,
 )
 from imu_calibration.references.turntable.window_statistics import Regime
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.compensation_cases import random_calibration
 from worlds.misfit_coverage import COARSE

@@ -11,15 +11,15 @@ from refusal import refused
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from imu_calibration.api.plan import notes_on
+from imu_calibration.api.recordings import Arm, Topics, table_of
+from imu_calibration.api.simulate import simulate
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from imu_calibration.document.files import read_calibration, read_robot_description
 from imu_calibration.kinematics.urdf import up_of
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.use_cases.plan import notes_on
-from imu_calibration.use_cases.recordings import Arm, Topics, table_of
-from imu_calibration.use_cases.simulate import simulate
 from msg_adapters.bag import DESCRIPTION_TOPIC, STATIC_TOPIC
 from msg_adapters.write import write_session
 

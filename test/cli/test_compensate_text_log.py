@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv, read_logs
 from msg_adapters.write import write_session

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_copying import raw_messages
 
+from imu_calibration.api.compensate import compensate_recording as compensate_samples
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.core.errors import InputError
@@ -16,7 +17,6 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.signal_history import ThermalBranch
-from imu_calibration.use_cases.compensate import compensate_recording as compensate_samples
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS
 from msg_adapters.write import write_session

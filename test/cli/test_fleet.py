@@ -13,6 +13,7 @@ import pytest
 import yaml
 from refusal import refused
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.cli.fleet_run import fleet_unit_rows, summary_html
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
@@ -23,7 +24,6 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.fleet import UnitResult, summarise
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
 TABLE_FILE = config_file('table_simulated.yaml')

@@ -103,7 +103,7 @@ def test_an_inspection_imports_neither_the_search_nor_slow_libraries():
         'rclpy',
         'jinja2',
         'imu_calibration.references.gravity.model_selection',
-        'imu_calibration.use_cases.calibrate',
+        'imu_calibration.api.calibrate',
     }
 
 

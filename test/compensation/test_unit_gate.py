@@ -7,13 +7,13 @@ import pytest
 from refusal import refused
 from test_live_compensation import field, imu_samples, messages
 
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.compensation.unit_gate import MOST_READINGS, GravityScale, UnitGate
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings, combined
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.base import Role
 from imu_calibration.nodes.message_compensation import WITHHELD, LiveCompensation
-from imu_calibration.use_cases.compensate import compensate_recording
 from validation.imu_messages import patch_imu
 
 from worlds.compensation_cases import random_calibration

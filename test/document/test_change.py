@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.change import changes_since
 from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.physics import make_session
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.exporting import import_calibration
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.exports.export import export, find_target
-from imu_calibration.use_cases.exporting import import_calibration
 from msg_adapters.csv_log import autopilot_of
 
 from worlds.compensation_cases import random_calibration

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from imu_calibration.api.inspect import RecordingSummary
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT, dropped_text
@@ -28,7 +29,6 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding
 from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.references.turntable.table_reference import TableReference
-from imu_calibration.use_cases.inspect import RecordingSummary
 
 PROOF = {
     sensor: ProofEntry(1.0, 0.1, (0.05, 0.2), unit=unit, windows=30)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.calibration.diagnosis.findings import sentence
 from imu_calibration.cli.main import main
 from imu_calibration.core import documents
@@ -32,7 +33,6 @@ from imu_calibration.simulation.session import (
     random_values,
     simulate_session,
 )
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.candidates import FEW
 from worlds.random_motion import random_reference
@@ -201,7 +201,7 @@ def test_one_of_unknown_size_cannot_be_simulated_by_name_and_what_to_write_is_sa
 
 
 def test_a_choice_may_be_a_mapping_too():
-    from imu_calibration.use_cases.choices import catalogue_of
+    from imu_calibration.api.choices import catalogue_of
 
     found = catalogue_of(documents.from_text(MINE)['effects'])
     assert ('gyroscope', 'gyro_warm_force') in found.effects() and catalogue_of(None) is not found
@@ -343,7 +343,7 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
 def test_the_node_reads_the_file(mine):
     program = (
         'import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import'
-        ' CalibrationNode\nfrom imu_calibration.use_cases.resources import config_file\ngiven ='
+        ' CalibrationNode\nfrom imu_calibration.api.resources import config_file\ngiven ='
         ' {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n       '
         '  "gyroscope_model": "bias+matrix+gyro_warm_force"}\nrclpy.init(args=["--ros-args", *(part'
         ' for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\nnode ='

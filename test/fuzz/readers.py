@@ -18,6 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from imu_calibration.allan.document import counts, noise_from_text, noise_to_text, rows
 from imu_calibration.allan.identify import figures_of, identify_noise
+from imu_calibration.api.inspect import imu_topics_of
+from imu_calibration.api.recordings import Topics
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import InputError
@@ -35,8 +37,6 @@ from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.references.gravity.sample_store import HandStore
 from imu_calibration.references.turntable.collector import from_bytes, to_bytes
 from imu_calibration.references.turntable.live_windows import LiveCalibration
-from imu_calibration.use_cases.inspect import imu_topics_of
-from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.bag import STRING_TYPE, TF_TYPE, description_in, open_recording, static_transforms
 from msg_adapters.csv_log import read_csv
 from msg_adapters.decode import Decoder, JointDecoder

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.files import read_table
 from imu_calibration.kinematics.chain import reference_motion, tilt, with_axis_angles
@@ -21,7 +22,6 @@ from imu_calibration.kinematics.joint import TYPES, Joint, Mimic
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import earth_rate_n, normal_gravity, skew
 from imu_calibration.kinematics.table import Table, axis_error_directions
-from imu_calibration.use_cases.resources import config_file
 
 THREE_AXES = {
     'joints': [

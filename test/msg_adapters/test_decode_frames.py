@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import OTHER_FRAME, FrameChoice

@@ -8,10 +8,10 @@ import pytest
 from refusal import refused
 from test_mcap_file import message, topic_records, write_file
 
+from imu_calibration.api import inspect
+from imu_calibration.api.inspect import MOST_IMUS, imu_topics_of
+from imu_calibration.api.recordings import Topics
 from imu_calibration.core.errors import InputError
-from imu_calibration.use_cases import inspect
-from imu_calibration.use_cases.inspect import MOST_IMUS, imu_topics_of
-from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.bag import LISTED_TOPICS, open_recording
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.recordings import name_of
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
@@ -14,8 +16,6 @@ from imu_calibration.preprocessing.sensor_join import (
     interpolated,
     join_sensors,
 )
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.recordings import name_of
 from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv, read_logs
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.files import read_table
 from imu_calibration.nodes import calibration_worker
@@ -15,7 +16,6 @@ from imu_calibration.nodes.calibration_worker import IDLE, CalibrationWorker, Se
 from imu_calibration.nodes.diagnosis_thread import Listeners
 from imu_calibration.preprocessing.stream_watch import SILENT_AFTER
 from imu_calibration.references.turntable.live_windows import LiveCalibration
-from imu_calibration.use_cases.resources import config_file
 
 from worlds.physics import make_session
 

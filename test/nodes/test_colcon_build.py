@@ -97,7 +97,7 @@ def test_the_ament_index_finds_the_package_with_its_files(workspace):
 
 def test_the_code_and_its_files_come_from_the_workspace(workspace):
     script = (
-        'import imu_calibration, msg_adapters; from imu_calibration.use_cases.resources import'
+        'import imu_calibration, msg_adapters; from imu_calibration.api.resources import'
         ' config_file; print(imu_calibration.__file__, msg_adapters.__file__,'
         ' config_file("tolerances.yaml"))'
     )

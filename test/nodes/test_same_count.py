@@ -3,13 +3,13 @@
 import pytest
 from test_calibration_attacked import gathered, send
 
+from imu_calibration.api.exporting import export_calibration
 from imu_calibration.calibration.result import summary
 from imu_calibration.document.files import read_calibration
 from imu_calibration.document.outcome import missing, parameter_count, shortcomings
 from imu_calibration.nodes.calibration_node import CalibrationNode
 from imu_calibration.nodes.compensator_node import CompensatorNode
 from imu_calibration.report.calibration_sections import calibration_report
-from imu_calibration.use_cases.exporting import export_calibration
 
 from ros.live_station import TABLE
 from worlds.live_sessions import make_session

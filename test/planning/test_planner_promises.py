@@ -8,6 +8,10 @@ import pytest
 import yaml
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.plan import class_in
+from imu_calibration.api.recordings import table_of
+from imu_calibration.api.resources import config_file
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
@@ -34,10 +38,6 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.plan import class_in
-from imu_calibration.use_cases.recordings import table_of
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import JOINT_TRAJECTORY_TYPE
 
 from worlds.arms import SEVEN_AXES

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
 TABLE_FILE = config_file('table_simulated.yaml')

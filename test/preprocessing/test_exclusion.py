@@ -4,6 +4,10 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.inspect import inspect_imus
+from imu_calibration.api.noise import identify_recording
+from imu_calibration.api.references import inputs_of
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.preprocessing.exclusion import (
@@ -14,10 +18,6 @@ from imu_calibration.preprocessing.exclusion import (
     exclusions_of_units,
     parse_exclusions,
 )
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.inspect import inspect_imus
-from imu_calibration.use_cases.noise import identify_recording
-from imu_calibration.use_cases.references import inputs_of
 
 from worlds.hand_sessions import GRAVITY
 from worlds.physics_hand import hold_and_turn
@@ -80,7 +80,7 @@ def test_a_time_outside_of_the_recording_is_refused():
         list(WithoutExcluded([SampleBlock(samples())], parse_exclusions('9:12')))
 
 
-def test_the_use_cases_leave_it_out():
+def test_the_functions_for_files_leave_it_out():
     imu = hold_and_turn(17, n_poses=14, rate_hz=80.0)[0]
     shaken = imu.force_s.copy()
     time = (imu.stamp_ns - imu.stamp_ns[0]) * 1e-9

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.diagnose import diagnose
 from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
@@ -23,8 +25,6 @@ from imu_calibration.preprocessing.on_table import (
 )
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.turntable.live_windows import LiveCalibration
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.diagnose import diagnose
 
 from worlds.misfit_worlds import make_pair
 

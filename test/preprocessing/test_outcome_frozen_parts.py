@@ -7,6 +7,7 @@ import pytest
 from refusal import refused
 
 from imu_calibration.allan.identify import figures_of, identify_noise
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.calibration.check import check_errors
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -18,7 +19,6 @@ from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 from imu_calibration.references.gravity.pose_readings import errors_by_hand
 from imu_calibration.references.turntable.collector import GatherStep
-from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.calibrated_by_hand import OPTIONS, calibrated
 from worlds.hand_sessions import GRAVITY

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from refusal import refused
 
+from imu_calibration.api.inspect import inspect_recording
+from imu_calibration.api.recordings import Topics, source_of
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError
@@ -20,8 +22,6 @@ from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.references.turntable import needs
 from imu_calibration.references.turntable.table_reference import TableReference
-from imu_calibration.use_cases.inspect import inspect_recording
-from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.bag import Recording
 
 from worlds.calibrated import calibrated_by_hand, calibrated_on_table

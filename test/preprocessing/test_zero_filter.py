@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.preprocessing.zero_filter import ZeroFilter
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 

@@ -20,7 +20,7 @@ FRONT_DOOR = ROOT / 'imu_calibration/__init__.py'
 Imports the names for notebooks when they are asked for; test_notebook sees to it that it imports
 nothing by itself.
 """
-EDGE = {'cli', 'nodes', 'use_cases', '__main__'}
+EDGE = {'cli', 'nodes', 'api', '__main__'}
 ROS = {
     'rclpy',
     'ros2cli',
@@ -175,7 +175,7 @@ ORDER = (
     ('between_imus',),
     ('planning',),
     ('report',),
-    ('use_cases',),
+    ('api',),
     ('cli', 'nodes'),
 )
 """Packages from the ground up: each may import what stands in an earlier row."""

@@ -20,10 +20,10 @@ from catkin_pkg.package import parse_package
 from refusal import refused
 
 import imu_calibration
+from imu_calibration.api import resources
 from imu_calibration.cli.parser import VERBS
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.use_cases import resources
 from msg_adapters.bag import DEFAULT_TOPICS
 from msg_adapters.definitions import standard_definition
 from msg_adapters.imu import IMU_TYPE

@@ -57,7 +57,7 @@ RUN_ELSEWHERE = {
     'examples/demo.py': 'make demo-check',
     'examples/downstream_nav.py': 'test/papers/test_reproduce_examples.py',
     'examples/live_demo.py': 'test/nodes/test_live_demo.py',
-    'examples/notebook.py': 'test/use_cases/test_notebook.py runs its cells',
+    'examples/notebook.py': 'test/api/test_notebook.py runs its cells',
     'examples/reproduce_avrutov2017.py': 'test/papers/test_reproduce_examples.py',
     'examples/reproduce_zhang2017.py': 'test/papers/test_reproduce_examples.py',
     'tools/demo_figures.py': 'make demo-check',
@@ -70,7 +70,7 @@ RUN_ELSEWHERE = {
 }
 """Script -> command, script or test of `.ci/run` that runs it; not run a second time here."""
 SECTION_ELSEWHERE = {
-    'arm_live': 'test/use_cases/test_validation.py::test_one_imu_predicts_another_live',
+    'arm_live': 'test/api/test_validation.py::test_one_imu_predicts_another_live',
 }
 """Section -> test that runs it; not run a second time here."""
 

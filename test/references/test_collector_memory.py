@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
+from imu_calibration.api.resources import config_file
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
@@ -15,7 +16,6 @@ from imu_calibration.references.turntable.collector import GatherStep
 from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
-from imu_calibration.use_cases.resources import config_file
 
 TABLE = Table.from_mapping(
     yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8'))

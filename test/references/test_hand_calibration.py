@@ -10,6 +10,7 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.api.choices import calibration_options
 from imu_calibration.calibration.live import LiveByHandSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError, NotObservableError
@@ -31,7 +32,6 @@ from imu_calibration.references.gravity.hand_parameters import (
     hand_options,
 )
 from imu_calibration.references.rows.group_variances import estimate_group_variances, student_factor
-from imu_calibration.use_cases.choices import calibration_options
 
 from worlds.hand_scatter import differences, errors_by_hand, hand_scatter
 from worlds.hand_sessions import (

@@ -7,6 +7,9 @@ import pytest
 from refusal import refused
 from scipy.ndimage import gaussian_filter1d
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.inspect import inspect_recording
+from imu_calibration.api.recordings import Topics
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -22,9 +25,6 @@ from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY
 from imu_calibration.references.gravity.gravity_reference import GravityReference
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.references.gravity.sway import sway_at_rest
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.inspect import inspect_recording
-from imu_calibration.use_cases.recordings import Topics
 
 from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate

@@ -6,6 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.inspect import inspect_recording
+from imu_calibration.api.recordings import Topics
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.show import warn
 from imu_calibration.core.samples import SampleBlock
@@ -21,9 +24,6 @@ from imu_calibration.simulation.session import (
     random_values,
     simulate_session,
 )
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.inspect import inspect_recording
-from imu_calibration.use_cases.recordings import Topics
 
 from worlds.calibrated import calibrated_on_table
 from worlds.candidates import FEW

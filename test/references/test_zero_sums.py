@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from imu_calibration.api.calibrate import calibrate_recordings
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import Role
-from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api import simulate as use_case
+from imu_calibration.api.resources import config_file
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
@@ -15,8 +17,6 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.replay import ReplayNoise, simulate_on_recording
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
-from imu_calibration.use_cases import simulate as use_case
-from imu_calibration.use_cases.resources import config_file
 
 MODEL = SensorModel(
     ('bias', 'matrix', 'accel_size_effect', 'accel_thermal_bias'),

@@ -39,7 +39,7 @@ def row_of(seed, kind, noise, cause=None, *, candidates=None, **options):
     """
     Return (row, bias and matrix of both sensors as estimated).
 
-    `candidates` as for `use_cases.diagnose.diagnose`, `options` as for `physics.make_session`.
+    `candidates` as for `api.diagnose.diagnose`, `options` as for `physics.make_session`.
     """
     recording = record(seed, None, noise, through_bag=False, cause=cause, **options)
     start = time.process_time()

@@ -13,7 +13,7 @@ def diagnose(windows, table, model, *, bias_processes=None, candidates=None):
     """
     Return the Diagnosis of the errors of a model on the windows of one recording, in order.
 
-    Unused ones serve dead reckoning. `candidates` as for `use_cases.diagnose.diagnose`.
+    Unused ones serve dead reckoning. `candidates` as for `api.diagnose.diagnose`.
     """
     model = with_candidates(model, candidates)
     found = build_diagnosis(table, inquire(windows, table, model, bias_processes=bias_processes))

@@ -5,13 +5,13 @@ from itertools import combinations
 
 import numpy as np
 
+from imu_calibration.api.diagnose import diagnose as diagnose_block
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.selection.investigation import investigate
 from imu_calibration.references.turntable.selection.window_gain import heldout_gain
-from imu_calibration.use_cases.diagnose import diagnose as diagnose_block
 
 from worlds import physics
 from worlds.beyond_catalogue import NOTHING, hidden_row, row_of

@@ -355,7 +355,7 @@ class KnownTurn:
 
 @dataclass(frozen=True)
 class HandOptions:
-    """Options passed from the use cases to the equations."""
+    """Options passed from `api` to the equations."""
 
     gravity: float = STANDARD_GRAVITY
     """Local gravity, m/s^2."""

@@ -11,6 +11,16 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from imu_calibration.api.choices import Choices, catalogue_of
+from imu_calibration.api.recordings import (
+    LIKELY_LINK,
+    Stand,
+    name_of,
+    options_of,
+    table_of,
+)
+from imu_calibration.api.references import inputs_of
+from imu_calibration.api.resources import config_file
 from imu_calibration.core import documents
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
@@ -32,16 +42,6 @@ from imu_calibration.simulation.session import (
     true_imu,
 )
 from imu_calibration.simulation.session import simulate_session as run_session
-from imu_calibration.use_cases.choices import Choices, catalogue_of
-from imu_calibration.use_cases.recordings import (
-    LIKELY_LINK,
-    Stand,
-    name_of,
-    options_of,
-    table_of,
-)
-from imu_calibration.use_cases.references import inputs_of
-from imu_calibration.use_cases.resources import config_file
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
     from typing_extensions import Unpack

@@ -12,6 +12,20 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from imu_calibration.api.choices import (
+    Choices,
+    made_from,
+    provenance_with,
+    readings_for,
+    require_same_inputs,
+)
+from imu_calibration.api.recordings import (
+    Stand,
+    jobs_for,
+    name_of,
+    provenance_of,
+)
+from imu_calibration.api.references import inputs_of
 from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.check import check_errors
 from imu_calibration.calibration.check_result import CheckResult
@@ -30,20 +44,6 @@ from imu_calibration.document.outcome import JudgedResult
 from imu_calibration.document.proof_entry import EarlierErrors, Proof
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import (
-    Choices,
-    made_from,
-    provenance_with,
-    readings_for,
-    require_same_inputs,
-)
-from imu_calibration.use_cases.recordings import (
-    Stand,
-    jobs_for,
-    name_of,
-    provenance_of,
-)
-from imu_calibration.use_cases.references import inputs_of
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
     from typing_extensions import Unpack

@@ -9,12 +9,12 @@ import pytest
 import yaml
 from refusal import refused
 
+from imu_calibration.api.choices import made_from, provenance_with, require_same_inputs
+from imu_calibration.api.recordings import Arm
+from imu_calibration.api.resources import config_file
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.document import files
-from imu_calibration.use_cases.choices import made_from, provenance_with, require_same_inputs
-from imu_calibration.use_cases.recordings import Arm
-from imu_calibration.use_cases.resources import config_file
 
 from worlds.candidates import FEW
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
+from imu_calibration.api.compensate import compensate_recording
+from imu_calibration.api.inspect import imu_topics_of
+from imu_calibration.api.recordings import Topics
 from imu_calibration.compensation.unit_gate import UnitGate
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings, SensorUnit, combined, unit_of
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
-from imu_calibration.use_cases.compensate import compensate_recording
-from imu_calibration.use_cases.inspect import imu_topics_of
-from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.csv_log import LogOptions
 
 from worlds.hand_sessions import GRAVITY, simulate, unpack

@@ -8,6 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.allan.figures import NoiseFigures
+from imu_calibration.api.choices import log_options, noise_of, readings_for
+from imu_calibration.api.recordings import (
+    Topics,
+    existing,
+    open_bag,
+    read_split,
+    temperatures,
+)
 from imu_calibration.compensation.compensate import Corrected, Transfer
 from imu_calibration.compensation.stream import (
     CompensationStream,
@@ -38,14 +46,6 @@ from imu_calibration.preprocessing.recording_evidence import EvidenceGatherer
 from imu_calibration.preprocessing.scan import FrozenSearch
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.preprocessing.value_checks import rate_unit, refuse_units
-from imu_calibration.use_cases.choices import log_options, noise_of, readings_for
-from imu_calibration.use_cases.recordings import (
-    Topics,
-    existing,
-    open_bag,
-    read_split,
-    temperatures,
-)
 from msg_adapters.bag import Recording
 from msg_adapters.csv_log import (
     corrected_log,

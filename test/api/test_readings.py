@@ -11,14 +11,14 @@ import pytest
 import yaml
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings, parse_axes, unit_of
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.effects.base import Role
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
-from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
+from imu_calibration.api.inspect import inspect_recording
+from imu_calibration.api.recordings import Topics
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.table_reference import TableReference
-from imu_calibration.use_cases.inspect import inspect_recording
-from imu_calibration.use_cases.recordings import Topics
 
 from worlds.physics import make_session
 

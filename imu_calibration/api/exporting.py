@@ -4,14 +4,8 @@ from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
-from imu_calibration.core.readings import combined
-from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.exports.export import Export, export, find_target
-from imu_calibration.document.exports.loss import TrialMotion, import_file
-from imu_calibration.use_cases.choices import log_options
-from imu_calibration.use_cases.recordings import (
+from imu_calibration.api.choices import log_options
+from imu_calibration.api.recordings import (
     Stand,
     Topics,
     name_of,
@@ -19,7 +13,13 @@ from imu_calibration.use_cases.recordings import (
     sources_without,
     temperatures,
 )
-from imu_calibration.use_cases.references import reference_of
+from imu_calibration.api.references import reference_of
+from imu_calibration.core.readings import combined
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.exports.export import Export, export, find_target
+from imu_calibration.document.exports.loss import TrialMotion, import_file
 
 
 def export_calibration(

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.compensate import compensate_recording
+from imu_calibration.api.inspect import inspect_recording
+from imu_calibration.api.noise import identify_recording
+from imu_calibration.api.recordings import Topics
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.references.gravity.gravity_reference import GravityReference
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.compensate import compensate_recording
-from imu_calibration.use_cases.inspect import inspect_recording
-from imu_calibration.use_cases.noise import identify_recording
-from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration

@@ -11,6 +11,15 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
+from imu_calibration.api.choices import calibration_options, topics_of
+from imu_calibration.api.recordings import (
+    Stand,
+    Topics,
+    open_bag,
+    source_of,
+    sources_without,
+)
+from imu_calibration.api.references import reference_of
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.reference import MotionReference
 from imu_calibration.calibration.result import CalibrationResult
@@ -22,15 +31,6 @@ from imu_calibration.preprocessing.checks import unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
 from imu_calibration.references.gravity.gravity_reference import GravityReference
-from imu_calibration.use_cases.choices import calibration_options, topics_of
-from imu_calibration.use_cases.recordings import (
-    Stand,
-    Topics,
-    open_bag,
-    source_of,
-    sources_without,
-)
-from imu_calibration.use_cases.references import reference_of
 from msg_adapters.bag import Recording, list_topics
 from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.compensate import compensate_recording
+from imu_calibration.api.references import inputs_of
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.use_cases.compensate import compensate_recording
-from imu_calibration.use_cases.references import inputs_of
 from msg_adapters.bag import list_topics, open_recording
 from msg_adapters.csv_log import LogOptions
 from msg_adapters.write import write_session

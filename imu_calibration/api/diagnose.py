@@ -6,6 +6,13 @@ from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING
 
+from imu_calibration.api.choices import (
+    Choices,
+    provenance_with,
+    require_same_inputs,
+)
+from imu_calibration.api.recordings import Stand
+from imu_calibration.api.references import inputs_of
 from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult
 from imu_calibration.core.progress import report
@@ -15,13 +22,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.outcome import JudgedResult
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import (
-    Choices,
-    provenance_with,
-    require_same_inputs,
-)
-from imu_calibration.use_cases.recordings import Stand
-from imu_calibration.use_cases.references import inputs_of
 
 if TYPE_CHECKING:  # in the standard library from Python 3.11 on
     from typing_extensions import Unpack
@@ -115,7 +115,7 @@ class Diagnosed(JudgedResult):
         The signals are measured and simulated ones (`overlay_topics`). An existing file is replaced
         only with `force`.
         """
-        from imu_calibration.use_cases.view import mcap_bytes, overlay_topics
+        from imu_calibration.api.view import mcap_bytes, overlay_topics
 
         files.require_new(path, force=force)
         diagnosis = self.result.diagnosis

@@ -13,6 +13,8 @@ from imu_calibration.allan.document import (
 )
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
+from imu_calibration.api.choices import log_options, readings_of, require_same_inputs
+from imu_calibration.api.recordings import Topics, provenance_of, source_of, sources_without
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock
@@ -20,8 +22,6 @@ from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import visible_findings
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import log_options, readings_of, require_same_inputs
-from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of, sources_without
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.api.choices import calibration_options
+from imu_calibration.api.recordings import Stand
+from imu_calibration.api.references import reference_of
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core import documents
 from imu_calibration.core.errors import DocumentError, InputError
@@ -43,9 +46,6 @@ from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.turntable.table_calibration import calibration_of_saved
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import calibration_options
-from imu_calibration.use_cases.recordings import Stand
-from imu_calibration.use_cases.references import reference_of
 
 ACCUMULATOR = '.npz'
 """Suffix of the accumulator that a live session saves with its calibration."""

@@ -13,24 +13,24 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 from numpy.typing import ArrayLike
 
+from imu_calibration.api.calibrate import Calibrated
+from imu_calibration.api.calibrate import calibrate_recordings as _calibrate
+from imu_calibration.api.calibrate import check_recording as _check
+from imu_calibration.api.choices import Choices
+from imu_calibration.api.compensate import Compensated
+from imu_calibration.api.compensate import compensate_recording as _compensate
+from imu_calibration.api.diagnose import diagnose as _diagnose
+from imu_calibration.api.inspect import RecordingSummary
+from imu_calibration.api.inspect import inspect_imus as _inspect
+from imu_calibration.api.noise import IdentifiedNoise
+from imu_calibration.api.noise import identify_recording as _noise
+from imu_calibration.api.recordings import Stand
+from imu_calibration.api.simulate import simulate as _simulate
 from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.use_cases.calibrate import Calibrated
-from imu_calibration.use_cases.calibrate import calibrate_recordings as _calibrate
-from imu_calibration.use_cases.calibrate import check_recording as _check
-from imu_calibration.use_cases.choices import Choices
-from imu_calibration.use_cases.compensate import Compensated
-from imu_calibration.use_cases.compensate import compensate_recording as _compensate
-from imu_calibration.use_cases.diagnose import diagnose as _diagnose
-from imu_calibration.use_cases.inspect import RecordingSummary
-from imu_calibration.use_cases.inspect import inspect_imus as _inspect
-from imu_calibration.use_cases.noise import IdentifiedNoise
-from imu_calibration.use_cases.noise import identify_recording as _noise
-from imu_calibration.use_cases.recordings import Stand
-from imu_calibration.use_cases.simulate import simulate as _simulate
 
 Arguments = ParamSpec('Arguments')
 Result = TypeVar('Result')
@@ -38,13 +38,13 @@ Recordings = str | PathLike | SampleBlock | Sequence[str | PathLike | SampleBloc
 
 
 USE_CASES: dict[str, Callable[..., Any]] = {'compensate': _compensate, 'noise': _noise}
-"""Function with further options -> the use case that has them."""
+"""Function with further options -> the function of `api` that has them."""
 
 
 def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the function with errors that name its arguments."""
     names = set(signature(function).parameters)
-    # Further named arguments are those of the use case, or choices.
+    # Further named arguments are those of the function of `api`, or choices.
     if 'options' in names:
         names |= set(signature(USE_CASES[function.__name__]).parameters)
     if 'choices' in names:
@@ -152,7 +152,7 @@ def calibrate(
     time, force, rate, joints, temperature_c
         See `SampleBlock.from_arrays`.
     choices
-        As for `use_cases.calibrate.calibrate_recordings`.
+        As for `api.calibrate.calibrate_recordings`.
 
     """
     arrays = Arrays(time, force, rate, joints, temperature_c)
@@ -176,7 +176,7 @@ def check(
     Test a calibration on a recording, or on arrays.
 
     ``check(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
-    `use_cases.calibrate.check_recording`.
+    `api.calibrate.check_recording`.
     """
     arrays = Arrays(time, force, rate, joints, temperature_c)
     block = arrays.or_given('check', recording)
@@ -198,7 +198,7 @@ def compensate(
     Correct the calibrated errors in a recording, or in arrays.
 
     ``compensate(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
-    `use_cases.compensate.compensate_recording`.
+    `api.compensate.compensate_recording`.
     """
     arrays = Arrays(time, force, rate, None, temperature_c)
     block = arrays.or_given('compensate', recording)
@@ -240,7 +240,7 @@ def noise(
     """
     Identify the noise of an IMU from a recording at rest, or from arrays.
 
-    Arguments as for `calibrate` and `use_cases.noise.identify_recording`.
+    Arguments as for `calibrate` and `api.noise.identify_recording`.
     """
     arrays = Arrays(time, force, rate, None, temperature_c)
     return _noise(arrays.or_given('noise', recording), **options)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.choices import calibration_options
+from imu_calibration.api.compensate import compensate_recording
+from imu_calibration.api.inspect import imu_topics_of, inspect_recording, split_topics
+from imu_calibration.api.recordings import Topics
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.references.gravity.gravity_reference import GravityReference
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.choices import calibration_options
-from imu_calibration.use_cases.compensate import compensate_recording
-from imu_calibration.use_cases.inspect import imu_topics_of, inspect_recording, split_topics
-from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import standard_definition

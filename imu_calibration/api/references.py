@@ -1,16 +1,11 @@
-"""The reference that the user has chosen, and the inputs of a use case on recordings."""
+"""The reference that the user has chosen, and the inputs of a function on recordings."""
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any, NamedTuple
 
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.reference import MotionReference
-from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import BlockSource, SampleBlock
-from imu_calibration.references.gravity.gravity_reference import GravityReference
-from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
-from imu_calibration.use_cases.recordings import (
+from imu_calibration.api.choices import Choices, calibration_options, topics_of
+from imu_calibration.api.recordings import (
     RecordingFile,
     Stand,
     Topics,
@@ -18,6 +13,11 @@ from imu_calibration.use_cases.recordings import (
     sources_without,
     table_of,
 )
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.reference import MotionReference
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import BlockSource, SampleBlock
+from imu_calibration.references.gravity.gravity_reference import GravityReference
 
 
 def reference_of(
@@ -44,7 +44,7 @@ def reference_of(
 
 
 class Inputs(NamedTuple):
-    """Inputs of a use case on recordings."""
+    """Inputs of a function on recordings."""
 
     options: CalibrationOptions
     """Options of estimation and validation."""

@@ -6,6 +6,11 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
+from imu_calibration.api.compensate import compensate_recording
+from imu_calibration.api.diagnose import diagnose
+from imu_calibration.api.inspect import inspect_recording
+from imu_calibration.api.recordings import Topics
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
@@ -16,11 +21,6 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.live_windows import LiveCalibration
 from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.report.calibration_sections import calibration_report
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
-from imu_calibration.use_cases.compensate import compensate_recording
-from imu_calibration.use_cases.diagnose import diagnose
-from imu_calibration.use_cases.inspect import inspect_recording
-from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.csv_log import read_csv
 
 from worlds.physics import make_session

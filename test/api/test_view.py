@@ -14,16 +14,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.coverage import label_of
-from imu_calibration.cli.main import main
-from imu_calibration.core.samples import SampleBlock
-from imu_calibration.document.calibration import UNKNOWN_SD
-from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.references.turntable.table_coverage import table_coverage
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.diagnose import diagnose
-from imu_calibration.use_cases.view import (
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.diagnose import diagnose
+from imu_calibration.api.view import (
     PARAMETERS_TOPIC,
     RESIDUAL_TOPIC,
     SPECTRUM_TOPIC,
@@ -33,6 +26,13 @@ from imu_calibration.use_cases.view import (
     scene_of,
     view,
 )
+from imu_calibration.calibration.coverage import label_of
+from imu_calibration.cli.main import main
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.calibration import UNKNOWN_SD
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.references.turntable.table_coverage import table_coverage
 
 from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate

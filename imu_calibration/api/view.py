@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.choices import Choices
+from imu_calibration.api.recordings import Stand, refuse_stand
 from imu_calibration.calibration.coverage import (
     Coverage,
     arrows_of,
@@ -28,9 +31,6 @@ from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.report.diagnosis_page import histogram
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.choices import Choices
-from imu_calibration.use_cases.recordings import Stand, refuse_stand
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -11,6 +11,13 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from imu_calibration.allan.figures import NoiseFigures
+from imu_calibration.api.recordings import (
+    Stand,
+    Topics,
+    options_of,
+    provenance_of,
+)
+from imu_calibration.api.resources import config_file
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import ImuCalibrationError, InputError
@@ -32,13 +39,6 @@ from imu_calibration.effects.motions import SENSOR_MOTIONS
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.use_cases.recordings import (
-    Stand,
-    Topics,
-    options_of,
-    provenance_of,
-)
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.csv_log import SENSOR_OF, LogOptions
 
 

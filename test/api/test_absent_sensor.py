@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings, check_recording
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import InputError
@@ -12,8 +14,6 @@ from imu_calibration.document.calibration_text import calibration_from_text, cal
 from imu_calibration.document.trust import usable
 from imu_calibration.preprocessing.absent_sensor import MIN_ABSENT_SAMPLES, SensorPresence
 from imu_calibration.references.gravity.live_poses import LiveByHand
-from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
-from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.candidates import FEW
 from worlds.small_hand import ACCELEROMETER, GRAVITY, GYROSCOPE, hand_motion

@@ -9,15 +9,15 @@ import pytest
 from refusal import refused
 
 import imu_calibration as imu
+from imu_calibration.api.calibrate import Calibrated
+from imu_calibration.api.resources import config_file
+from imu_calibration.api.simulate import simulate
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.references.gravity.gravity_reference import GravityReference
-from imu_calibration.use_cases.calibrate import Calibrated
-from imu_calibration.use_cases.resources import config_file
-from imu_calibration.use_cases.simulate import simulate
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.api.compensate import compensate_recording
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.export import export, find_target
-from imu_calibration.use_cases.calibrate import calibrate_recordings
-from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.csv_log import read_csv
 
 from worlds.compensation_cases import random_calibration
