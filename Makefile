@@ -60,7 +60,7 @@ $(STAMP): $(filter-out $(addprefix constraints/,docs.txt rosdebian.txt validate.
 	  { echo 'The venv module of $(PYTHON) is missing; run: apt-get install python3-venv' >&2; exit 1; }
 	@echo 'Installing $(PINS) into $(VENV): a minute or two, once.'
 	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
-	@$(PIP) $$($(ALL_PINS) | grep -oE '^(setuptools|wheel)==[0-9.]+')
+	@$(PIP) $$($(ALL_PINS) | grep -oE '^(pip|setuptools|wheel)==[0-9.]+')
 	@$(ALL_PINS) | grep '^[A-Za-z]' | split -n r/2 --filter='$(PIP) --prefer-binary --no-deps --no-build-isolation --use-pep517 --requirement /dev/stdin'
 	@$(PIP) --no-deps --no-build-isolation --use-pep517 --editable .
 	@touch $@
