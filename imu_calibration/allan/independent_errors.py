@@ -72,13 +72,18 @@ def _log_likelihoods(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     `counts` are the numbers of readings in the bins of the histogram.
     """
-    no_error, changes = _densities()
+    some = counts > 0
+    counts = counts[some]
+    no_error, changes = (densities[..., some] for densities in _densities())
     share = np.full(changes.shape[:2], 0.5 * LARGEST_SHARE)
     for _ in range(NEWTON_STEPS):
         # d/dp of log((1 - p) f + p h) = (h - f) / density
-        slope = changes / (no_error[:, None] + share[..., None] * changes)
+        slope = share[..., None] * changes
+        slope += no_error[:, None]
+        np.divide(changes, slope, out=slope)
         gradient = slope @ counts
-        curvature = slope**2 @ counts
+        slope *= slope
+        curvature = slope @ counts
         share = np.clip(share + gradient / curvature, 0.0, LARGEST_SHARE)
     density = no_error[:, None] + share[..., None] * changes
     return (np.log(density) @ counts).max(axis=1), np.log(no_error) @ counts

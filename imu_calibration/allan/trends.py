@@ -298,8 +298,8 @@ class TrendSearch:
             difference = self._differences(count)
             if len(difference):
                 detrended = difference @ remaining
-                remaining_trace = np.einsum('ij,jk,ik->', detrended, covariance, detrended)
-                trace = np.einsum('ij,jk,ik->', difference, covariance, difference)
+                remaining_trace = np.sum(detrended @ covariance * detrended)
+                trace = np.sum(difference @ covariance * difference)
                 shares[k] = remaining_trace / trace
         return np.clip(shares, 0.02, 1.0)
 
