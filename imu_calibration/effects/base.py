@@ -5,7 +5,7 @@ An effect: one physical cause of sensor output, its columns, its coefficients an
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from functools import partial
+from functools import cache, partial
 from itertools import permutations, product
 from typing import Any
 
@@ -495,11 +495,13 @@ def power_coefficients(axes: np.ndarray, products: Sequence[tuple[int, ...]]) ->
     The coefficient of ``v_a v_b ...`` is ``u_a u_b ...`` times the number of orders of its factors
     (multinomial theorem).
     """
-    coefficients = []
-    for factors in products:
-        n_orders = len(set(permutations(factors)))
-        coefficients.append(axes[:, list(factors)].prod(axis=1) * n_orders)
-    return np.stack(coefficients)
+    n_orders = [_number_of_orders(factors) for factors in products]
+    return (axes[:, np.array(products)].prod(axis=2) * n_orders).T
+
+
+@cache
+def _number_of_orders(factors: tuple[int, ...]) -> int:
+    return len(set(permutations(factors)))
 
 
 def signed_coefficients(axes: np.ndarray) -> np.ndarray:
@@ -574,6 +576,5 @@ def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) ->
     With the matrix M and the arm r_i of output i (Zhang 2017, eq. 11-17 with the true inverse).
     """
     matrix = values['matrix'].reshape(3, 3)
-    # One arm serves all three outputs.
-    arms = np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3))
+    arms = values[effect.name].reshape(-1, 3)  # one arm serves all three outputs
     return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}

@@ -333,18 +333,47 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     layout = model.layout(sensor)
     step = 1e-30
     jacobian = np.zeros((layout.width, 3, len(values)))
+    of_sensor = model.values_of(sensor, values.astype(complex))
+    readers = _readers(model, of_sensor, layout)
     for effect in layout.effects:
-        dependent_effects = layout.effects if effect.shared else (effect,)
+        dependent_effects = readers.get(effect.name, ()) if effect.shared else (effect,)
         part = model.slices[effect.key]
-        for index in range(part.start, part.stop):
-            moved = values.astype(complex)
-            moved[index] += 1j * step
-            of_sensor = model.values_of(sensor, moved)
+        for place, index in enumerate(range(part.start, part.stop)):
+            moved = of_sensor[effect.name].copy()
+            moved[place] += 1j * step
+            moved_of_sensor = {**of_sensor, effect.name: moved}
             total = np.zeros((layout.width, 3), complex)
             for dependent in dependent_effects:
-                _add_coefficients(total, model, dependent, of_sensor, layout)
+                _add_coefficients(total, model, dependent, moved_of_sensor, layout)
             jacobian[:, :, index] = total.imag / step
     return jacobian
+
+
+class _NotedReads(dict):
+    """Values of effects by name; notes whose are read."""
+
+    def __init__(self, values: Mapping[str, np.ndarray]):
+        super().__init__(values)
+        self.names: set[str] = set()
+        """Names of the effects whose values were read."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        self.names.add(name)
+        return super().__getitem__(name)
+
+
+def _readers(
+    model: SensorModel, of_sensor: dict[str, np.ndarray], layout: ColumnLayout
+) -> dict[str, list[Effect]]:
+    """Return {effect name: the effects whose coefficients depend on its values}."""
+    readers: dict[str, list[Effect]] = {}
+    total = np.zeros((layout.width, 3), complex)
+    for effect in layout.effects:
+        noted = _NotedReads(of_sensor)
+        _add_coefficients(total, model, effect, noted, layout)
+        for name in noted.names:
+            readers.setdefault(name, []).append(effect)
+    return readers
 
 
 def effect_slopes(

@@ -248,4 +248,4 @@ class CosineScores:
     def _inverse(self, group: np.ndarray) -> np.ndarray:
         """Return the inverse of the covariance of each shift of n parameters, shape (k, n, n)."""
         expected = self.expected[:, group][:, :, group]
-        return np.array([inverse_normal(of_wave) for of_wave in expected])
+        return inverse_normal(expected)

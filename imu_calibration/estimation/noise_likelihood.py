@@ -59,6 +59,7 @@ class NoiseLikelihood:
         self.many = len(rows) >= MIN_PROCESS_WINDOWS
         """Whether the windows are enough for the estimate of a bias process."""
         self._rows = rows
+        self._sessions = rows.sessions
         self._common = common
         self._reduced: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
         """(shape of the noise, variance ratio of sessions) -> result of `_eliminated`."""
@@ -113,14 +114,20 @@ class NoiseLikelihood:
             units = (self.typical, self.typical, 1.0, self.typical)
             offset, bias, time, session_sd = np.multiply(key, units)
             processes = self.processes(bias, time)
-            rows = self._with_errors(self._rows, offset, processes)
-            of_errors, normal = whitened(replace(rows, session_variance=session_sd**2))
+            rows = self._with_errors(self._rows, offset, processes, session_variance=session_sd**2)
+            of_errors, normal = whitened(rows, self._sessions)
             of_common, normal = eliminate(normal, self._common)
             self._reduced[key] = of_errors + of_common, normal
         return self._reduced[key]
 
     @staticmethod
-    def _with_errors(rows: Rows, offset: float, processes: tuple[BiasProcess, ...]) -> Rows:
+    def _with_errors(
+        rows: Rows,
+        offset: float,
+        processes: tuple[BiasProcess, ...],
+        *,
+        session_variance: float = 0.0,
+    ) -> Rows:
         """
         Return rows with bias processes, and with the variance of offsets added.
 
@@ -129,7 +136,9 @@ class NoiseLikelihood:
         durations = np.zeros(len(rows)) if rows.duration is None else rows.duration
         about_middles = means_beside_middles(processes, durations)[:, None]
         variance = rows.variance + about_middles + offset**2
-        return replace(rows, variance=variance, processes=processes, session_variance=0.0)
+        return replace(
+            rows, variance=variance, processes=processes, session_variance=session_variance
+        )
 
     @property
     def known(self) -> tuple[BiasProcess, ...]:
@@ -147,7 +156,7 @@ class NoiseLikelihood:
         bias = shape.bias * self.typical
         processes = self.processes(bias, shape.time)
         other_axes = self._rows.of_axes(np.arange(self._rows.variance.shape[1]) != axis)
-        _, normal = whitened(self._with_errors(other_axes, offset, processes))
+        _, normal = whitened(self._with_errors(other_axes, offset, processes), self._sessions)
         rows_of_axis = replace(self._rows.of_axes(np.array([axis])), products=normal)
         return NoiseLikelihood(rows_of_axis, common=self._common)
 
@@ -175,14 +184,15 @@ def _chosen(normal: np.ndarray, choices: Sequence[tuple[int, ...]]) -> np.ndarra
     return normal[places[:, :, None], places[:, None, :]]
 
 
-def whitened(rows: Rows) -> tuple[float, np.ndarray]:
+def whitened(rows: Rows, sessions: list[np.ndarray] | None = None) -> tuple[float, np.ndarray]:
     """
     Return log|V| and the normal matrix of ``[design | residual]`` of rows of the covariance V.
 
     The matrix is weighted with V^-1, and contains the products of the reduced rows. Minus twice the
-    restricted log likelihood is log|V| plus the `profile` of the matrix.
+    restricted log likelihood is log|V| plus the `profile` of the matrix. `sessions` are those of the
+    rows, where they are known.
     """
-    whitening = rows.whitening()
+    whitening = rows.whitening(sessions)
     white = flat(whitening(rows.equations))
     normal = white.T @ white
     if rows.products is not None:

@@ -152,12 +152,16 @@ class Rows(AlignedArrays):
         added = np.append(components, 0.0)[self.component]
         return replace(self, variance=self.variance + added[:, None], component=None)
 
-    def whitening(self) -> Whitening:
-        """Return the operator that makes the errors independent and of unit variance."""
+    def whitening(self, sessions: list[np.ndarray] | None = None) -> Whitening:
+        """
+        Return the operator that makes the errors independent and of unit variance.
+
+        `sessions` are those of the rows, where they are known.
+        """
         return Whitening(
             self.variance,
             self.times,
-            self.sessions,
+            self.sessions if sessions is None else sessions,
             processes=self.processes,
             session_variance=self.session_variance,
         )

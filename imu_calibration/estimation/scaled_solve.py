@@ -114,11 +114,16 @@ def inverse_gram(matrix: np.ndarray) -> np.ndarray:
 
 
 def inverse_normal(information: np.ndarray) -> np.ndarray:
-    """Return the inverse of an information matrix, scaled to a unit diagonal first."""
-    scale = 1 / np.sqrt(np.diag(information))
-    scaled = information * np.outer(scale, scale)
-    scaled.flat[:: len(scaled) + 1] += JITTER
-    return np.linalg.inv(scaled) * np.outer(scale, scale)
+    """
+    Return the inverse of an information matrix, scaled to a unit diagonal first.
+
+    Several matrices, shape (..., n, n), are inverted one by one.
+    """
+    scale = 1 / np.sqrt(np.einsum('...ii->...i', information))
+    products = scale[..., :, None] * scale[..., None, :]
+    scaled = information * products
+    np.einsum('...ii->...i', scaled)[...] += JITTER
+    return np.linalg.inv(scaled) * products
 
 
 def solve_scaled(information: np.ndarray, right: np.ndarray) -> np.ndarray:
