@@ -189,8 +189,8 @@ def whitened(rows: Rows, sessions: list[np.ndarray] | None = None) -> tuple[floa
     Return log|V| and the normal matrix of ``[design | residual]`` of rows of the covariance V.
 
     The matrix is weighted with V^-1, and contains the products of the reduced rows. Minus twice the
-    restricted log likelihood is log|V| plus the `profile` of the matrix. `sessions` are those of the
-    rows, where they are known.
+    restricted log likelihood is log|V| plus the `profile` of the matrix. `sessions` are those of
+    the rows, where they are known.
     """
     whitening = rows.whitening(sessions)
     white = flat(whitening(rows.equations))
