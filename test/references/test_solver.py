@@ -73,7 +73,8 @@ def test_reported_standard_deviations_match_the_scatter(session):
     """
     Eight sessions with white noise and wandering biases; 120 are a section of `make validate`.
 
-    The sd of the mean square of some 250 errors is 0.09, that of the coverage 1.4 %.
+    The standard deviations over 24 groups of eight other seeds are 0.08 for the mean square and
+    1.2 % for the coverage, about means of 0.96 and 95.5 %.
     """
     found = scatter(session, range(8))
     assert 0.8 <= found.mean_square <= 1.2

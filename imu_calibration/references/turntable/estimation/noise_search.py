@@ -280,10 +280,10 @@ class BiasProcessSearch:
         shapes = [NoiseShape(offset, self.least, first_time)]
         larger = [ratio for ratio in SD_RATIOS if ratio > 1.2 * self.least]
         if self.likelihood.many:
+            offsets = [_nearest_ratio(share * offset) for share in OFFSET_SHARES]
             for time in CORRELATION_TIMES:
                 bias = _descend(lambda x: loss(NoiseShape(0.0, x, time)), [self.least, *larger])
-                for share in OFFSET_SHARES:
-                    shapes.append(NoiseShape(_nearest_ratio(share * offset), bias, time))
+                shapes += [NoiseShape(of_share, bias, time) for of_share in offsets]
         best = min(shapes, key=loss)
         return best, loss(best)
 
