@@ -31,6 +31,7 @@ PRELOAD = [
     'scipy.optimize',
     'scipy.signal',
     'scipy.spatial.transform',
+    'worlds.hostile_messages',
     'worlds.limited',
 ]
 
