@@ -284,8 +284,6 @@ FAULTS = (
 """Fault, check, severity, and names and numbers that a finding must have."""
 IDS = [f'{fault.__name__}-{check}' for fault, check, *_ in FAULTS]
 THROUGH_A_BAG = (
-    gyroscope_turned,
-    clipped_gyroscope,
     no_stamps,
     jumping_clock,
     not_finite,
