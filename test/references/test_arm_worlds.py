@@ -31,7 +31,7 @@ def test_tilt_angles_zeros_and_places_are_all_that_can_be_wrong_with_an_arm(text
 
 @pytest.fixture(scope='module')
 def world():
-    return make_arm_world(100, joint_error=3e-4, place_error=3e-4, rate=50.0)
+    return make_arm_world(100, joint_error=3e-4, place_error=3e-4, rate=25.0)
 
 
 @pytest.mark.long

@@ -255,7 +255,7 @@ def test_nine_poses_are_widened_by_student_s_t():
     the rms was 4.3.
     """
     errors = []
-    for seed in range(5):
+    for seed in range(3):
         error, covariance = errors_by_hand([seed, 6], pose_sd=0.02, n_poses=9)
         errors.append((error / np.sqrt(np.diag(covariance)))[:9])
     errors = np.array(errors)
@@ -292,13 +292,13 @@ def test_misfit_of_inseparable_groups_counts_for_each():
     assert few.dof.max() < 2 and np.all(few.upper > 1.0)
 
 
-@pytest.mark.parametrize('step', [0.04, 0.08])
-def test_coarse_readings_have_the_noise_of_rounding(step):
+def test_coarse_readings_have_the_noise_of_rounding():
     """
     Readings that are constant in every pose: their means are known to step / sqrt(12).
 
     Before, to 1e-8 of the reading.
     """
+    step = 0.08
     imu, ranges, truth = simulate([16, 6], n_poses=14, force_sd=0.002)
     found = calibrate_by_hand(
         replace(imu, force_s=step * np.round(imu.force_s / step)), HandOptions(GRAVITY), ranges
@@ -473,7 +473,7 @@ def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
     assert np.all(np.abs(error) < 4.5 * np.sqrt(np.diag(covariance)))
     without = calibrate_by_hand(imu, HandOptions(GRAVITY, gyroscope=('bias', 'matrix')), ranges)
     assert without.statistics['drift_scatter_sd'] > 5 * found.statistics['drift_scatter_sd']
-    quiet = [simulate(seed, drift_sd=1e-4, n_poses=14)[:2] for seed in range(20, 25)]
+    quiet = [simulate(seed, drift_sd=1e-4, n_poses=14)[:2] for seed in range(20, 22)]
     assert not any(
         'gyroscope.gyro_g_sensitivity.xx'
         in calibrate_by_hand(imu, HandOptions(GRAVITY), r).param_names
@@ -484,7 +484,7 @@ def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
 def test_g_sensitivity_test_keeps_its_level():
     rng = np.random.default_rng(14)
     values = []
-    for _ in range(500):
+    for _ in range(300):
         poses = Poses(
             rng.normal(0, 6, (15, 3)),
             rng.normal(0, 1e-4, (15, 3)),
@@ -495,7 +495,7 @@ def test_g_sensitivity_test_keeps_its_level():
             np.arange(15.0),
         )
         values.append(g_sensitivity_evidence(poses)['g_sensitivity_p_value'])
-    assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.04  # four sd of 500 trials
+    assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.05  # four sd of 300 trials
 
 
 def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_see():

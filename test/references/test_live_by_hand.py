@@ -22,10 +22,10 @@ from imu_calibration.references.gravity.advice import missing_motion
 from imu_calibration.references.gravity.live_poses import FACE_DIRECTIONS, LiveByHand, unseen
 
 from worlds.calibrated import calibrated_by_hand
-from worlds.candidates import FEW
 from worlds.physics_table import stand_up
 
-OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW))
+CANDIDATES = 'accel_quadratic+gyro_g_sensitivity'
+OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(CANDIDATES))
 
 
 def blocks(imu, seed=0, mean=40):
@@ -105,8 +105,8 @@ def test_solving_on_the_way_changes_nothing(session, expected):
     live, solved = make_live(), 0
     for number, block in enumerate(blocks(session, 3)):
         live.push(block)
-        if number % 10 == 9 and live.scan.attitudes >= 4:
-            live.solve(pending=number % 20 == 19)
+        if number % 12 == 11 and live.scan.attitudes >= 4:
+            live.solve(pending=number % 24 == 23)
             solved += 1
     assert solved >= 3
     assert_same(live.solve(pending=True), expected)

@@ -37,7 +37,7 @@ from worlds import physics
 from worlds.misfit_coverage import COARSE
 from worlds.misfit_worlds import make_pair
 
-CANDIDATES = 'accel_quadratic+gyro_g_sensitivity+time_offset'
+CANDIDATES = 'accel_quadratic+time_offset'
 OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(CANDIDATES))
 QUICK = {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
 

@@ -20,14 +20,13 @@ from worlds.physics_hand import hold_and_turn
 MATRIX = PARAM_NAMES[12:21]
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_a_gyroscope_whose_scale_walks_is_not_known_to_the_noise(seed):
+def test_a_gyroscope_whose_scale_walks_is_not_known_to_the_noise():
     """
     Its scale walks by two per cent through the recording.
 
     What one session says of the next errs by about that, and not by the noise of turns.
     """
-    imu, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0)
+    imu, ranges, _ = hold_and_turn(0, n_poses=24, rate_hz=50.0)
     walk = np.linspace(0, 0.02, len(imu))[:, None]
     walking, steady = (
         calibrate_by_hand(replace(imu, rate_s=rate), HandOptions(GRAVITY), ranges)

@@ -62,6 +62,12 @@ def session():
     return hold_and_turn(3)
 
 
+@pytest.fixture(scope='module')
+def usual(session):
+    """Return the calibration of that session."""
+    return calibrated(session[0])
+
+
 def calibrated(imu):
     return calibrate_by_hand(read_recording([SampleBlock(imu)]).imu, HandOptions(GRAVITY))
 
@@ -86,17 +92,17 @@ def looked_at(imu):
 
 
 @pytest.mark.parametrize('factor', [0.5, 8.0])
-def test_the_solver_reaches_a_wrong_full_scale(session, factor):
+def test_the_solver_reaches_a_wrong_full_scale(session, usual, factor):
     """Half a turn that is read as a whole one is far outside what steps from the identity reach."""
     imu, _, truth = session
     found = calibrated(with_wrong_full_scale(imu, factor))
-    assert rate_error(found, truth, factor) < 2 * rate_error(calibrated(imu), truth)
+    assert rate_error(found, truth, factor) < 2 * rate_error(usual, truth)
     assert found.statistics['gyro_factor'] == pytest.approx(factor, rel=0.15)
     assert 'held' not in found.statuses
 
 
-def test_a_right_full_scale_stays_one(session):
-    assert calibrated(session[0]).statistics['gyro_factor'] == 1.0
+def test_a_right_full_scale_stays_one(session, usual):
+    assert usual.statistics['gyro_factor'] == 1.0
     assert calibrated(with_wrong_full_scale(session[0], 1.08)).statistics['gyro_factor'] == 1.0
 
 
@@ -115,20 +121,18 @@ def test_preflight_names_the_full_scale_factor(session, factor):
 
 
 @pytest.mark.parametrize('factor', [0.43, 2.4])
-def test_force_at_another_scale_does_not_end_on_the_mirrored_branch(session, factor):
+def test_force_at_another_scale_does_not_end_on_the_mirrored_branch(session, usual, factor):
     """Steps from the identity passed zero for half of the scale: the matrix was -0.5."""
     imu, _, _ = session
-    usual = calibrated(imu).accelerometer[1]
     scaled = calibrated(replace(imu, force_s=factor * imu.force_s))
-    assert scaled.accelerometer[1] == pytest.approx(factor * usual, abs=2e-4)
+    assert scaled.accelerometer[1] == pytest.approx(factor * usual.accelerometer[1], abs=2e-4)
     assert 'held' not in scaled.statuses
 
 
 @pytest.mark.parametrize('bias', [(0.0, 0.0, 11.0), (-14.0, 0.0, 9.0), (0.0, 23.0, 0.0)])
-def test_a_large_bias_does_not_spoil_the_gyroscope(session, bias):
+def test_a_large_bias_does_not_spoil_the_gyroscope(session, usual, bias):
     """The directions of gravity contained the bias; the rates were called 4.76 times too high."""
     imu, _, truth = session
-    usual = calibrated(imu)
     biased = calibrated(replace(imu, force_s=imu.force_s + np.array(bias)))
     assert biased.statistics['gyro_factor'] == 1.0
     assert biased.accelerometer[0] == pytest.approx(usual.accelerometer[0] + bias, abs=2e-3)
@@ -418,10 +422,10 @@ def test_faces_without_the_turns_between_them_give_bias_and_scale():
 # late stamps
 
 
-def test_late_stamps_of_even_samples_do_not_reach_the_turns(session):
+def test_late_stamps_of_even_samples_do_not_reach_the_turns(session, usual):
     imu, _, truth = session
     late = with_stamp_jitter(imu, 0.003, 1)
-    assert rate_error(calibrated(late), truth) < 2 * rate_error(calibrated(imu), truth)
+    assert rate_error(calibrated(late), truth) < 2 * rate_error(usual, truth)
 
 
 def test_repeated_stamps_are_spread_over_the_step_that_follows():

@@ -23,7 +23,7 @@ from imu_calibration.references.turntable.selection.investigation import investi
 from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.unexplained import IN_MOTION
 
-from worlds.candidates import FEW, with_candidates
+from worlds.candidates import with_candidates
 from worlds.hiding import record
 from worlds.physics import make_session
 from worlds.physics_beyond import Machine
@@ -31,6 +31,9 @@ from worlds.physics_cause import Cause
 from worlds.physics_draw import ARCMIN, MG
 
 STEP = 0.01
+ONE = 'accel_quadratic'
+"""Candidates where the search for effects is not the subject."""
+COARSE = {'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
 def stretches(amplitudes, frequency=23.7, noise=1.0):
@@ -119,7 +122,8 @@ def test_a_fixed_frequency_is_removed_before_orders_are_searched():
 
 def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
     recording = record(5, None, 'realistic', through_bag=False, cause=Machine())
-    found = investigate(recording.windows, recording.table, with_candidates(recording.model))
+    model = with_candidates(recording.model, ONE)
+    found = investigate(recording.windows, recording.table, model)
     tones = find_tones(found, recording.table)
     (hum,), (teeth,) = tones['accelerometer'], tones['gyroscope']
     assert (hum.joint, hum.axis) == (None, 'z') and hum.frequency == pytest.approx(
@@ -193,8 +197,8 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
 
     The diagnosis of either was "nothing found".
     """
-    recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size))
-    model = with_candidates(recording.model)
+    recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size), **COARSE)
+    model = with_candidates(recording.model, ONE)
     found = build_diagnosis(
         recording.table, investigate(recording.windows, recording.table, model)
     ).unexplained
@@ -215,12 +219,13 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
 @pytest.mark.long
 def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
     """Tones and the scatter of one axis were tested by `diagnose` only."""
-    session = make_session(5, None, 'realistic', cause=Loud(1.0), imu_rate=50.0, joint_rate=50.0)
+    kind = {'profile': 'quick', **COARSE}
+    session = make_session(5, None, 'realistic', cause=Loud(1.0), **kind)
     reported = imu.calibrate(
-        session.block, Table.from_mapping(session.table), candidates=FEW
+        session.block, Table.from_mapping(session.table), candidates=ONE
     ).calibration.statistics['unexplained']
     found = imu.diagnose(
-        session.block, Table.from_mapping(session.table), candidates=FEW
+        session.block, Table.from_mapping(session.table), candidates=ONE
     ).result.diagnosis.unexplained
     assert reported == {
         sensor: {'rms': pytest.approx(rest.rms), 'axes': list(rest.axes)}
@@ -231,11 +236,11 @@ def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
         'accelerometer': ['z'],
         'gyroscope': ['y'],
     }
-    empty = make_session(5, None, 'realistic', imu_rate=50.0, joint_rate=50.0)
+    empty = make_session(5, None, 'realistic', **kind)
     assert (
         'unexplained'
         not in imu.calibrate(
-            empty.block, Table.from_mapping(empty.table), candidates=FEW
+            empty.block, Table.from_mapping(empty.table), candidates=ONE
         ).calibration.statistics
     )
 
@@ -256,8 +261,9 @@ class Sway(Cause):
 
 
 def test_a_sway_of_the_floor_is_named_with_its_period_and_size():
-    recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(1.0))
-    found = investigate(recording.windows, recording.table, with_candidates(recording.model))
+    recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(1.0), **COARSE)
+    model = with_candidates(recording.model, ONE)
+    found = investigate(recording.windows, recording.table, model)
     tones = ResidualAnalysis.of(found, recording.table).unexplained['accelerometer'].tones
     (sway,) = [tone for tone in tones if tone.tilts]
     assert 1 / sway.frequency == pytest.approx(Sway.PERIOD, rel=0.03)

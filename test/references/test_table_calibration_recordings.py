@@ -11,6 +11,7 @@ from imu_calibration.calibration.diagnosis.diagnose import diagnose_recording
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import from_text
 from imu_calibration.document.outcome import exit_code
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.table_reference import TableReference
 from msg_adapters.bag import open_recording
@@ -19,17 +20,30 @@ from worlds.calibrated import calibrated_on_table
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
+LAGS_AND_OTHERS = CalibrationOptions(
+    catalogue=CATALOGUE.with_candidates(
+        'accel_quadratic+gyro_g_sensitivity+gyro_bandwidth+gyro_delay+gyro_filter+time_offset'
+    )
+)
 BOTH = CalibrationOptions('bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset')
 
 
-def opened(folder):
+@pytest.fixture(scope='module')
+def shaft(recordings):
     """Return the table of a recording and its blocks."""
+    folder = recordings / 'shaft_yaw_medium'
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
     with open_recording(folder, imu_topic='/imu/data_raw') as recording:
         return table, list(recording.blocks(table.joint_names))
 
 
-def test_gyroscope_scale_and_lag_along_the_shaft(recordings):
+def first_seconds(blocks, seconds):
+    """Return the blocks of the first part of a recording."""
+    end = blocks[0].imu.stamp_ns[0] + seconds * 10**9
+    return [block for block in blocks if block.imu.stamp_ns[0] <= end]
+
+
+def test_gyroscope_scale_and_lag_along_the_shaft(shaft):
     """
     The scale along the shaft within 0.003, the lag after the encoder 12-14 ms.
 
@@ -38,7 +52,7 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings):
     joint states follow, must not bend the scale. `make validate` has both shafts, with and without
     the lag in the model.
     """
-    table, blocks = opened(recordings / 'shaft_yaw_medium')
+    table, blocks = shaft
     calibration = calibrated_on_table([blocks], table, BOTH).calibration
     values, sds = (
         dict(zip(calibration.param_names, numbers))
@@ -51,24 +65,16 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings):
 
 
 @pytest.mark.long
-def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
+def test_the_lag_is_the_one_finding(shaft):
     """
     Found as an offset of the clocks (or a lag of the gyroscope, the same to first order).
 
     With its gain on held-out windows, and no story beside it. `make validate` asks of both shafts.
     """
-    folder = recordings / name
-    table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
-
-    blocks = []
-    with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-        for block in recording.blocks(table.joint_names):
-            blocks.append(block)
-            if block.imu.stamp_ns[0] > blocks[0].imu.stamp_ns[0] + 150 * 10**9:
-                blocks.pop()
-                break
-
-    document = diagnose_recording(blocks, TableReference(table)).document
+    table, blocks = shaft
+    document = diagnose_recording(
+        first_seconds(blocks, 60), TableReference(table), LAGS_AND_OTHERS
+    ).document
     effects = {finding['effect'] for finding in document['findings']}
     assert effects and effects <= {'time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter'}
     lag = sum(
@@ -78,21 +84,19 @@ def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
     )
     gain = document['findings'][0]['gain']
     print(
-        f'{name}: {sorted(effects)} of {lag * 1e3:.2f} ms, held-out residual falls by'
+        f'{sorted(effects)} of {lag * 1e3:.2f} ms, held-out residual falls by'
         f' {gain["reduction"]:.2f} {np.round(gain["ci95"], 2)}'
     )
     assert 0.0115 < lag < 0.0145
     assert gain['ci95'][0] > 0.3
 
 
-def test_what_one_axis_cannot_show_is_held(recordings):
+def test_what_one_axis_cannot_show_is_held(shaft):
     """
     A single vertical axis says nothing of the rates across it; they keep the prior and say so.
     """
-    folder = recordings / 'shaft_yaw_medium'
-    table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
-    with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-        result = calibrated_on_table([recording.blocks(table.joint_names)], table)
+    table, blocks = shaft
+    result = calibrated_on_table([first_seconds(blocks, 60)], table)
     status = dict(zip(result.calibration.param_names, result.calibration.status))
     assert all(
         status[f'gyroscope.matrix.{name}'] == 'held'

@@ -29,7 +29,9 @@ from worlds.calibrated import calibrated_on_table
 from worlds.candidates import FEW
 from worlds.tables import joints_about
 
-OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(f'{FEW}+encoder_zero'))
+TIMES_AND_ZEROS = 'accel_quadratic+gyro_bandwidth+time_offset+encoder_zero'
+OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(TIMES_AND_ZEROS))
+MORE = CalibrationOptions(catalogue=CATALOGUE.with_candidates(f'{FEW}+encoder_zero'))
 TABLE = Table.from_mapping(
     {
         'joints': joints_about('zxy'),
@@ -100,7 +102,7 @@ def test_another_cause_is_a_residual_that_is_not_noise(session):
     """The gyroscope reads 3 deg/s more about x above 20 deg/s about z."""
     rate = session.imu.rate_s.copy()
     rate[:, 0] += np.radians(3.0) * (np.abs(rate[:, 2]) > np.radians(20.0))
-    summary = inspected(replace(session, imu=replace(session.imu, rate_s=rate)))
+    summary = inspected(replace(session, imu=replace(session.imu, rate_s=rate)), MORE)
     assert 'residual' in named(summary)
     plain = inspected(
         replace(session, imu=replace(session.imu, rate_s=rate)), CalibrationOptions(as_asked=True)

@@ -49,7 +49,7 @@ def recording():
         values,
         TABLE,
         profile=make_profile('quick', 4, TABLE),
-        options=SimulationOptions(noise=GRADES['industrial'].noise),
+        options=SimulationOptions(50.0, 50.0, noise=GRADES['industrial'].noise),
         seed=4,
     )
     return SampleBlock(imu, joints)
