@@ -37,8 +37,20 @@ def problem(seed=3, grade='tactical', share=0.2):
     )
 
 
-def test_windows_together_never_say_more_than_the_sum_of_their_bounds():
-    made, rng = problem(), np.random.default_rng(8)
+@pytest.fixture(scope='module')
+def made():
+    """A situation, which the tests do not change."""
+    return problem()
+
+
+@pytest.fixture(scope='module')
+def bound(made):
+    """Its lower bound."""
+    return made.lower_bound()
+
+
+def test_windows_together_never_say_more_than_the_sum_of_their_bounds(made):
+    rng = np.random.default_rng(8)
     windows, times, _ = made.timed(rng.permutation(len(made.motions))[:30], 0)
     slack = sum(additive_bound(window, made.noise) for window in windows) - exact_information(
         windows, times, made.noise
@@ -49,8 +61,7 @@ def test_windows_together_never_say_more_than_the_sum_of_their_bounds():
     assert values.max() > 1e-3
 
 
-def test_the_bound_would_be_wrong_if_the_floor_were_larger():
-    made = problem()
+def test_the_bound_would_be_wrong_if_the_floor_were_larger(made):
     number = next(k for k, motion in enumerate(made.motions) if motion.kind == 'pose')
     moves = [k for k, motion in enumerate(made.motions) if motion.kind == 'move'][:2]
     windows, times, _ = made.timed([number, *moves] * 20, 0)
@@ -60,9 +71,8 @@ def test_the_bound_would_be_wrong_if_the_floor_were_larger():
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_no_random_plan_that_meets_the_tolerances_is_shorter_than_the_bound(seed):
-    made, rng = problem(), np.random.default_rng(seed)
-    bound = made.lower_bound()
+def test_no_random_plan_that_meets_the_tolerances_is_shorter_than_the_bound(made, bound, seed):
+    rng = np.random.default_rng(seed)
     sequence, place = [], 0
     while made.coordinates.excess(made.covariance_after(sequence, place)[0]).max() > 1.0:
         sequence += list(rng.permutation(len(made.motions))[:2])
