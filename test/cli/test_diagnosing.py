@@ -23,7 +23,7 @@ def outcome(tmp_path_factory):
             [
                 'simulate',
                 '--profile',
-                'short',
+                'quick',
                 '--effect',
                 'gyro_g_sensitivity',
                 '--seed',
