@@ -6,6 +6,7 @@ line.
 """
 
 import fcntl
+import functools
 import io
 import os
 import pty
@@ -18,6 +19,7 @@ import sys
 import termios
 import threading
 import time
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -41,6 +43,27 @@ PRINTING = {
     'check': [SESSION, '--table', TABLE, '--calibration', TRUTH],
     'noise': [SESSION, '--no-report', '--output', 'noise'],
 }
+
+
+COMPUTED = (
+    'calibrate.check_recording',
+    'inspect.inspect_recording',
+    'noise.identify_recording',
+)
+"""Functions of `imu_calibration.api` that take the time of a verb."""
+
+
+def remember(name, monkeypatch):
+    """Let a function be called once, and return what it returned then."""
+    module, _, attribute = f'imu_calibration.api.{name}'.rpartition('.')
+    function, results = getattr(import_module(module), attribute), []
+
+    @functools.wraps(function)
+    def once(*arguments, **options):
+        results.extend([] if results else [function(*arguments, **options)])
+        return results[0]
+
+    monkeypatch.setattr(f'{module}.{attribute}', once)
 
 
 def shown(monkeypatch, capsys, width, run):
@@ -70,6 +93,8 @@ def test_no_word_of_a_help_is_broken(verb, monkeypatch, capsys):
 @pytest.mark.parametrize('verb', PRINTING)
 def test_no_word_of_a_result_is_broken(verb, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
+    for computed in COMPUTED:
+        remember(computed, monkeypatch)
     wide, narrow = (
         shown(
             monkeypatch,
@@ -323,7 +348,7 @@ def interrupted_at(module, *arguments):
 @pytest.mark.live
 @pytest.mark.parametrize(
     'module',
-    ['imu_calibration.cli.main', 'imu_calibration.cli.parser', 'numpy', 'datetime', 'scipy'],
+    ['imu_calibration.cli.main', 'numpy', 'datetime', 'scipy'],
 )
 def test_an_early_interruption_ends_with_130_in_one_line(module, tmp_path):
     """
