@@ -110,7 +110,10 @@ def number(
     """
 
     def check(value: Any, place: str) -> None:
-        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        # Most values are floats, which need no search among the kinds of numbers.
+        is_number = type(value) is float or (
+            isinstance(value, Real) and not isinstance(value, bool)
+        )
         if is_number and not finite and isinstance(value, float):
             return
         if not is_number or not abs(value) <= sys.float_info.max:
@@ -251,7 +254,7 @@ def array(shape: tuple[int, ...], each: Requirement) -> Requirement:
             raise Unmet(
                 'shape', place, f'have the shape {shape}', received=items.shape, code='shape'
             )
-        for index, item in np.ndenumerate(items):
+        for index, item in zip(np.ndindex(shape), items.ravel()):
             each(item, f'{place}{list(index)}')
 
     return check
