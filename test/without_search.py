@@ -1,5 +1,5 @@
 """
-Scripts whose searches for effects on a table test only some candidates.
+Scripts whose searches for effects on a table test only some candidates, without reports.
 
 Scripts are run as users run them, without an argument for the candidates of their searches.
 `python -m without_search 'EFFECT+... MODULE [ARGUMENT ...]' ...` runs modules one after the other,
@@ -33,10 +33,12 @@ def candidates_in_scripts(candidates: str) -> Iterator[None]:
 
 
 if __name__ == '__main__':
+    from worlds.no_reports import without_reports
+
     for line in sys.argv[1:]:
         names, *sys.argv = shlex.split(line)
         print(f'== {line}', flush=True)
-        with candidates_in_scripts(names):
+        with candidates_in_scripts(names), without_reports():
             try:
                 runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
             except SystemExit as end:
