@@ -20,7 +20,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.outcome import exit_code
-from imu_calibration.effects.catalogue import term
+from imu_calibration.effects.catalogue import CATALOGUE, term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.references.turntable.residuals.proposals import Proposal
 from imu_calibration.references.turntable.table_reference import TableReference
@@ -37,6 +37,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
+from worlds.candidates import FEW
 from worlds.tables import three_axis_table
 
 TABLE = three_axis_table()
@@ -45,7 +46,7 @@ MODEL = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'))
 
 @pytest.fixture(scope='module')
 def result():
-    """The diagnosis of a short session."""
+    """The diagnosis of a short session; without a temperature one candidate cannot be tested."""
     values = random_values(MODEL, 'industrial', 9)
     values[MODEL.slices['gyroscope', 'gyro_g_sensitivity']] = 8e-5 * np.array(
         [1, -0.5, 0.3, 0.2, 1, -0.4, 0.5, 0.1, -1]
@@ -62,7 +63,7 @@ def result():
     return diagnose_recording(
         [block],
         TableReference(TABLE),
-        CalibrationOptions(),
+        CalibrationOptions(catalogue=CATALOGUE.with_candidates(f'{FEW}+gyro_thermal_bias')),
         provenance={'bags': [{'name': 'session', 'sha256': '0'}]},
     )
 
