@@ -24,7 +24,6 @@ from imu_calibration.kinematics.table import Table
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
-from worlds.candidates import FEW
 from worlds.compensation_cases import random_calibration
 from worlds.misfit_worlds import SHAFT, sweeps
 from worlds.physics import make_session
@@ -249,7 +248,7 @@ def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
         SampleBlock(*(each.select((each.stamp_ns < middle) == early) for each in whole))
         for early in (True, False)
     )
-    found = imu.calibrate(first, table, candidates=FEW)
+    found = imu.calibrate(first, table, candidates='gyro_bandwidth+time_offset')
     assert (
         found.calibration.decisions['gyroscope'] is HELPS
         and found.calibration.decisions['accelerometer'] is UNPROVEN
