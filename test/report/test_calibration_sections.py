@@ -348,15 +348,43 @@ const cut = frames.filter(e => e.scrollWidth > e.clientWidth + 1).length;
 const wide = document.documentElement.scrollWidth - window.innerWidth;
 const figures = [...document.querySelectorAll('svg')];
 const flat = figures.filter(s => s.getBoundingClientRect().height < 50).length;
-document.title =
-  `wide ${wide} flat ${flat} overlaps ${overlaps} cut ${cut} figures ${figures.length}`;
+parent.postMessage(
+  `wide ${wide} flat ${flat} overlaps ${overlaps} cut ${cut} figures ${figures.length}`, '*');
 });</script></body>"""
 
 
-def opened(page, width, tmp_path):
-    """Return {what was measured: number} of a page opened in a browser."""
-    file = tmp_path / 'report.html'
-    file.write_text(page.replace('</body>', WATCH))
+FRAMES = """<body><script>
+const frames = document.getElementsByTagName('iframe');
+window.addEventListener('message', event => {
+  const place = [...frames].findIndex(frame => frame.contentWindow === event.source);
+  document.body.append(`[${place} ${event.data}]`);
+});</script>"""
+"""Beginning of a page of frames, which prints what each of them measures."""
+PAPER = 717
+"""Width of A4 between chromium's margins, pixels."""
+VIEWS = (
+    ('on_table', 1300),
+    ('on_table', 800),
+    ('on_table', 500),
+    ('by_hand', 500),
+    ('on_table', PAPER),
+    ('by_hand', PAPER),
+)
+"""(Report, width); those as wide as paper are shown as they are printed."""
+
+
+@pytest.fixture(scope='module')
+def shown(pages, tmp_path_factory):
+    """{(report, width): {what was measured: number}} in frames of one browser."""
+    folder = tmp_path_factory.mktemp('browser')
+    frames = [FRAMES]
+    for name, width in VIEWS:
+        page = pages[name].replace('</body>', WATCH)
+        if width == PAPER:
+            page = page.replace('@media print', '@media all')
+        (folder / f'{name}_{width}.html').write_text(page)
+        frames.append(f'<iframe src="{name}_{width}.html" width="{width}" height="1000"></iframe>')
+    (folder / 'frames.html').write_text('\n'.join(frames))
     flags = [
         '--headless',
         '--no-sandbox',
@@ -368,35 +396,36 @@ def opened(page, width, tmp_path):
         '--disable-sync',
         '--disable-dev-shm-usage',
         '--enable-logging=stderr',
-        f'--user-data-dir={tmp_path / "profile"}',
-        f'--window-size={width},1000',
+        f'--user-data-dir={folder / "profile"}',
         '--virtual-time-budget=3000',
         '--dump-dom',
     ]
     done = subprocess.run(
-        [chromium(), *flags, file.as_uri()], capture_output=True, text=True, timeout=120
+        [chromium(), *flags, (folder / 'frames.html').as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert [line for line in done.stderr.splitlines() if 'CONSOLE' in line] == []
-    found = re.search(r'<title>(wide .*)</title>', done.stdout)
-    assert found, done.stdout[:300]
-    words = found.group(1).split()
-    return dict(zip(words[::2], map(int, words[1::2]), strict=True))
+    measured = {}
+    for place, line in re.findall(r'\[(\d) (wide [^]]*)\]', done.stdout):
+        words = line.split()
+        measured[VIEWS[int(place)]] = dict(zip(words[::2], map(int, words[1::2]), strict=True))
+    assert measured.keys() == set(VIEWS), done.stdout[-300:]
+    return measured
 
 
 @pytest.mark.live
-@pytest.mark.parametrize(
-    ('name', 'width'), (('on_table', 1300), ('on_table', 800), ('on_table', 500), ('by_hand', 500))
-)
-def test_a_browser_shows_it_without_errors_overflow_or_overlap(pages, tmp_path, name, width):
-    found = opened(pages[name], width, tmp_path)
+@pytest.mark.parametrize('view', [view for view in VIEWS if view[1] != PAPER])
+def test_a_browser_shows_it_without_errors_overflow_or_overlap(shown, view):
+    found = shown[view]
     assert found['wide'] <= 0 and found['figures'] >= 6
     assert (found['flat'], found['overlaps']) == (0, 0)
 
 
 @pytest.mark.live
 @pytest.mark.parametrize('name', ('on_table', 'by_hand'))
-def test_nothing_is_cut_off_on_paper(pages, tmp_path, name):
-    page = pages[name].replace('@media print', '@media all')
-    found = opened(page, 717, tmp_path)  # A4 between chromium's margins
+def test_nothing_is_cut_off_on_paper(shown, name):
+    found = shown[name, PAPER]
     assert (found['cut'], found['overlaps'], found['flat']) == (0, 0, 0)
