@@ -26,7 +26,8 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import CONVENTION_SHARE, Solution
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.search import FAMILY_WISE, SelectedEffects, SelectionSettings
+from imu_calibration.selection.search import FAMILY_WISE
+from imu_calibration.selection.selected_effects import SelectedEffects, SelectionSettings
 
 
 def solve_by_evidence(

@@ -22,7 +22,7 @@ from imu_calibration.document.trust import Uncorrected, usage
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.selection.search import SelectedEffects
+from imu_calibration.selection.selected_effects import SelectedEffects
 
 GRAVITY_SD = 5e-4
 """

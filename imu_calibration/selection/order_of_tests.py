@@ -3,24 +3,34 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.questions import Question, without_weakest
+from imu_calibration.selection.search import Search
+
+
+class SearchProblem(Protocol):
+    """Data of a recording with the columns of all effects under test."""
+
+    search: Search
+    """Search of effects in these data."""
+
+    @property
+    def explained(self) -> Explained:
+        """Excess over noise in these data, and the share of it that effects remove."""
 
 
 @dataclass(eq=False)
 class EffectTests(ABC):
     """Tests of a choice of effects on the data of a reference."""
 
-    problem: Any
-    """Evidence and `search` of a reference: a `RowProblem` or a `LinearisedProblem`."""
-    explained: Explained
-    """Excess over noise, and the share of it that effects remove."""
+    problem: SearchProblem
+    """The data and the search that made the choice."""
 
     def explaining(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the effects of which each explains most of the excess variance."""
-        return self.preferred(pruned(chosen, self.explained.share))
+        return self.preferred(pruned(chosen, self.problem.explained.share))
 
     def predicting(self, named: Sequence[Question]) -> list[Question]:
         """Return the effects that improve the prediction of held-out data."""

@@ -4,17 +4,15 @@ Choosing effects one after the other by held-out evidence.
 With earlier choices reconsidered after each step.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import AbstractSet, Any, ClassVar
+from typing import AbstractSet
 
 import numpy as np
 
 from imu_calibration.core.progress import reported
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS, Effect
-from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.evidence import Evidence, agree
 from imu_calibration.selection.questions import Question, with_exchanged
 
@@ -428,119 +426,3 @@ def least_angle(effect: Effect, encoder_step: float) -> float:
     if effect.unit not in angle_of_unit:
         return 0.0
     return 0.5 * encoder_step / angle_of_unit[effect.unit]
-
-
-@dataclass(frozen=True)
-class SelectionSettings:
-    """How a solution with the findings of a search judges them."""
-
-    joint_test: bool = True
-    """
-    Whether the coefficients of an effect have to be significant together, in addition to one alone.
-    """
-    judge_requested: bool = True
-    """Whether findings that are in the requested model have to be significant, too."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SelectedEffects:
-    """
-    Findings of a search on data of any reference, separated by plausibility of their sizes.
-
-    A reference that searches for more than effects overrides the properties that are empty here.
-    """
-
-    settings: ClassVar[SelectionSettings] = SelectionSettings()
-    problem: Any
-    """Rows, evidence and search: a `RowProblem` or a `LinearisedProblem`."""
-    explained: Any
-    """Excess over noise, and the share of it that effects remove (`Explained`)."""
-    named: Sequence[Question]
-    """Questions that became findings, in the order found."""
-    not_testable: list[dict]
-    """Effects that could not be tested."""
-    unstable: Sequence[Question] = ()
-    """
-    Questions that would have become findings, but the parts of the recording disagree on them.
-    """
-    rejected: Sequence[Question] = ()
-    """
-    Questions selected by likelihood but not named: their gain is too small, or the remaining excess
-    too large.
-    """
-    limits: Sequence[Any] = ()
-    """Saturations (`Saturation`)."""
-
-    @property
-    def changed_at(self) -> float | None:
-        """Time at which parameters change, s; None where no search looked for it."""
-        return None
-
-    @property
-    def jitter_entry(self) -> Mapping[str, Any]:
-        """Entry of a document for independent errors of the stamps; empty without any."""
-        return {}
-
-    @property
-    def further_moves(self) -> Sequence[tuple[Mapping[str, float], float]]:
-        """(changes of parameters by other causes than effects that are not named, weight)."""
-        return ()
-
-    @property
-    def param_names(self) -> Sequence[str]:
-        """Names of the parameters of the baseline and of the effects under test."""
-        raise NotImplementedError
-
-    @property
-    def baseline_model(self) -> SensorModel:
-        """The model that the search extends."""
-        raise NotImplementedError
-
-    @property
-    def point_of_named(self) -> Mapping[str, np.ndarray]:
-        """Effect -> values at which its columns are linearised, in the model with all findings."""
-        raise NotImplementedError
-
-    @property
-    def point_of_adopted(self) -> dict[str, np.ndarray]:
-        """Effect -> values at which its columns are linearised, of the adopted effects."""
-        point = self.point_of_named
-        adopted = [question.name for question in self.adopted]
-        return {name: point[name] for name in adopted if name in point}
-
-    def clipped_solution(self) -> Solution | None:
-        """
-        Return the solution of a search that found a limit of a sensor, without saturated samples.
-
-        None where it found no limit.
-        """
-        return None
-
-    def unexplained_rests(self) -> Mapping[str, Any]:
-        """
-        Return sensor -> its residual that no finding explains (`Unexplained`).
-
-        Intermediate results are freed.
-        """
-        raise NotImplementedError
-
-    @property
-    def search(self) -> Search:
-        """Search in which the findings were chosen."""
-        return self.problem.search
-
-    @property
-    def implausible(self) -> list[Question]:
-        """
-        Findings with sizes above those of any known instrument.
-
-        They are reported, but added to a model only on request.
-        """
-        search = self.search
-        return [question for question in self.named if search.implausible(self.named, question)]
-
-    @property
-    def adopted(self) -> list[Question]:
-        """Findings of plausible sizes, which are added to the model."""
-        implausible = self.implausible
-        return [question for question in self.named if question not in implausible]

@@ -44,7 +44,7 @@ from imu_calibration.references.turntable.session_data import DecimatedWindows
 from imu_calibration.references.turntable.table_reference import TableReference
 from imu_calibration.references.turntable.window_search import baseline_model
 from imu_calibration.report.diagnosis_page import diagnosis_report
-from imu_calibration.selection.search import SelectionSettings
+from imu_calibration.selection.selected_effects import SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
 from worlds.candidates import FEW, with_candidates
@@ -209,8 +209,7 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
     bare = SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES)
     bare = with_candidates(bare, 'gyro_g_sensitivity+gyro_bias_drift')
     whole, half = (
-        ResidualAnalysis.of(investigate(measured(share), TABLE, bare), TABLE)
-        for share in (0.0, 0.5)
+        ResidualAnalysis.of(investigate(measured(share), TABLE, bare)) for share in (0.0, 0.5)
     )
     assert [question.name for question in whole.named] == [
         'gyro_g_sensitivity'
@@ -286,7 +285,7 @@ def investigated(late, windows):
     """Return what the search finds in the session beyond biases and matrices."""
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(late[1].joint_names))
     model = with_candidates(model, LAGS)
-    return ResidualAnalysis.of(investigate(windows, late[1], model), late[1])
+    return ResidualAnalysis.of(investigate(windows, late[1], model))
 
 
 @pytest.fixture(scope='module')
@@ -305,7 +304,7 @@ def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late, exam
     ]
     assert added[0] == pytest.approx(0.5 * 0.3**2) and added[1] < 1e-200
     beside = replace(found, rivals=[replace(rivals[0], other=found.problem.questions[0])])
-    mates = build_diagnosis(late[1], beside).findings[0].indistinguishable_from
+    mates = build_diagnosis(beside).findings[0].indistinguishable_from
     assert mates[0] == found.problem.questions[0].name
 
 
@@ -328,9 +327,7 @@ def test_what_likelihood_asks_for_and_nobody_is_sure_of_is_not_named_but_widens(
 
 def test_a_finding_of_the_model_as_asked_must_stand_out_too(examined, monkeypatch):
     found = examined
-    solution = extended_solution(
-        found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named
-    )
+    solution = extended_solution(found.problem, found.named)
     assert by_evidence._without_insignificant(found, solution, solution.model) is found
     monkeypatch.setattr(
         by_evidence, 'stands_out', lambda _, question, **settings: question is not found.named[0]
@@ -349,9 +346,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     late, lag, examined, monkeypatch
 ):
     found = examined
-    solution = extended_solution(
-        found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named
-    )
+    solution = extended_solution(found.problem, found.named)
     question = found.named[0]
     assert stands_out(solution, question) and not stands_out(
         replace(solution, terms={'noise': 1e9 * solution.covariance}), question

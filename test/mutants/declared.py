@@ -490,7 +490,7 @@ SEARCH = _of(
     (
         'a finding need not lower the residual in its own unit',
         'WindowTests.least_predicting',
-        'not _1 > _needed_reduction(..., ..., ..., ...)',
+        'not _1 > _needed_reduction(..., ..., ...)',
         'False',
         (
             'test_search.py::test_a_finding_lowers_the_residual_in_the_sensors_own_unit'

@@ -77,7 +77,7 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
         assert changes == {'reference.encoder_zero.middle': pytest.approx(-0.03, abs=6e-4)}
     # The longer part, in which nothing is left to find.
     assert not found.named and len(found.used) < 0.7 * len(recording.windows)
-    diagnosis = build_diagnosis(recording.table, found)
+    diagnosis = build_diagnosis(found)
     assert diagnosis.onset is onset and set(onset.to_mapping()['parameters']) == set(changes)
     assert any(f'{onset.time:.1f} +-' in line for line in diagnosis_lines(diagnosis))
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
@@ -108,7 +108,7 @@ def test_a_step_of_the_biases_is_found_with_both_states(shock, what, axes):
         change = onset.after[name] - before
         assert abs(change - truth[sensor][axis]) < 4 * onset.sd[name], name
     assert not found.named
-    printed = ' '.join(diagnosis_lines(build_diagnosis(recording.table, found)))
+    printed = ' '.join(diagnosis_lines(build_diagnosis(found)))
     assert all(f'{name} ' in printed for name in onset.before)
     for sensor, changed in onset.sensor_axes.items():
         assert not changed or f'{sensor} {" and ".join(changed)}' in printed

@@ -26,11 +26,11 @@ def looked_again(monkeypatch):
         search = SimpleNamespace(run=lambda start: best, resolved=(), cost=len)
         problem = SimpleNamespace(search=search, questions=[])
         problem.asking_any_size = lambda: problem
+        problem.explained = SimpleNamespace(rest=lambda chosen: before)
         first = SimpleNamespace(
             rest=100.0,
             problem=problem,
             chosen=[SimpleNamespace(label=label, name=label) for label in ('one', 'two')],
-            explained=SimpleNamespace(rest=lambda chosen: before),
         )
         monkeypatch.setattr(investigation, 'best_pairs', lambda search: [])
 

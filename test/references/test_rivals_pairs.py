@@ -83,14 +83,9 @@ def test_a_pair_of_which_one_does_nothing_does_not_survive():
 
 
 def outcome(search, named, rest):
-    problem = SimpleNamespace(search=search)
-    return SimpleNamespace(
-        problem=problem,
-        chosen=named,
-        named=named,
-        rest=rest,
-        explained=SimpleNamespace(rest=lambda chosen: 0.0),
-    )
+    explained = SimpleNamespace(rest=lambda chosen: 0.0)
+    problem = SimpleNamespace(search=search, explained=explained)
+    return SimpleNamespace(problem=problem, chosen=named, named=named, rest=rest)
 
 
 @pytest.mark.parametrize(

@@ -58,4 +58,4 @@ def test_the_simpler_of_two_is_told_where_a_rest_stays_and_the_residual_does_not
     explained = SimpleNamespace(
         rest_beside=lambda chosen, question: rest, share=lambda chosen, question: share
     )
-    assert module.simpler(SimpleNamespace(search=Search()), explained, [ARMS]) == [told]
+    assert module.simpler(SimpleNamespace(search=Search(), explained=explained), [ARMS]) == [told]

@@ -124,7 +124,7 @@ def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
     recording = record(5, None, 'realistic', through_bag=False, cause=Machine())
     model = with_candidates(recording.model, ONE)
     found = investigate(recording.windows, recording.table, model)
-    tones = find_tones(found, recording.table)
+    tones = find_tones(found)
     (hum,), (teeth,) = tones['accelerometer'], tones['gyroscope']
     assert (hum.joint, hum.axis) == (None, 'z') and hum.frequency == pytest.approx(
         Machine.hum_hz, abs=0.1
@@ -156,11 +156,9 @@ def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
         text='Teeth of the gear.',
     )
     formula = SimpleNamespace(effects=[mesh], values=[np.array([0.2 * DEG, 0.0, 0.0])])
-    assert [
-        tone.sensor
-        for tones in find_tones(found, recording.table, [formula]).values()
-        for tone in tones
-    ] == ['accelerometer']
+    assert [tone.sensor for tones in find_tones(found, [formula]).values() for tone in tones] == [
+        'accelerometer'
+    ]
 
     class Rest:
         tones = (teeth, hum)
@@ -199,9 +197,7 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
     """
     recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size), **COARSE)
     model = with_candidates(recording.model, ONE)
-    found = build_diagnosis(
-        recording.table, investigate(recording.windows, recording.table, model)
-    ).unexplained
+    found = build_diagnosis(investigate(recording.windows, recording.table, model)).unexplained
     assert [found[sensor].significant for sensor in ('accelerometer', 'gyroscope')] == [
         size > 0
     ] * 2
@@ -264,7 +260,7 @@ def test_a_sway_of_the_floor_is_named_with_its_period_and_size():
     recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(1.0), **COARSE)
     model = with_candidates(recording.model, ONE)
     found = investigate(recording.windows, recording.table, model)
-    tones = ResidualAnalysis.of(found, recording.table).unexplained['accelerometer'].tones
+    tones = ResidualAnalysis.of(found).unexplained['accelerometer'].tones
     (sway,) = [tone for tone in tones if tone.tilts]
     assert 1 / sway.frequency == pytest.approx(Sway.PERIOD, rel=0.03)
     assert sway.amplitude / 9.8 == pytest.approx(Sway.ANGLE, rel=0.2)

@@ -66,8 +66,7 @@ def looked(kind=None, seed=5):
     """Return (examination, sensor -> blocks, cause) of a session."""
     recording, cause = recorded(kind, seed)
     found = ResidualAnalysis.of(
-        investigate(recording.windows, recording.table, with_candidates(recording.model, FEW)),
-        recording.table,
+        investigate(recording.windows, recording.table, with_candidates(recording.model, FEW))
     )
     return found, found.blocks, cause
 
@@ -269,9 +268,9 @@ def test_the_gain_of_a_formula_is_that_of_corrected_readings():
 
     It is a root mean square over the axes; the bias that the fit absorbs is within 10 %.
     """
-    (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
+    (_, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
     proposal = found.proposals['gyroscope']
-    gain = gains_of_formulas(found, recording.table, [proposal])['gyroscope']
+    gain = gains_of_formulas(found, [proposal])['gyroscope']
     hidden = hidden_rms(cause, found)
     before, after = gain.beyond_noise
     assert (gain.of, gain.measure) == (APPLIED, SAMPLES)
@@ -281,8 +280,8 @@ def test_the_gain_of_a_formula_is_that_of_corrected_readings():
 
 
 def test_the_formula_is_printed():
-    (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
-    lines = '\n'.join(diagnosis_lines(build_diagnosis(recording.table, without_superseded(found))))
+    (_, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
+    lines = '\n'.join(diagnosis_lines(build_diagnosis(without_superseded(found))))
     assert all(
         part in lines
         for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposals['gyroscope'].sentence)

@@ -678,11 +678,8 @@ def test_windows_agree_on_a_finding(scatter, sure):
     assert value / np.sqrt(covariance[0, 0]) > 30.0
     assert (evidence.p_value_by_scatter([0], [0]) < 1e-6) == sure
     problem = LinearisedProblem.__new__(LinearisedProblem)
-    problem.evidence, problem.questions, problem.search = (
-        evidence,
-        [QUADRATIC] * 30,
-        SimpleNamespace(indices=lambda chosen: (0,)),
-    )
+    problem.evidence = evidence
+    problem.search = SimpleNamespace(indices=lambda chosen: (0,), questions=[QUADRATIC] * 30)
     assert problem.windows_agree([QUADRATIC], QUADRATIC) == sure
 
 
@@ -886,7 +883,7 @@ def judging_tests(
         ),
         windows_agree=windows_agree,
     )
-    return investigation.WindowTests(problem, None)
+    return investigation.WindowTests(problem)
 
 
 def test_a_finding_lowers_the_residual_in_the_sensors_own_unit(monkeypatch):
@@ -972,8 +969,7 @@ def rest_of(sigma, residual):
     explained.n_means, explained.n_within = 3.0 * count, 0.0
     explained.numbers = {'accelerometer': np.array([3.0 * count, 0.0])}
     return rests._unexplained(
-        SimpleNamespace(space=space, recording=recording),
-        explained,
+        SimpleNamespace(space=space, recording=recording, explained=explained),
         'accelerometer',
         alike(sigma * np.sqrt(6.0 * count), 0.0),
         np.ones(1),

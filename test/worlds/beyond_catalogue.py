@@ -79,7 +79,7 @@ def _known(found, recording):
     windows = [window for window in recording.windows if window.kind != 'unused']
     unlocked = np.zeros(len(windows), bool)
     problem = SearchedWindows(windows, recording.table, model, [], unlocked).linearised()
-    solution = extended_solution(problem.space, problem.noise, model, chosen=[])
+    solution = extended_solution(problem, chosen=[])
     unsure = ModelExtension(
         moves=tuple((moved, 1.0) for moved in biases_off(model, found.unexplained))
     )

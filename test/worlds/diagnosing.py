@@ -16,7 +16,7 @@ def diagnose(windows, table, model, *, bias_processes=None, candidates=None):
     Unused ones serve dead reckoning. `candidates` as for `api.diagnose.diagnose`.
     """
     model = with_candidates(model, candidates)
-    found = build_diagnosis(table, inquire(windows, table, model, bias_processes=bias_processes))
+    found = build_diagnosis(inquire(windows, table, model, bias_processes=bias_processes))
     return replace(
         found, traces=residual_traces(windows, table, found.baseline, after=found.solution)
     )

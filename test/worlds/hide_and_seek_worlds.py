@@ -209,7 +209,7 @@ def effects_of_seed(seed, noise, effects, profile='random', table='three_axis', 
 def nothing_of(sizes, seed, noise):
     """Return the row of the session that gave the sizes."""
     empty, start = sizes.recording, time.process_time()
-    diagnosis = build_diagnosis(empty.table, sizes.found)
+    diagnosis = build_diagnosis(sizes.found)
     return [
         _row(
             diagnosis,

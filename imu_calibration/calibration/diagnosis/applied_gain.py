@@ -7,7 +7,8 @@ import numpy as np
 
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.search import Search, SelectedEffects
+from imu_calibration.selection.search import Search
+from imu_calibration.selection.selected_effects import SelectedEffects
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,13 @@ from imu_calibration.references.gravity.pose_residual import unexplained_by_hand
 from imu_calibration.references.gravity.pose_rows import SearchParameters, build_rows, gravity_turns
 from imu_calibration.references.rows.row_evidence import RowEvidence
 from imu_calibration.references.rows.row_search import ChoiceWithout, RowProblem, choose_effects
-from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.questions import (
     Question,
     lacking_temperature,
     sort_effects,
     time_constants,
 )
-from imu_calibration.selection.search import SelectedEffects, SelectionSettings
+from imu_calibration.selection.selected_effects import SelectedEffects, SelectionSettings
 from imu_calibration.selection.unexplained import Unexplained
 
 MIN_SPARE_POSES = 3
@@ -59,8 +58,6 @@ class HandInvestigation(SelectedEffects):
     """The calibration under diagnosis."""
     problem: RowProblem
     """Rows of poses and turns, with the search on them."""
-    explained: Explained
-    """Excess over noise, and the share of it that effects remove."""
     held_out: Sequence[ChoiceWithout]
     """The complete search, repeated without each part of the poses."""
     constants: np.ndarray
@@ -90,11 +87,12 @@ class HandInvestigation(SelectedEffects):
     @cached_property
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the residual that no finding explains."""
-        blocks = self.problem.blocks
         evidence = self.problem.evidence
         used = self.search.indices(self.named)
         return {
-            sensor: unexplained_by_hand(self.baseline, blocks, evidence, used=used, sensor=sensor)
+            sensor: unexplained_by_hand(
+                self.baseline, evidence.blocks, evidence, used=used, sensor=sensor
+            )
             for sensor in SENSORS
         }
 
@@ -191,7 +189,6 @@ def investigate_by_hand(
     return HandInvestigation(
         baseline=baseline,
         problem=problem,
-        explained=problem.explained,
         named=chosen.named,
         held_out=chosen.held_out,
         not_testable=not_testable,

@@ -46,7 +46,7 @@ from imu_calibration.references.gravity.held_out_poses import (
     uncorrected_by_hand,
     values_without,
 )
-from imu_calibration.selection.search import SelectedEffects
+from imu_calibration.selection.selected_effects import SelectedEffects
 
 HandResult = CalibrationResult[HandCalibration]
 """A calibration by hand."""

@@ -45,8 +45,6 @@ class RowProblem:
     ):
         untimed = [question for question in questions if not question.effect.time_constant]
         smooth = smooth_parameters(untimed)
-        self.blocks = blocks
-        self.questions = questions
         self.evidence = RowEvidence(blocks, prior_sd, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)
         self.explained = Explained(
@@ -55,9 +53,13 @@ class RowProblem:
 
     def without(self, groups: np.ndarray) -> 'RowProblem':
         """Return the same problem without some groups of rows."""
-        blocks = without_groups(self.blocks, groups)
-        prior_sd = self.evidence.prior_sd
-        return RowProblem(blocks, prior_sd, self.questions, baseline=self.search.baseline)
+        search = self.search
+        return RowProblem(
+            without_groups(self.evidence.blocks, groups),
+            self.evidence.prior_sd,
+            search.questions,
+            baseline=search.baseline,
+        )
 
     def gain(
         self,
@@ -93,13 +95,15 @@ class RowProblem:
         """
         residuals_before = self.evidence.heldout_residuals(self.search.indices(before))
         residuals_after = self.evidence.heldout_residuals(self.search.indices(after))
-        blocks = []
         ratios = []
-        for block, rest_before, rest_after in zip(self.blocks, residuals_before, residuals_after):
+        for block, rest_before, rest_after in zip(
+            self.evidence.blocks, residuals_before, residuals_after
+        ):
+            ratio = np.inf
             if block.sensor == sensor:
-                blocks.append(block)
-                ratios.append(np.sum(rest_after**2) / max(np.sum(rest_before**2), 1e-300))
-        return blocks[ratios.index(min(ratios))]
+                ratio = np.sum(rest_after**2) / max(np.sum(rest_before**2), 1e-300)
+            ratios.append(ratio)
+        return self.evidence.blocks[int(np.argmin(ratios))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +140,7 @@ def choose_effects(problem: RowProblem) -> RowChoice:
     problem : RowProblem
 
     """
-    tests = RowTests(problem, problem.explained)
+    tests = RowTests(problem)
     found = select_findings(tests, problem.search.run())
     return RowChoice(found.named, found.unstable, tests.held_out)
 
@@ -147,8 +151,6 @@ class RowTests(EffectTests):
 
     problem: RowProblem
     """All rows."""
-    explained: Explained
-    """Their excess over noise."""
     held_out: list[ChoiceWithout] = field(default_factory=list)
     """The search without each part of the groups; empty before it is needed."""
 
@@ -159,7 +161,7 @@ class RowTests(EffectTests):
         Sizes beyond the range of known instruments are tested only where an excess remains. The
         problem has that search from then on.
         """
-        explained = self.explained
+        explained = self.problem.explained
         if not explained.rest(named):
             return named
         search_of_any_size = self.problem.search.asking_any_size()
@@ -195,7 +197,7 @@ def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
     for number in reported('repeating the search', range(n_parts), n_parts):
         left_out = groups[number::n_parts]
         smaller = problem.without(left_out)
-        named = RowTests(smaller, smaller.explained).explaining(smaller.search.run())
+        named = RowTests(smaller).explaining(smaller.search.run())
         choices.append(ChoiceWithout(left_out, named, smaller))
     return choices
 

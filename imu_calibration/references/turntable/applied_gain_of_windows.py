@@ -1,8 +1,7 @@
 """Gain of an extension of the model: errors of the corrected readings of held-out windows."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -53,7 +52,6 @@ class _Side:
 
 def gain_of_findings(
     investigation: Investigation,
-    table: Table,
     before: Sequence[Question],
     *,
     after: Sequence[Question],
@@ -70,7 +68,6 @@ def gain_of_findings(
     Parameters
     ----------
     investigation : Investigation
-    table : Table
     before, after : sequence of Question
     sensors : sequence of str
         Sensors that the difference acts on.
@@ -88,12 +85,12 @@ def gain_of_findings(
         _applied_parameters(investigation, compensated.before),
         _applied_parameters(investigation, compensated.after),
     ]
-    sums = _locked_errors(investigation, table, sides)
+    sums = _locked_errors(investigation, sides)
     return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
 
 
 def gains_of_formulas(
-    investigation: Investigation, table: Table, proposals: Sequence[Proposal]
+    investigation: Investigation, proposals: Sequence[Proposal]
 ) -> dict[str, Gain]:
     """
     Return sensor -> Gain of the proposed formulas over the findings on the locked windows.
@@ -105,7 +102,6 @@ def gains_of_formulas(
     Parameters
     ----------
     investigation : Investigation
-    table : Table
     proposals : sequence of Proposal
         At most one for each sensor.
 
@@ -123,7 +119,7 @@ def gains_of_formulas(
     accumulator = Accumulator()
     unlocked = [window for window, locked in zip(investigation.used, problem.locked) if not locked]
     for group in chunks(unlocked):
-        for window in reduce_windows(group, model, table):
+        for window in reduce_windows(group, model, investigation.table):
             accumulator.add(window)
     solution = solve(accumulator, model, noise=problem.noise)
     estimated = solution.values
@@ -142,9 +138,7 @@ def gains_of_formulas(
         is_compensated = any(effect.compensation == 'exact' for effect in proposal.effects)
         error_kind = APPLIED if is_compensated else OF_MODEL
         if error_kind not in sums_of:
-            sums_of[error_kind] = _locked_errors(
-                investigation, table, [before, after], of=error_kind
-            )
+            sums_of[error_kind] = _locked_errors(investigation, [before, after], of=error_kind)
         gain = sums_of[error_kind].gains(proposal.sensor, error_kind)[SAMPLES]
         white_variance = problem.noise[proposal.sensor].white_variance
         gains[proposal.sensor] = replace(gain, noise_rms=float(np.sqrt(np.mean(white_variance))))
@@ -152,11 +146,7 @@ def gains_of_formulas(
 
 
 def _locked_errors(
-    investigation: Investigation,
-    table: Table,
-    sides: Sequence[_Side],
-    *,
-    of: str = APPLIED,
+    investigation: Investigation, sides: Sequence[_Side], *, of: str = APPLIED
 ) -> DistanceSums:
     """
     Return the sums of squared errors of each side over the locked windows.
@@ -171,12 +161,23 @@ def _locked_errors(
         if locked and window.time[0] >= start:
             held_out.append(window)
 
-    errors_of = _errors if of == APPLIED else _model_errors
+    table = investigation.table
     sums = DistanceSums()
     for group in chunks(held_out):
-        errors_of_sides = [errors_of(group, table, side) for side in sides]
-        for window, *errors in zip(group, *errors_of_sides):
-            sums.add(window, errors, problem.noise)
+        errors_of_sides = []
+        for side in sides:
+            if of == APPLIED:
+                errors_of_sides.append(_errors(group, table, side))
+            else:
+                errors_of_sides.append(residuals(group, table, side.model, values=side.values))
+        edges = np.cumsum([0, *map(len, group)])
+        for window, first, last in zip(group, edges, edges[1:]):
+            errors_of_window = []
+            for errors in errors_of_sides:
+                errors_of_window.append(
+                    {sensor: error[first:last] for sensor, error in errors.items()}
+                )
+            sums.add(window, errors_of_window, problem.noise)
     return sums
 
 
@@ -200,11 +201,9 @@ def _applied_parameters(investigation: Investigation, chosen: Sequence[Question]
     return _Side(model, values, applied_values(model, values, centre), latest)
 
 
-def _errors(
-    windows: Sequence[Window], table: Table, side: _Side
-) -> Iterator[dict[str, np.ndarray]]:
+def _errors(windows: Sequence[Window], table: Table, side: _Side) -> dict[str, np.ndarray]:
     """
-    Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3).
+    Return sensor -> error of the corrected readings of windows, m/s^2 and rad/s, shape (n, 3).
 
     The true readings are the output of an ideal sensor on the table as this side estimates it.
     """
@@ -236,14 +235,4 @@ def _errors(
     for sensor in SENSORS:
         true = sensor_output(ideal_model, sensor, ideal, ref=reference_of[sensor])
         errors[sensor] = corrected_of[sensor] - true[rows]
-    for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
-        yield {sensor: error[start:stop] for sensor, error in errors.items()}
-
-
-def _model_errors(
-    windows: Sequence[Window], table: Table, side: _Side
-) -> Iterator[dict[str, np.ndarray]]:
-    """Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3)."""
-    residual_of = residuals(windows, table, side.model, values=side.values)
-    for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
-        yield {sensor: residual[start:stop] for sensor, residual in residual_of.items()}
+    return errors

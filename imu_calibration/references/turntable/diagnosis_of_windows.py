@@ -12,7 +12,6 @@ from imu_calibration.calibration.diagnosis.findings import (
 )
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.applied_gain_of_windows import (
     gain_of_findings,
     gains_of_formulas,
@@ -45,15 +44,13 @@ the effect is then reported with the finding.
 
 
 def build_diagnosis(
-    table: Table, investigation: Investigation, *, calibrated: Solution | None = None
+    investigation: Investigation, *, calibrated: Solution | None = None
 ) -> Diagnosis:
     """
     Return the result of an investigation as a Diagnosis, without traces.
 
     Parameters
     ----------
-    table : Table
-        The reference.
     investigation : Investigation
     calibrated : Solution, optional
         Solution of a model with all findings, with the reported parameters; default: the solution
@@ -62,18 +59,12 @@ def build_diagnosis(
     """
     problem = investigation.problem
     named = investigation.named
-    analysis = ResidualAnalysis.of(investigation, table)
+    analysis = ResidualAnalysis.of(investigation)
     unexplained = analysis.unexplained
-    baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
+    baseline = extended_solution(problem, chosen=[])
     solution = baseline
     if named or investigation.limits:
-        solution = extended_solution(
-            problem.space,
-            problem.noise,
-            problem.baseline,
-            chosen=named,
-            saturations=investigation.limits,
-        )
+        solution = extended_solution(problem, named, saturations=investigation.limits)
 
     # Findings are added in their order: the functions below compare the model with the findings
     # before `place` and that with the finding at `place` too.
@@ -81,7 +72,6 @@ def build_diagnosis(
         """Return the gain of a finding over the ones before it."""
         return gain_of_findings(
             investigation,
-            table,
             named[:place],
             after=named[: place + 1],
             sensors=named[place].effect.sensors,
@@ -98,6 +88,7 @@ def build_diagnosis(
 
     def motion_of(question: Question, mate: Question) -> str:
         """Return the motion that separates two effects."""
+        table = investigation.table
         if len(table.joint_names) == 1:
             return motions_of_one_joint(question, mate)
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
@@ -138,12 +129,12 @@ def build_diagnosis(
         not_testable=tuple(investigation.not_testable),
         baseline=baseline,
         solution=solution,
-        gain=gain_of_findings(investigation, table, [], after=named, sensors=sensors),
+        gain=gain_of_findings(investigation, [], after=named, sensors=sensors),
         windows=len(investigation.used),
         locked=int(np.sum(problem.locked)),
         onset=investigation.onset,
         stamp_jitter=analysis.stamp_jitter,
-        formula_gains=gains_of_formulas(investigation, table, proposals),
+        formula_gains=gains_of_formulas(investigation, proposals),
     )
 
 

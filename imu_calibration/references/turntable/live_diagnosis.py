@@ -87,7 +87,7 @@ class DiagnosisQuestion:
             calibrated = None if extension.changes.lacking else evidence.solution
             # Its columns of a wider model need much memory.
             del evidence
-            diagnosis = build_diagnosis(self.snapshot.table, search, calibrated=calibrated)
+            diagnosis = build_diagnosis(search, calibrated=calibrated)
             return Answer(live_state_of(diagnosis), extension)
         except ImuCalibrationError as error:
             return Answer(LiveState(WAITING, str(error)))

@@ -93,7 +93,7 @@ class TableReference:
 
     def identify(self, result: TableResult) -> Diagnosis:
         """Return the errors of the model in windows."""
-        return build_diagnosis(self.table, result.search, calibrated=result.solution)
+        return build_diagnosis(result.search, calibrated=result.solution)
 
     def traces(
         self, recording: StoredRecording, before: Solution, after: Solution | Calibration

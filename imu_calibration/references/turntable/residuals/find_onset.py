@@ -19,7 +19,6 @@ from imu_calibration.references.turntable.selection.changes_in_time import (
     ChangingColumns,
     WindowRows,
 )
-from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.window_evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE
@@ -56,7 +55,6 @@ A group of fewer parameters is preferred if its excess is at most this many time
 
 def find_onset(
     problem: LinearisedProblem,
-    explained: ExplainedWindows,
     chosen: Sequence[Question],
     *,
     windows: Sequence[Window],
@@ -79,7 +77,7 @@ def find_onset(
     parameters = list(used)
     for group in groups:
         parameters += [k for k in group.parameters.tolist() if k not in parameters]
-    rows = WindowRows.of(space.restricted(np.array(parameters)), explained.floor.noise)
+    rows = WindowRows.of(space.restricted(np.array(parameters)), problem.explained.floor.noise)
 
     # Both parts must contain enough moving windows for a separate search.
     n_moving = np.cumsum(space.recording.moving)

@@ -90,26 +90,24 @@ class ResidualAnalysis(Investigation):
     Methods with an argument `chosen` concern the model with these effects; None: the findings.
     """
 
-    table: Table
-    """The reference."""
     replaced: Sequence[Question] = ()
     """Effects that a formula, a regime or the temperature replaces (`superseded`)."""
     _cache: _BlockCache = field(default_factory=_BlockCache, init=False, repr=False)
 
     @classmethod
-    def of(cls, investigation: Investigation, table: Table) -> 'ResidualAnalysis':
+    def of(cls, investigation: Investigation) -> 'ResidualAnalysis':
         """
         Return an Investigation as a ResidualAnalysis; a ResidualAnalysis is returned unchanged.
         """
         if isinstance(investigation, cls):
             return investigation
         values = {each.name: getattr(investigation, each.name) for each in fields(investigation)}
-        return cls(**values, table=table)
+        return cls(**values)
 
     @cached_property
     def residual_of(self) -> dict[str, Unexplained]:
         """Sensor -> its residual with the findings, with axes and cause where it is significant."""
-        residual_of = unexplained(self.problem, self.explained, self.named)
+        residual_of = unexplained(self.problem, self.named)
         for sensor, residual in residual_of.items():
             if residual.significant:
                 residual_of[sensor] = replace(
@@ -165,9 +163,7 @@ class ResidualAnalysis(Investigation):
     def blocks(self) -> dict[str, BlockMeans]:
         """Sensor -> BlockMeans; computed again after `unexplained_rests` has freed them."""
         if self._cache.blocks is None:
-            self._cache.blocks = residual_blocks(
-                self.used, self.table, self.problem, explained=self.explained
-            )
+            self._cache.blocks = residual_blocks(self.used, self.table, self.problem)
         return self._cache.blocks
 
     def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:
@@ -256,7 +252,7 @@ class ResidualAnalysis(Investigation):
         """
         report('analysing the residual')
         proposals = [proposal for proposal in self.proposals.values() if proposal is not None]
-        tones = find_tones(self, self.table, proposals)
+        tones = find_tones(self, proposals)
         accelerometer = SENSORS[0]
         if accelerometer in self.residual_of:
             sway = find_sway(self.blocks[accelerometer], self.fits(accelerometer))
@@ -379,7 +375,7 @@ def inquire(
 
     """
     investigation = investigate(windows, table, model, bias_processes=bias_processes)
-    return without_superseded(ResidualAnalysis.of(investigation, table))
+    return without_superseded(ResidualAnalysis.of(investigation))
 
 
 def without_superseded(analysis: ResidualAnalysis) -> ResidualAnalysis:

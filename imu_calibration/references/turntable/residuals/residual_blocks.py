@@ -26,7 +26,6 @@ from imu_calibration.references.turntable.residuals.jitter_of_blocks import (
     jitter_ratio,
     stamp_jitter,
 )
-from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.noise_beside_effects import natural_processes
 from imu_calibration.references.turntable.selection.reduced_recording import columns_with_bank
@@ -219,11 +218,7 @@ class _CutWindows:
 
 
 def residual_blocks(
-    windows: Sequence[Window],
-    table: Table,
-    problem: LinearisedProblem,
-    *,
-    explained: ExplainedWindows,
+    windows: Sequence[Window], table: Table, problem: LinearisedProblem
 ) -> dict[str, BlockMeans]:
     """
     Return sensor -> BlockMeans of the windows of the reduced recording.
@@ -234,9 +229,7 @@ def residual_blocks(
         Windows of the fit, in order.
     table : Table
     problem : LinearisedProblem
-        The linearisation of the columns.
-    explained : ExplainedWindows
-        The noise of each sensor.
+        The linearisation of the columns, and the noise of each sensor.
 
     """
     cut = _CutWindows.of(windows)
@@ -272,7 +265,7 @@ def residual_blocks(
     n_samples_of_block = np.diff(cut.first_sample, append=len(time)).astype(float)
     blocks = {}
     for sensor, residual in residual_of.items():
-        floor = explained.floor.noise[sensor]
+        floor = problem.explained.floor.noise[sensor]
         noise_factor = _white_noise_factor(
             cut.windows, sensor, floor, problem.recording.kind[cut.used], ~problem.locked[cut.used]
         )

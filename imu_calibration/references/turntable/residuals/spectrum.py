@@ -12,7 +12,6 @@ import numpy as np
 from imu_calibration.core.distributions import binom_sf, f_sf
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.residuals.proposals import Proposal, with_formulas
 from imu_calibration.references.turntable.residuals.residual_blocks import (
@@ -327,7 +326,7 @@ class Tone:
 
 
 def find_tones(
-    investigation: Investigation, table: Table, formulas: Sequence[Proposal] = ()
+    investigation: Investigation, formulas: Sequence[Proposal] = ()
 ) -> dict[str, tuple[Tone, ...]]:
     """
     Return sensor -> the tones in the residual, the most significant first.
@@ -343,6 +342,7 @@ def find_tones(
     model = investigation.problem.recording.model
     values = investigation.problem.values(investigation.named)[: len(model.param_names)]
     model, values = with_formulas(model, values, formulas)
+    table = investigation.table
     windows = investigation.used
     edges = np.cumsum([len(window) for window in windows])[:-1]
     residual_of = {}  # sensor -> residual of each window

@@ -7,7 +7,6 @@ import numpy as np
 
 from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.rows import weights_of
-from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.reduced_recording import ReducedRecording
 from imu_calibration.selection.questions import Question
@@ -35,16 +34,13 @@ residual.
 """
 
 
-def unexplained(
-    problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]
-) -> dict[str, Unexplained]:
+def unexplained(problem: LinearisedProblem, chosen: Sequence[Question]) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained with the effects `chosen` in the model."""
-    excess = explained.excess(chosen)
     used = problem.search.indices(chosen)
     values = weights_of(used, problem.evidence.fit(used)[0], problem.space.size)
     of_sensors = {}
-    for sensor, excess_of_sensor in excess.items():
-        of_sensors[sensor] = _unexplained(problem, explained, sensor, excess_of_sensor, values)
+    for sensor, excess in problem.explained.excess(chosen).items():
+        of_sensors[sensor] = _unexplained(problem, sensor, excess, values)
     return of_sensors
 
 
@@ -99,11 +95,7 @@ def scatter_in_motion(problem: LinearisedProblem, sensor: str) -> np.ndarray:
 
 
 def _unexplained(
-    problem: LinearisedProblem,
-    explained: ExplainedWindows,
-    sensor: str,
-    excess: np.ndarray,
-    values: np.ndarray,
+    problem: LinearisedProblem, sensor: str, excess: np.ndarray, values: np.ndarray
 ) -> Unexplained:
     """
     Return the residual of a sensor that the model does not explain, and its likely cause.
@@ -111,7 +103,6 @@ def _unexplained(
     Parameters
     ----------
     problem : LinearisedProblem
-    explained : ExplainedWindows
     sensor : str
     excess : ndarray, shape (2, 3)
         Excess squares over noise of the means and within windows, of each axis.
@@ -121,6 +112,7 @@ def _unexplained(
     """
     space = problem.space
     recording = problem.recording
+    explained = problem.explained
     residual_of_axes = []  # of the means of the windows
     for axis in range(3):
         residual_of_axes.append(space.mean[sensor][axis] @ values[space.places(sensor, axis)])

@@ -6,53 +6,47 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.effects.base import Role
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import SAMPLE_NOISE, Solution
 from imu_calibration.references.turntable.estimation.session_noise import WEIGHTLESS
 from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.references.turntable.noise_model import NoiseModel
-from imu_calibration.references.turntable.selection.parameter_space import ParameterSpace
+from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.saturation import Saturation
 from imu_calibration.selection.questions import Question
 
 
 def extended_solution(
-    space: ParameterSpace,
-    noise: dict[str, NoiseModel],
-    baseline: SensorModel,
-    *,
+    problem: LinearisedProblem,
     chosen: Sequence[Question],
+    *,
     saturations: Sequence[Saturation] = (),
 ) -> Solution:
     """
-    Return the Solution of the baseline extended by the chosen effects.
+    Return the Solution of the baseline of a problem, extended by the chosen effects.
 
     Parameters
     ----------
-    space : ParameterSpace
-        Of a recording linearised at the chosen effects.
-    noise : dict
-        Sensor -> NoiseModel.
-    baseline : SensorModel
+    problem : LinearisedProblem
+        Linearised at the chosen effects.
     chosen : sequence of Question
     saturations : sequence of Saturation
         Limits to write into the model.
 
     """
     # Linearised where the rows of the recording are.
-    model_of_rows = space.recording.model
+    model_of_rows = problem.recording.model
     model = replace(
-        baseline,
-        point={**baseline.point, **model_of_rows.point},
+        problem.baseline,
+        point={**problem.baseline.point, **model_of_rows.point},
         temperature_ref_c=model_of_rows.temperature_ref_c,
         folded_arms=model_of_rows.folded_arms,
     )
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
     trusted = {}
-    for sensor in space.sensors:
-        trusted[sensor] = _in_trusted_band(noise[sensor], space.slow_only[sensor])
-    solution = solve(space.recording.accumulated(model), model, noise=trusted)
+    for sensor, noise in problem.noise.items():
+        trusted[sensor] = _in_trusted_band(noise, problem.space.slow_only[sensor])
+    solution = solve(problem.recording.accumulated(model), model, noise=trusted)
     solution = replace(solution, model=replace(model, folded_arms=None))
     for limit in saturations:
         solution = _with_limit(solution, limit)

@@ -19,7 +19,6 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.residuals.find_onset import find_onset
-from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
 from imu_calibration.references.turntable.selection.extended_model import (
     point_with,
     without_saturation,
@@ -49,7 +48,7 @@ from imu_calibration.selection.gain import LEAST_REDUCTION
 from imu_calibration.selection.onset import Onset
 from imu_calibration.selection.order_of_tests import EffectTests, select_findings
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.search import SelectedEffects
+from imu_calibration.selection.selected_effects import SelectedEffects
 
 LINEARISATIONS = 5
 """Largest number of linearisations."""
@@ -68,12 +67,12 @@ needs up to eight linearisations.
 class Investigation(SelectedEffects):
     """Numerical result of a search, without sentences."""
 
+    table: Table
+    """The reference."""
     used: list[Window]
     """Windows that were fitted to, without clipped samples."""
     problem: LinearisedProblem
     """Linearised at the findings."""
-    explained: ExplainedWindows
-    """Excess over noise, and the share of it that effects remove."""
     rivals: Sequence[Rival] = field(default_factory=list)
     """Alternatives to findings that fit nearly as well."""
     onset: Onset | None = None
@@ -106,14 +105,7 @@ class Investigation(SelectedEffects):
         """Return the solution without the saturated samples; None where no limit was found."""
         if not self.limits:
             return None
-        problem = self.problem
-        return extended_solution(
-            problem.space,
-            problem.noise,
-            problem.baseline,
-            chosen=self.adopted,
-            saturations=self.limits,
-        )
+        return extended_solution(self.problem, self.adopted, saturations=self.limits)
 
 
 def investigate(
@@ -165,9 +157,7 @@ def investigate(
     onset = None
     if result.outcome.rest:
         outcome = result.outcome
-        onset = find_onset(
-            outcome.problem, outcome.explained, outcome.named, windows=used, table=table
-        )
+        onset = find_onset(outcome.problem, outcome.named, windows=used, table=table)
 
     # A step of the clock is an effect: the search is repeated with it, and counts if it removes
     # most of the excess.
@@ -203,9 +193,9 @@ def investigate(
             rivals.append(rival)
     rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
     return Investigation(
+        table=table,
         used=used,
         problem=outcome.problem,
-        explained=outcome.explained,
         named=named,
         not_testable=not_testable,
         unstable=unstable,
@@ -270,8 +260,6 @@ class _Outcome:
 
     problem: LinearisedProblem
     """Linearised at the choice."""
-    explained: ExplainedWindows
-    """Excess over noise there."""
     chosen: Sequence[Question]
     """Effects that the search chose by likelihood."""
     named: Sequence[Question]
@@ -282,7 +270,7 @@ class _Outcome:
     @cached_property
     def rest(self) -> float:
         """Significant excess over noise with the findings in the model."""
-        return self.explained.rest(self.named)
+        return self.problem.explained.rest(self.named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,7 +379,7 @@ def _looked_again(
     best = min(choices, key=search.cost)
     if _labels(best) in tried:
         return outcome
-    if outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest:
+    if outcome.problem.explained.rest(best) >= LEFT_BEFORE * outcome.rest:
         return outcome
     # Implausible sizes have a price; without them the better choice has the lower cost.
     if not searched.any_size and search.cost(best) >= search.cost(outcome.chosen):
@@ -427,9 +415,8 @@ def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome
     """Return the outcome of a choice at the linearisation of a problem."""
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
-    explained = ExplainedWindows(problem.evidence, problem.search)
-    found = select_findings(WindowTests(problem, explained), chosen)
-    return _Outcome(problem, explained, chosen, found.named, found.unstable)
+    found = select_findings(WindowTests(problem), chosen)
+    return _Outcome(problem, chosen, named=found.named, unstable=found.unstable)
 
 
 def _without_unnamed(outcome: _Outcome, searched: SearchedWindows) -> _Outcome:
@@ -442,14 +429,12 @@ def _without_unnamed(outcome: _Outcome, searched: SearchedWindows) -> _Outcome:
         if not outcome.problem.acts_beside(outcome.named):
             break
         problem = searched.linearised(outcome.problem.point(outcome.named))
-        explained = ExplainedWindows(problem.evidence, problem.search)
-        named = pruned(same_questions(problem, outcome.named), explained.share)
+        named = pruned(same_questions(problem, outcome.named), problem.explained.share)
         outcome = _Outcome(
             problem,
-            explained,
             same_questions(problem, outcome.chosen),
-            WindowTests(problem, explained).predicting(named),
-            same_questions(problem, outcome.unstable),
+            named=WindowTests(problem).predicting(named),
+            unstable=same_questions(problem, outcome.unstable),
         )
     return outcome
 
@@ -480,12 +465,10 @@ class WindowTests(EffectTests):
 
     problem: LinearisedProblem
     """Linearised at the choice, or near it."""
-    explained: ExplainedWindows
-    """Excess over noise in its windows."""
 
     def preferred(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects, or a simpler alternative."""
-        return simpler(self.problem, self.explained, named)
+        return simpler(self.problem, named)
 
     def admissible(self, named: Sequence[Question]) -> Sequence[Question]:
         """Return the effects of a possible size on which the windows agree."""
@@ -509,7 +492,7 @@ class WindowTests(EffectTests):
         least = np.inf
         for k, question in enumerate(kept):
             reduction = _sure_reduction(self.problem, kept, question)
-            if not reduction > _needed_reduction(self.problem, self.explained, kept, question):
+            if not reduction > _needed_reduction(self.problem, kept, question):
                 # Without an interval (NaN) the reduction is the least of all.
                 reduction = -np.inf if np.isnan(reduction) else reduction
                 if place is None or reduction < least:
@@ -523,10 +506,7 @@ class WindowTests(EffectTests):
 
 
 def _needed_reduction(
-    problem: LinearisedProblem,
-    explained: ExplainedWindows,
-    chosen: Sequence[Question],
-    question: Question,
+    problem: LinearisedProblem, chosen: Sequence[Question], question: Question
 ) -> float:
     """
     Return the required relative reduction of the residual by an effect.
@@ -535,7 +515,7 @@ def _needed_reduction(
     noise.
     """
     has_rests = not problem.recording.moving.all()
-    if has_rests and not explained.rest_beside(chosen, question):
+    if has_rests and not problem.explained.rest_beside(chosen, question):
         return 0.0
     return LEAST_REDUCTION
 

@@ -18,6 +18,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.selection.explained_windows import ExplainedWindows
 from imu_calibration.references.turntable.selection.extended_model import extended_model
 from imu_calibration.references.turntable.selection.noise_beside_effects import (
     in_trusted_band,
@@ -145,15 +146,15 @@ class LinearisedProblem:
         space = in_trusted_band(self.all_samples)
         self.space = replace(space, recording=recording)
         """All windows, locked ones included, in the trusted band."""
-        self.questions = questions(space, effects)
+        candidates = questions(space, effects)
         self.noise = noise_beside_effects(
-            space, smooth_parameters(self.questions), searched.bias_processes
+            space, smooth_parameters(candidates), searched.bias_processes
         )
         self.evidence = WindowEvidence(space, self.noise, folds_of(space.recording.kind))
         self.search = Search(
             self.evidence,
             in_baseline,
-            self.questions,
+            candidates,
             encoder_step=space.recording.encoder_step,
             any_size=searched.any_size,
             resolved=searched.resolved,
@@ -169,6 +170,16 @@ class LinearisedProblem:
     def recording(self) -> ReducedRecording:
         """The reduced recording, all of its windows."""
         return self.space.recording
+
+    @property
+    def questions(self) -> Sequence[Question]:
+        """Candidate effects."""
+        return self.search.questions
+
+    @cached_property
+    def explained(self) -> ExplainedWindows:
+        """Excess over noise in the selection windows, and the share of it that effects remove."""
+        return ExplainedWindows(self.evidence, self.search)
 
     @cached_property
     def locked_samples(self) -> ParameterSpace:

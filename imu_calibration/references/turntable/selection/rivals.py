@@ -19,7 +19,7 @@ from imu_calibration.references.turntable.selection.linearised_problem import (
     SearchedWindows,
 )
 from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
-from imu_calibration.selection.explained_share import Explained, needed_share
+from imu_calibration.selection.explained_share import needed_share
 from imu_calibration.selection.gain import LEAST_REDUCTION
 from imu_calibration.selection.questions import Question, with_exchanged
 from imu_calibration.selection.search import PENALTY, TIE, Search
@@ -177,9 +177,7 @@ replacement.
 """
 
 
-def simpler(
-    problem: LinearisedProblem, explained: Explained, named: Sequence[Question]
-) -> Sequence[Question]:
+def simpler(problem: LinearisedProblem, named: Sequence[Question]) -> Sequence[Question]:
     """
     Return findings with no more parameters than the held-out residual supports.
 
@@ -190,13 +188,13 @@ def simpler(
     """
     kept = list(named)
     for place, question in enumerate(named):
-        if not explained.rest_beside(kept, question):
+        if not problem.explained.rest_beside(kept, question):
             continue
         for other in _fewer(problem.search, kept, question):
             instead = with_exchanged(kept, place, other)
             if not problem.search.allowed(instead, other):
                 continue
-            if explained.share(instead, other) < needed_share(other):
+            if problem.explained.share(instead, other) < needed_share(other):
                 continue
             # A finding that surely lowers the residual below that of the simpler one is kept.
             gain = gain_in_turn(problem, instead, kept, sensors=question.effect.sensors)
