@@ -15,8 +15,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.references.turntable.collector import GatherStep
-from imu_calibration.references.turntable.estimation.solver import solve
-from imu_calibration.references.turntable.window_observations import (
+from imu_calibration.references.turntable.error_budget_of_windows import (
     JOINT_POSITION_SD,
     _faster,
     _heavier,
@@ -25,6 +24,7 @@ from imu_calibration.references.turntable.window_observations import (
     error_budget,
     parameter_shifts,
 )
+from imu_calibration.references.turntable.estimation.solver import solve
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
@@ -67,6 +67,12 @@ def result(recording):
     return calibrated(recording, replace(TABLE, mount_xyz=(0.0, 0.0, 0.0)))
 
 
+def shifts_by(result, *changes):
+    """Return the shifts of the parameters by each change of the reference, in each window."""
+    data = result.data
+    return parameter_shifts(data.table, data.gathered, result.solution, changes=changes)
+
+
 def moved(recording, result, false_table):
     """Return how the estimate moves when the reference is wrong, at the same weights."""
     gathered = GatherStep(false_table, result.model).gather([recording], 0)
@@ -79,7 +85,7 @@ def moved(recording, result, false_table):
 @pytest.mark.parametrize('axis', (0, 1))
 def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, result, axis):
     angle = 1e-3 * np.eye(2)[axis]
-    shift = parameter_shifts(result.data, result.solution, [partial(_tilted, angle)])[0].sum(axis=0)
+    shift = shifts_by(result, partial(_tilted, angle))[0].sum(axis=0)
     actual = -moved(recording, result, tilt(result.data.table, angle))
     assert np.linalg.norm(shift[:12]) > 1e-4
     for effect in result.solution.model.effects[:3]:
@@ -90,16 +96,14 @@ def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, 
 
 
 def test_a_wrong_gravity_scales_the_accelerometer_matrix(recording, result):
-    shift = parameter_shifts(result.data, result.solution, [partial(_heavier, 0.01)])[0].sum(axis=0)
+    shift = shifts_by(result, partial(_heavier, 0.01))[0].sum(axis=0)
     assert shift[3:12] == pytest.approx(result.solution.values[3:12] * 0.01 / 9.81, abs=3e-7)
     actual = -moved(recording, result, replace(result.data.table, gravity=9.82))
     assert actual[:21] == pytest.approx(shift[:21], abs=5e-6)
 
 
 def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
-    shift = parameter_shifts(result.data, result.solution, [partial(_faster, 1 + 1e-3)])[0].sum(
-        axis=0
-    )
+    shift = shifts_by(result, partial(_faster, 1 + 1e-3))[0].sum(axis=0)
     names = result.solution.param_names
     arms, matrix = (
         result.solution.model.slices[key]
@@ -114,7 +118,7 @@ def test_joint_errors_are_drawn_anew_in_every_window(result):
     """The sd of the budget is that of random joint errors put through the same shifts."""
     budget = result.error_budget()
     changes = [partial(_turned, angles) for angles in JOINT_POSITION_SD * np.eye(3)]
-    shifts = parameter_shifts(result.data, result.solution, changes)
+    shifts = shifts_by(result, *changes)
     rng = np.random.default_rng(5)
     draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)
     own = budget.causes['joint position']
@@ -137,7 +141,7 @@ def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):
 def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result, monkeypatch):
     small = result.error_budget()
     monkeypatch.setattr(
-        'imu_calibration.references.turntable.window_observations.JOINT_POSITION_SD',
+        'imu_calibration.references.turntable.error_budget_of_windows.JOINT_POSITION_SD',
         10 * JOINT_POSITION_SD,
     )
     large = result.error_budget()
@@ -150,8 +154,9 @@ def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result, 
 
 
 def test_gravity_sd_of_the_table_description_is_used(result):
-    stated = replace(result.data, table=replace(result.data.table, gravity_sd=1e-3))
-    assert '0.001' in error_budget(stated, result.solution).texts['gravity']
+    stated = replace(result.data.table, gravity_sd=1e-3)
+    budget = error_budget(stated, result.data.gathered, result.solution)
+    assert '0.001' in budget.texts['gravity']
 
 
 def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording, result):
@@ -166,5 +171,5 @@ def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording,
         for table in (place, replace(place, gravity_sd=0.0))
     )
     assert stated - exact == pytest.approx(1e-8 * result.solution.values[scales] ** 2, rel=1e-3)
-    at_place = error_budget(replace(result.data, table=place), result.solution)
+    at_place = error_budget(place, result.data.gathered, result.solution)
     assert at_place.causes['gravity'][scales] == pytest.approx(1e-4, rel=0.02)
