@@ -199,7 +199,7 @@ class CalibrationResult(Generic[Estimate]):
     """The estimate in the document: `solution` with the values of `fits`."""
     fits: tuple[PlainFit, ...] = ()
     """Plain fits that predict held-out data better than the solution."""
-    search: Any = None
+    search: SelectedEffects | None = None
     """Result of the search for the model; None without a search."""
 
     @property

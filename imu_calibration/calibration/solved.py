@@ -1,12 +1,13 @@
 """A solution with the data that it was solved from, for any reference."""
 
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol
+from typing import Generic, Protocol
 
 from imu_calibration.calibration.from_solution import Estimate, ModelExtension
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import Observations
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.selection.selected_effects import SelectedEffects
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +20,7 @@ class Solved(Generic[Estimate]):
     """What the reference gathered."""
     extension: ModelExtension = ModelExtension()
     """Effects that the search added; nothing without a search."""
-    search: Any = None
+    search: SelectedEffects | None = None
     """Result of the search; None without one, or with too few data."""
 
     @property

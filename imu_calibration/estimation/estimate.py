@@ -14,7 +14,7 @@ import numpy as np
 
 from imu_calibration.estimation.gauss_newton import StateT
 from imu_calibration.estimation.scaled_solve import covariance_with_held
-from imu_calibration.estimation.solution import terms_of_fit
+from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 
 
 class WeightedRows(Protocol):
@@ -123,7 +123,8 @@ def estimate(
         held[list(misfit)] = True
 
     # 4. The covariance as a sum of named terms.
-    terms = terms_of_fit(of_free, rows.scatter_term(of_free), of_held)
+    of_bias = rows.scatter_term(of_free)
+    terms = {SAMPLE_NOISE: of_free - of_bias, BIAS_PROCESS: of_bias, HELD_PRIORS: of_held}
     return JointEstimate(
         state=state, rows=rows, terms=terms, held=held, free=free, not_believed=not_believed
     )

@@ -138,25 +138,6 @@ def common_scale(model: SensorModel, values: np.ndarray) -> np.ndarray:
     return change
 
 
-def terms_of_fit(
-    of_free: np.ndarray, of_bias: np.ndarray, of_held: np.ndarray
-) -> dict[str, np.ndarray]:
-    """
-    Return the terms of the covariance of a fit, each of shape (n, n).
-
-    Parameters
-    ----------
-    of_free : array
-        Covariance of the free parameters by all errors of the data.
-    of_bias : array
-        Its part from bias processes and offsets.
-    of_held : array
-        Covariance due to the priors of the held parameters.
-
-    """
-    return {SAMPLE_NOISE: of_free - of_bias, BIAS_PROCESS: of_bias, HELD_PRIORS: of_held}
-
-
 def bounded_by_prior(terms: Terms, held: np.ndarray, prior_sd: np.ndarray) -> dict[str, np.ndarray]:
     """
     Return the terms with no more than the variance of the prior for held parameters.

@@ -24,6 +24,12 @@ MIN_EXPLAINED_WINDOWS = 12
 """Least number of windows; with fewer the model hardly predicts held-out windows."""
 ALPHA = 1e-4
 """Significance that a correlation must have."""
+MIN_CORRELATED_SHARE = 0.15
+"""Adjusted share of the variance above which a significant variable is named as a likely cause."""
+WINDOWS_PER_COLUMN = 3
+"""Windows for each column of a variable, at least, in addition to `SPARE_WINDOWS`."""
+SPARE_WINDOWS = 6
+"""Windows that a variable of few columns needs in addition."""
 IN_MOTION = 'motion (moving windows against windows at rest)'
 """Name of the variable that separates moving windows from windows at rest."""
 CURVES_IN_TIME = 'time'
@@ -135,7 +141,8 @@ def correlate(
         fitted = [np.zeros((len(residual), 0))] * residual.shape[1]
     bias = np.ones((len(residual), 1))
     for name, columns, known in explanations:
-        if known.sum() < 3 * columns.shape[1] + 6:
+        # A variable with nearly as many columns as windows would fit any residual.
+        if known.sum() < WINDOWS_PER_COLUMN * columns.shape[1] + SPARE_WINDOWS:
             continue
         squares_without = 0.0
         dof_without = 0
@@ -157,7 +164,7 @@ def correlate(
         share = 1 - (squares_with / dof_with) / (squares_without / dof_without)
         variance = max(squares_with / dof_with, 1e-300)
         p_value = f_sf((squares_without - squares_with) / n_added / variance, n_added, dof_with)
-        if p_value < ALPHA and share > max(best[1], 0.15):
+        if p_value < ALPHA and share > max(best[1], MIN_CORRELATED_SHARE):
             best = (name, float(share))
     return best
 

@@ -1268,15 +1268,15 @@ LIVE = _of(
     (
         'an earlier run is forgotten',
         'LiveCalibration._with_earlier',
-        'merge([copied(self.earlier), _1])',
+        'merge([self.earlier, _1])',
         '_1',
         'test_live_calibration.py::test_a_session_resumed_from_its_state_equals_two_recordings',
     ),
     (
         'solving again adds the earlier run again',
-        'LiveCalibration._with_earlier',
-        'copied(self.earlier)',
-        'self.earlier',
+        'merge',
+        '_1.accumulator.copy()',
+        '_1.accumulator',
         'test_live_calibration.py::test_a_session_resumed_from_its_state_equals_two_recordings',
     ),
 )

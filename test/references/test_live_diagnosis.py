@@ -240,7 +240,7 @@ def test_without_windows_nothing_is_asked(hidden):
 
 def test_a_window_keeps_no_chunk_alive(station):
     """A window that was cut from a chunk of 20 s would keep all of it."""
-    for window in station.live.last.gathered.spreads[0].windows:
+    for window in station.live.last.gathered.for_search[0].windows:
         assert all(
             array.base is None
             for array in (window.force_s, window.rate_s, window.stamp_ns, window.motion.position)

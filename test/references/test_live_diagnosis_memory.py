@@ -48,7 +48,7 @@ def question():
 
 @pytest.mark.long
 def test_peak_of_a_live_diagnosis(question):
-    windows = question.snapshot.gathered.spreads[0].windows
+    windows = question.snapshot.gathered.for_search[0].windows
     assert sum(map(len, windows)) <= MAX_LIVE_SAMPLES
     size = sum(
         each.nbytes

@@ -73,7 +73,7 @@ def test_a_wrong_gain_at_high_frequency_does_not_bend_the_estimate(fast_gain):
     windows = sweeps(np.random.default_rng(1), fast_gain)
     value, sd, noise = solved(windows)
     assert abs(value - GAIN) < 4 * sd < 0.01
-    assert noise.moving['dynamic'].slow[2] < 0.5 * noise.moving['dynamic'].every[2]
+    assert noise.moving['dynamic'].slow[2] < 0.5 * noise.moving['dynamic'].centred[2]
     x = np.concatenate([w.motion.rate[:, 0] - w.motion.rate[:, 0].mean() for w in windows])
     y = np.concatenate([w.rate_s[:, 2] for w in windows])
     assert abs(x @ y / (x @ x) - GAIN) > 3 * abs(value - GAIN)
@@ -105,7 +105,7 @@ def test_white_noise_has_the_same_variance_in_both_parts():
     np.testing.assert_allclose(found.overall, 4.0, rtol=0.05)
     np.testing.assert_allclose(found.slow, 4.0, rtol=0.2)
     factors = found.factors(NoiseModel(np.full(3, 4.0), np.ones(3)))
-    np.testing.assert_array_equal(factors.every, factors.slow)
+    np.testing.assert_array_equal(factors.centred, factors.slow)
 
 
 def test_weights_of_slow_and_of_all_rows_give_each_part_its_own():

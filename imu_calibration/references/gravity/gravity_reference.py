@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.check import ReadingErrors
@@ -29,6 +29,7 @@ from imu_calibration.references.gravity.pose_readings import errors_by_hand
 if TYPE_CHECKING:
     from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
     from imu_calibration.calibration.diagnosis.traces import Traces
+    from imu_calibration.references.gravity.model_selection import HandInvestigation
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class GravityReference:
         # Here, because its import is slow.
         from imu_calibration.references.gravity.diagnosis_of_poses import diagnosis_by_hand
 
-        return diagnosis_by_hand(result.search, result.solution)
+        return diagnosis_by_hand(cast('HandInvestigation', result.search), result.solution)
 
     def traces(
         self, recording: PoseRecording, before: HandCalibration, after: HandCalibration

@@ -334,7 +334,7 @@ class Collector:
         Checks that see the cleaned samples.
     windows : optional
         Receives all windows with their samples, unused ones too.
-    spread : bool
+    keep_for_search : bool
         Whether windows are kept for the search of effects.
     judged_from : float
         Windows from this time on are judged by a proof, s.
@@ -355,7 +355,7 @@ class Collector:
         session: int = 0,
         watchers: Sequence[Watcher] = (),
         windows: StoredWindows | KeptWindows | list | None = None,
-        spread: bool = False,
+        keep_for_search: bool = False,
         judged_from: float = 0.0,
         without: np.ndarray = NO_RANGES,
         unusable: Sequence[str] = (),
@@ -364,7 +364,7 @@ class Collector:
         self.model = model
         self.session = session
         self.windows = windows
-        self.spread = spread
+        self.keep_for_search = keep_for_search
         # Cleans the samples, joins the streams and finds the windows.
         self.gatherer = MotionGatherer(
             table,
@@ -446,8 +446,8 @@ class Collector:
             n_samples = sum(len(w.time) for w in kept) + len(window.time)
             if n_samples <= KEPT_SAMPLES:
                 kept.append(window)
-        if self.spread:
-            self.gathered.spreads[0].add(owned_window(window))
+        if self.keep_for_search:
+            self.gathered.for_search[0].add(owned_window(window))
 
 
 @dataclass(frozen=True)
@@ -466,7 +466,7 @@ class GatherStep:
     """
     Names of the recordings for messages; with several of them an error names the one at fault.
     """
-    spread: bool = False
+    keep_for_search: bool = False
     """Whether windows are kept for the search of effects."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
@@ -536,7 +536,7 @@ class GatherStep:
             session=session,
             watchers=watchers,
             windows=windows,
-            spread=self.spread,
+            keep_for_search=self.keep_for_search,
             judged_from=self.judged_from,
             without=without,
             unusable=unusable,
@@ -576,13 +576,13 @@ class LiveCollector(Collector):
     ):
         super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
         self.store = store
-        self.gathered.spreads = [DecimatedWindows(MAX_LIVE_SAMPLES)]
+        self.gathered.for_search = [DecimatedWindows(MAX_LIVE_SAMPLES)]
 
     def _store(self, window: Window, reduced: WindowStatistics) -> None:
         """Keep a copy of a window for other columns and for the search of effects."""
         kept = owned_window(window)
         self.store.add(kept, reduced)
-        self.gathered.spreads[0].add(kept)
+        self.gathered.for_search[0].add(kept)
 
     def take_model(self, model: SensorModel) -> None:
         """
@@ -620,5 +620,5 @@ def copied(gathered: SessionData) -> SessionData:
         poses=list(gathered.poses),
         kept=[],
         counts=dict(gathered.counts),
-        spreads=[spread.copy() for spread in gathered.spreads],
+        for_search=[kept.copy() for kept in gathered.for_search],
     )

@@ -1,7 +1,7 @@
 """A diagnosis during the motion: its input, a solution, and its outcome as a status."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
@@ -16,7 +16,10 @@ from imu_calibration.core.progress import LiveState
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.live_windows import LiveSnapshot
-from imu_calibration.references.turntable.selection.investigation import too_few_windows
+from imu_calibration.references.turntable.selection.investigation import (
+    Investigation,
+    too_few_windows,
+)
 from imu_calibration.references.turntable.selection.window_evidence import MIN_FOLD_WINDOWS
 from imu_calibration.references.turntable.window_search import windows_to_search
 
@@ -80,9 +83,9 @@ class DiagnosisQuestion:
         try:
             evidence = self.snapshot.evidence()
             if evidence.search is None:
-                spreads = self.snapshot.gathered.spreads
-                raise too_few_windows(sum(len(spread.windows) for spread in spreads))
-            search = evidence.search
+                for_search = self.snapshot.gathered.for_search
+                raise too_few_windows(sum(len(kept.windows) for kept in for_search))
+            search = cast(Investigation, evidence.search)
             extension = evidence.extension
             calibrated = None if extension.changes.lacking else evidence.solution
             # Its columns of a wider model need much memory.

@@ -28,7 +28,6 @@ from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.window import Window, WindowSettings
 from imu_calibration.references.turntable.collector import (
     LiveCollector,
-    copied,
     from_bytes,
     require_columns,
     to_bytes,
@@ -404,10 +403,10 @@ class LiveCalibration(LiveSession):
         return self._collector
 
     def _with_earlier(self, gathered: SessionData) -> SessionData:
-        """Return data of this run merged with a copy of those of the earlier run."""
+        """Return data of this run merged with those of the earlier run."""
         if self.earlier is None:
             return gathered
-        return merge([copied(self.earlier), gathered])
+        return merge([self.earlier, gathered])
 
     def residuals(self, windows: Sequence[Window]) -> ImuSamples | None:
         """

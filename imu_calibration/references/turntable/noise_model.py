@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.estimation.sensor_noise import BiasProcess, SensorNoise, means_beside_middles
+from imu_calibration.estimation.sensor_noise import BiasProcess, SensorNoise
 from imu_calibration.estimation.solution import Solution
 
 SAME_VARIANCE = 0.05
@@ -56,18 +56,18 @@ class MovingFactors:
     Factors on ``white_variance * inflation``, each shape (3,).
     """
 
-    every: np.ndarray
+    centred: np.ndarray
     """Factor on the variance of the centred rows."""
     slow: np.ndarray
     """
     Factor on the variance of the slow part of the centred rows, where that is smaller; otherwise
-    equal to `every`.
+    equal to `centred`.
     """
     means: np.ndarray = field(default_factory=lambda: np.ones(3))
     """Factor on the variance of window means due to the noise within windows."""
-    along: float = 1.0
+    correlation: float = 1.0
     """
-    Factor contained in `every` for misfit along the columns of the model, which is correlated in
+    Factor contained in `centred` for misfit along the columns of the model, which is correlated in
     time; at least 1.
     """
 
@@ -152,23 +152,6 @@ class NoiseModel(SensorNoise):
             return variance
         return variance + self.reference.variance(kinds, durations)[:, None]
 
-    def variance_beside_bias(
-        self,
-        kinds: Sequence[str] | np.ndarray,
-        counts: np.ndarray,
-        durations: np.ndarray,
-        *,
-        keys: Sequence[tuple[int, float]] = (),
-    ) -> np.ndarray:
-        """
-        Return the variance of window means about the bias in the middle of the window, (k, 3).
-
-        It is the sum of `mean_variance` and of the variance by the change of the bias within the
-        window.
-        """
-        noise = self.mean_variance(kinds, counts, durations, keys=keys)
-        return noise + means_beside_middles(self.bias_processes, durations)[:, None]
-
     def wander_within(self, offsets: np.ndarray) -> np.ndarray:
         """
         Return the covariance of the bias at n instants, given its value in the middle, (n, n).
@@ -188,20 +171,20 @@ class NoiseModel(SensorNoise):
     def row_variance(self, kind: str) -> np.ndarray:
         """Return the variance per centred row of windows of `kind`, shape (3,)."""
         if kind in self.moving:
-            return self.low_variance * self.moving[kind].every
+            return self.low_variance * self.moving[kind].centred
         return self.low_variance
 
     def slow_weight(self, kind: str) -> np.ndarray:
         """
         Return the additional weight w of the slow part of centred rows, shape (3,).
 
-        ``w^2 = (1/slow - 1/every) / low_variance``: all rows have the weight ``1/every``, so that
-        the slow part has ``1/slow`` in total.
+        ``w^2 = (1/slow - 1/centred) / low_variance``: all rows have the weight ``1/centred``, so
+        that the slow part has ``1/slow`` in total.
         """
         if kind not in self.moving:
             return np.zeros(3)
         factors = self.moving[kind]
-        return np.sqrt(np.maximum(1 / factors.slow - 1 / factors.every, 0.0) / self.low_variance)
+        return np.sqrt(np.maximum(1 / factors.slow - 1 / factors.centred, 0.0) / self.low_variance)
 
     def without_misfit(self, *processes: BiasProcess) -> 'NoiseModel':
         """
@@ -211,10 +194,10 @@ class NoiseModel(SensorNoise):
         """
         moving = {}
         for kind, factors in self.moving.items():
-            every = factors.every / factors.along
+            centred = factors.centred / factors.correlation
             # The means of moving windows have at least the noise at rest.
-            means = np.minimum(factors.means, np.maximum(every, 1.0))
-            moving[kind] = replace(factors, every=every, means=means)
+            means = np.minimum(factors.means, np.maximum(centred, 1.0))
+            moving[kind] = replace(factors, centred=centred, means=means)
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
 
     def weighs_alike(self, other: 'NoiseModel') -> bool:
@@ -225,14 +208,14 @@ class NoiseModel(SensorNoise):
         """
         variance_ratio = self.low_variance / other.low_variance
         for kind, factors in self.moving.items():
-            if np.all(factors.slow == factors.every):
+            if np.all(factors.slow == factors.centred):
                 continue
             if kind not in other.moving:
                 return False
             other_factors = other.moving[kind]
-            change_of_every = variance_ratio * factors.every / other_factors.every - 1
+            change_of_centred = variance_ratio * factors.centred / other_factors.centred - 1
             change_of_slow = variance_ratio * factors.slow / other_factors.slow - 1
-            if np.any(np.abs(change_of_every) > SAME_VARIANCE):
+            if np.any(np.abs(change_of_centred) > SAME_VARIANCE):
                 return False
             if np.any(np.abs(change_of_slow) > SAME_VARIANCE):
                 return False

@@ -1,5 +1,6 @@
 """Data of sessions on a table: windows stored, held out for the proof, merged."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -180,7 +181,8 @@ class KeptWindows:
 
     def clear(self) -> None:
         """Remove all windows."""
-        self.windows, self.n_samples = [], 0
+        self.windows = []
+        self.n_samples = 0
 
     def extend(self, windows: Iterable[Window]) -> None:
         """Append the used ones of some windows."""
@@ -251,12 +253,12 @@ class HeldOutBlock:
 
     def copy(self) -> 'HeldOutBlock':
         """Return an independent copy."""
-        return HeldOutBlock(
-            self.accumulator.copy(),
-            dict(self.pieces),
-            dict(self.counts),
-            self.judged,
-            dict(self.earlier),
+        return replace(
+            self,
+            accumulator=self.accumulator.copy(),
+            pieces=dict(self.pieces),
+            counts=dict(self.counts),
+            earlier=dict(self.earlier),
         )
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
@@ -265,11 +267,10 @@ class HeldOutBlock:
         for sensor, indices in selected_columns(wide, narrow).items():
             # The rows of pieces end with the derivative of the input and the output.
             chosen[sensor] = np.concatenate([indices[:-N_AXES], np.arange(-2 * N_AXES, 0)])
-        return HeldOutBlock(
+        return replace(
+            self,
             accumulator=restrict(self.accumulator, wide, narrow),
             pieces=chosen_columns(self.pieces, chosen),
-            counts=self.counts,
-            judged=self.judged,
             earlier=chosen_columns(self.earlier, chosen),
         )
 
@@ -442,7 +443,7 @@ class SessionData(GatheredData):
     """Statistics of all windows, from which parameters are estimated."""
     held_out: HeldOut = field(default_factory=HeldOut)
     """The same windows in blocks for cross-validation."""
-    spreads: list[DecimatedWindows] = field(default_factory=lambda: [DecimatedWindows()])
+    for_search: list[DecimatedWindows] = field(default_factory=lambda: [DecimatedWindows()])
     """
     Windows for the search of effects: one item for each of the `MAX_SEARCHED` recordings with most
     samples, the largest first; without windows where there is no search.
@@ -481,14 +482,14 @@ class SessionData(GatheredData):
         """
         if self.kept:
             return self.kept
-        windows = chain.from_iterable(spread.windows for spread in self.spreads)
+        windows = chain.from_iterable(kept.windows for kept in self.for_search)
         return [window for window in windows if window.kind != 'static']
 
 
-def merge(parts: Iterable[SessionData]) -> SessionData:
-    """Return the first of several recordings, to which the data of the others are added."""
-    parts = list(parts)
-    total = parts[0]
+def merge(parts: Sequence[SessionData]) -> SessionData:
+    """Return the data of several recordings as those of one; `parts` are not changed."""
+    first = parts[0]
+    total = replace(first, accumulator=first.accumulator.copy(), held_out=first.held_out.copy())
     for part in parts[1:]:
         total.accumulator.merge(part.accumulator)
         total.held_out.merge(part.held_out)
@@ -499,12 +500,11 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
         ends = np.cumsum([len(window.time) for window in windows])
         total.kept = windows[: int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))]
 
-        spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)
-        total.spreads = spreads[:MAX_SEARCHED]
-        counts = dict(total.counts)
-        for key, count in part.counts.items():
-            counts[key] = counts.get(key, 0) + count
-        total.counts = counts
+        largest_first = sorted(total.for_search + part.for_search, key=lambda kept: -kept.n_samples)
+        total.for_search = largest_first[:MAX_SEARCHED]
+        counts = Counter(total.counts)
+        counts.update(part.counts)
+        total.counts = dict(counts)
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)
         total.frame_id = total.frame_id or part.frame_id
@@ -565,13 +565,16 @@ def join(
         the table (`check_units`), with its name.
 
     """
+    named_parts = []
     for session, part in enumerate(parts):
         with naming(names, session):
             check_units(part, model, table)
         if len(parts) > 1:
-            part.findings = tuple(finding.named(names[session]) for finding in part.findings)
             _require_like_the_first(parts[0], part, names[0], names[session])
-    return merge(parts)
+            findings = tuple(finding.named(names[session]) for finding in part.findings)
+            part = replace(part, findings=findings)
+        named_parts.append(part)
+    return merge(named_parts)
 
 
 def _require_like_the_first(

@@ -121,7 +121,7 @@ class TableRecordings:
             options.windows,
             options.nominal,
             names=self.names,
-            spread=keep_windows,
+            keep_for_search=keep_windows,
             judged_from=judged_from,
         )
         parts = self.reduced(step)

@@ -25,7 +25,10 @@ from imu_calibration.preprocessing.sample_recording import read_recording
 from imu_calibration.preprocessing.window_finder import session_truth
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.live_windows import LiveCalibration
-from imu_calibration.references.turntable.selection.investigation import too_few_windows
+from imu_calibration.references.turntable.selection.investigation import (
+    Investigation,
+    too_few_windows,
+)
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.table_calibration import (
     KeptRecording,
@@ -89,11 +92,11 @@ class TableReference:
     def too_few(self, result: TableResult) -> NotObservableError:
         """Return the error with the number of windows."""
         gathered = cast(SessionData, result.data.gathered)
-        return too_few_windows(len(gathered.spreads[0].windows))
+        return too_few_windows(len(gathered.for_search[0].windows))
 
     def identify(self, result: TableResult) -> Diagnosis:
         """Return the errors of the model in windows."""
-        return build_diagnosis(result.search, calibrated=result.solution)
+        return build_diagnosis(cast(Investigation, result.search), calibrated=result.solution)
 
     def traces(
         self, recording: StoredRecording, before: Solution, after: Solution | Calibration

@@ -48,24 +48,8 @@ def windows_to_search(gathered: SessionData) -> list[list[Window]]:
 
     The largest recording is first.
     """
-    suitable = []
-    for spread in gathered.spreads:
-        if len(spread.windows) >= MIN_FOLD_WINDOWS:
-            suitable.append(spread.windows)
-    return suitable
-
-
-def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
-    """
-    Return the options of the baseline model of the search.
-
-    Effects that were not requested have to be significant.
-    """
-    return replace(
-        options,
-        accelerometer_model=options.accelerometer_model or BARE,
-        reference_model=options.reference_model or 'none',
-    )
+    windows_of_recordings = [kept.windows for kept in gathered.for_search]
+    return [windows for windows in windows_of_recordings if len(windows) >= MIN_FOLD_WINDOWS]
 
 
 def baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
@@ -80,15 +64,17 @@ def baseline_model(options: CalibrationOptions, table: Table, solved: SensorMode
         The model of a solution; the same effects are linearised at its point.
 
     """
-    model = choose_model(baseline_options(options), table)
+    # Effects that were not requested have to be significant.
+    baseline_options = replace(
+        options,
+        accelerometer_model=options.accelerometer_model or BARE,
+        reference_model=options.reference_model or 'none',
+    )
+    model = choose_model(baseline_options, table)
     for effect in solved.effects:
         # An effect that is no candidate would be reported as unexplained if it were removed.
         if effect.key not in model.slices and not model.catalogue.is_candidate(effect):
             model = model.with_effect(*effect.key)
     names = {effect.name for effect in model.effects}
     point = {name: value for name, value in solved.point.items() if name in names}
-    return replace(
-        model,
-        point=point,
-        temperature_ref_c=solved.temperature_ref_c,
-    )
+    return replace(model, point=point, temperature_ref_c=solved.temperature_ref_c)

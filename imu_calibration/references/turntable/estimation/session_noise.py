@@ -97,9 +97,9 @@ class BandMisfit:
         pieces = np.where(self.apart, 0.0, self.slow)
         of_samples = samples / noise.white_variance
         of_pieces = pieces / noise.low_variance
-        factor = np.maximum.reduce([of_samples, of_pieces, np.ones(3)])
-        slow_factor = np.minimum(np.maximum(self.slow / noise.low_variance, 1.0), factor)
-        return MovingFactors(factor, np.where(self.apart, slow_factor, factor))
+        centred = np.maximum.reduce([of_samples, of_pieces, np.ones(3)])
+        slow = np.minimum(np.maximum(self.slow / noise.low_variance, 1.0), centred)
+        return MovingFactors(centred, slow=np.where(self.apart, slow, centred))
 
     def without_fast(self) -> 'BandMisfit':
         """Return the misfit with a variance of the fast part so large that its weight is zero."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.rows import Rows
+from imu_calibration.estimation.sensor_noise import means_beside_middles
 from imu_calibration.references.turntable.noise_model import NoiseModel
 from imu_calibration.references.turntable.window_statistics import WindowStatistics
 
@@ -73,8 +74,9 @@ class WindowMeans:
         With `beside_bias` it is the variance relative to the bias in the middle of each window,
         otherwise only that of the noise within windows and of the reference.
         """
-        of_windows = noise.variance_beside_bias if beside_bias else noise.mean_variance
-        variance = of_windows(self.kind, self.count, self.duration, keys=self.keys)
+        variance = noise.mean_variance(self.kind, self.count, self.duration, keys=self.keys)
+        if beside_bias:
+            variance = variance + means_beside_middles(noise.bias_processes, self.duration)[:, None]
         if noise.left_out:
             left_out = np.array([key in noise.left_out for key in self.keys])
             largest = variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance

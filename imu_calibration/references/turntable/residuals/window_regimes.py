@@ -56,15 +56,14 @@ def find_regimes(
     search = ScatterSearch(
         blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange
     )
-    # Two tests on each axis.
+    # Two tests on each axis: of another offset, and of a larger scatter.
     level = REGIME_LEVEL / len(AXES) / 2
-    regimes: list[RestRegime] = []
-    whitener = None
-    if len(axes):
+    offsets_of: dict[str, list[RestRegime]] = {}
+    if axes:
+        # The whitening of all blocks, locked ones too, is common to the axes.
         whitener = BlockWhitener(blocks, np.ones(len(blocks.time), bool))
-    for axis, name in enumerate(AXES):
-        regimes_of_axis: list[RestRegime] = []
-        if name in axes and whitener is not None:
+        for name in axes:
+            axis = AXES.index(name)
             whitening = WhitenedAxis(whitener, axis)
             places = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
             parameters = blocks.index[axis][places]
@@ -73,16 +72,17 @@ def find_regimes(
                 information=1 / problem.space.prior_sd[parameters] ** 2,
                 mean=problem.space.prior_mean[parameters],
             )
-            regimes_of_axis = search.offsets(
+            offsets_of[name] = search.offsets(
                 name,
                 residual,
                 whitening,
                 level=level,
                 formula=None if formula is None else formula[:, :, axis],
             )
-        if not regimes_of_axis:
-            regimes_of_axis = search.scatters(
-                name, blocks.rough[:, axis], blocks.freedom, level=level
-            )
-        regimes += regimes_of_axis
+
+    regimes: list[RestRegime] = []
+    for axis, name in enumerate(AXES):
+        regimes += offsets_of.get(name) or search.scatters(
+            name, blocks.rough[:, axis], blocks.freedom, level=level
+        )
     return regimes

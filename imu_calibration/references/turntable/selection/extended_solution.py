@@ -61,8 +61,8 @@ def _in_trusted_band(noise: NoiseModel, slow_only: np.ndarray) -> NoiseModel:
     """
     moving = {}
     for kind, factors in noise.moving.items():
-        every = np.where(slow_only, WEIGHTLESS * factors.every, factors.every)
-        moving[kind] = replace(factors, every=every)
+        centred = np.where(slow_only, WEIGHTLESS * factors.centred, factors.centred)
+        moving[kind] = replace(factors, centred=centred)
     return replace(noise, moving=moving)
 
 

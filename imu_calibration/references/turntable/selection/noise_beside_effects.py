@@ -280,7 +280,9 @@ def _with_moving_factors(
             correlation = float(np.clip(np.mean(column_variances / variances), 1.0, None))
         factor = np.maximum(variances / noise.white_variance, LEAST_NOISE_SHARE)
         factor = factor * correlation / noise.inflation
-        moving[str(kind)] = MovingFactors(factor, factor, np.maximum(factor, 1.0), correlation)
+        moving[str(kind)] = MovingFactors(
+            factor, slow=factor, means=np.maximum(factor, 1.0), correlation=correlation
+        )
     return replace(noise, moving=moving)
 
 
