@@ -197,7 +197,7 @@ SEARCH = _of(
     (
         'locked windows take part in the fit',
         'LinearisedProblem.__init__',
-        '_1.select(~_2)',
+        '_1.select(~self.locked)',
         '_1',
         'test_diagnosis_workflow_on_table.py::test_what_locked_windows_show_moves_the_gain_and_nothing_else',
     ),
@@ -551,7 +551,7 @@ BEYOND = _of(
     (
         'any correlation is told',
         'correlate',
-        '_1 < ALPHA and _2 > max(_3[1], 0.15)',
+        '_1 < ALPHA and _2 > max(_3[1], MIN_CORRELATED_SHARE)',
         '_2 > _3[1]',
         'test_search.py::test_noise_goes_with_nothing',
     ),

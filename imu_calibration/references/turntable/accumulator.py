@@ -292,12 +292,6 @@ def _joined(first: WindowStatistics, second: WindowStatistics) -> WindowStatisti
 
 def _with_mean_rows_only(window: WindowStatistics) -> WindowStatistics:
     """Return a window without its centred rows and pieces."""
-    has_centred_rows = False
-    for statistics in window.sensors.values():
-        if len(statistics.within) or statistics.slow is not None:
-            has_centred_rows = True
-    if not window.pieces and not has_centred_rows:
-        return window
     sensors = {}
     for name, statistics in window.sensors.items():
         sensors[name] = replace(

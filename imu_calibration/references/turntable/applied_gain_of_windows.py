@@ -28,10 +28,9 @@ from imu_calibration.references.turntable.held_out_windows import nominal_values
 from imu_calibration.references.turntable.residuals.proposals import Proposal, with_formulas
 from imu_calibration.references.turntable.residuals.residual_blocks import residuals
 from imu_calibration.references.turntable.selection.investigation import Investigation
-from imu_calibration.references.turntable.selection.saturation import measured
 from imu_calibration.references.turntable.selection.window_gain import gain_in_turn, heldout_gain
 from imu_calibration.references.turntable.uncorrected_windows import uncorrected_on_table
-from imu_calibration.references.turntable.window_statistics import reduce_windows
+from imu_calibration.references.turntable.window_statistics import measured, reduce_windows
 from imu_calibration.selection.gain import APPLIED, OF_MODEL, SAMPLES, Gain
 from imu_calibration.selection.questions import Question
 
@@ -216,9 +215,7 @@ def _errors(windows: Sequence[Window], table: Table, side: _Side) -> dict[str, n
 
     # Readings as compensation corrects them, with the motion at the gyroscope.
     ref = reference_of['gyroscope'].select(rows)
-    raw = []
-    for sensor in SENSORS:
-        raw.append(np.concatenate([measured(window, sensor) for window in windows]))
+    raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
     count = len(side.values)
     calibration = Calibration(side.model, side.applied, np.zeros((count, count)), (HELD,) * count)
     corrected = compensated_samples(

@@ -501,12 +501,12 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        gathered = self._gather(self.blocks(source), session, (preflight,), windows=windows)
+        gathered = self._gather(source, session, (preflight,), windows=windows)
         if len(preflight.without_readings) or preflight.unusable:
             if windows is not None:
                 windows.clear()
             gathered = self._gather(
-                self.blocks(source),
+                source,
                 session,
                 watchers=(),  # the checks have seen all samples
                 windows=windows,
@@ -519,7 +519,7 @@ class GatherStep:
 
     def _gather(
         self,
-        blocks: Iterable[SampleBlock],
+        source: BlockSource,
         session: int,
         watchers: Sequence[Watcher],
         *,
@@ -527,7 +527,7 @@ class GatherStep:
         without: np.ndarray = NO_RANGES,
         unusable: Sequence[str] = (),
     ) -> SessionData:
-        """Return the data of blocks; `without`, `unusable` are the samples that are omitted."""
+        """Return the data of a recording without the samples of `without` and `unusable`."""
         collector = Collector(
             self.table,
             self.model,
@@ -541,7 +541,7 @@ class GatherStep:
             without=without,
             unusable=unusable,
         )
-        for block in blocks:
+        for block in self.blocks(source):
             collector.push(block)
         return collector.finish()
 

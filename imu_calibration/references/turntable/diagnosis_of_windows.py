@@ -1,6 +1,6 @@
 """Diagnosis of a recording on a table: findings, their gains, and the unexplained residual."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from imu_calibration.references.turntable.applied_gain_of_windows import (
 from imu_calibration.references.turntable.residuals.residual_analysis import ResidualAnalysis
 from imu_calibration.references.turntable.selection.extended_solution import extended_solution
 from imu_calibration.references.turntable.selection.investigation import Investigation
-from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.saturation import Saturation
 from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
 from imu_calibration.references.turntable.separating_motion import (
@@ -93,6 +92,12 @@ def build_diagnosis(
             return motions_of_one_joint(question, mate)
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
 
+    def agree(chosen: Sequence[Question], question: Question) -> bool:
+        """Return whether the windows and both halves agree on one of the chosen effects."""
+        if not problem.windows_agree(chosen, question):
+            return False
+        return problem.search.agrees_in_halves(chosen, question)
+
     # Implausible findings are not in the calibration.
     reported = calibrated or solution
     implausible = investigation.implausible
@@ -118,7 +123,7 @@ def build_diagnosis(
     candidates = candidates_of(
         problem.search,
         named,
-        agree=_agreement(problem),
+        agree=agree,
         withdrawn=investigation.unstable,
         replaced=analysis.replaced,
     )
@@ -136,18 +141,6 @@ def build_diagnosis(
         stamp_jitter=analysis.stamp_jitter,
         formula_gains=gains_of_formulas(investigation, proposals),
     )
-
-
-def _agreement(problem: LinearisedProblem) -> Callable[[Sequence[Question], Question], bool]:
-    """Return a function that tests the agreement of parts of a recording on a chosen effect."""
-
-    def agree(chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether the windows and both halves agree on one of the chosen effects."""
-        if not problem.windows_agree(chosen, question):
-            return False
-        return problem.search.agrees_in_halves(chosen, question)
-
-    return agree
 
 
 def _rivals(investigation: Investigation, question: Question) -> list[Question]:

@@ -139,16 +139,10 @@ def _of_estimated_rate(
     if table.latitude is None:
         magnitude, sd = _magnitude(rate, covariance)
         return (_excess(magnitude, sd),) if _exceeds_earth_rate(magnitude, sd) else ()
-    expected_up = _vertical_rate(table)
     up_sd = float(np.sqrt(covariance[2, 2]))
-    severity = _severity(rate[2] - expected_up, up_sd)
+    severity = _severity(rate[2] - _vertical_rate(table), up_sd)
     if severity is not None:
-        # The latitude with the other sign expects the vertical component `-expected_up`.
-        if severity == WARNING and _agrees(rate[2] + expected_up, up_sd, expected_up):
-            raise _wrong_sign(table, rate[2], expected_up)
-        return (
-            _finding('vertical component', rate[2], up_sd, expected=expected_up, severity=severity),
-        )
+        return (_vertical_finding(table, rate[2], up_sd, severity),)
     magnitude, sd = _magnitude(rate, covariance)
     if _contradicts(magnitude - EARTH_RATE, sd):
         return (_finding('magnitude', magnitude, sd, expected=EARTH_RATE, severity=WARNING),)
@@ -186,17 +180,23 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
     if np.any(remaining > tolerated):
         return ()
     # At no latitude the vertical component is larger than the Earth's rate.
-    expected_up = _vertical_rate(table)
-    measured_up = expected_up + vertical
+    measured_up = _vertical_rate(table) + vertical
     if _exceeds_earth_rate(measured_up, vertical_sd):
         return ()
-    if severity == WARNING and _agrees(measured_up + expected_up, vertical_sd, expected_up):
-        raise _wrong_sign(table, measured_up, expected_up)
-    return (
-        _finding(
-            'vertical component', measured_up, vertical_sd, expected=expected_up, severity=severity
-        ),
-    )
+    return (_vertical_finding(table, measured_up, vertical_sd, severity),)
+
+
+def _vertical_finding(table: Table, measured: float, sd: float, severity: Severity) -> CheckFinding:
+    """
+    Return the finding of a vertical component that contradicts the latitude, rad/s.
+
+    Raises an InputError where the latitude with the other sign explains it.
+    """
+    expected = _vertical_rate(table)
+    # The latitude with the other sign expects the vertical component `-expected`.
+    if severity == WARNING and _agrees(measured + expected, sd, expected):
+        raise _wrong_sign(table, measured, expected)
+    return _finding('vertical component', measured, sd, expected=expected, severity=severity)
 
 
 @dataclass(frozen=True, eq=False)

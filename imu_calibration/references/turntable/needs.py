@@ -1,6 +1,6 @@
 """Parameters that windows on a table do not determine, and the motions that would."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -125,9 +125,16 @@ def weak_on_table(
         solution.covariance[np.ix_(present, present)], tolerances[present], names
     )
     entries = [{'parameters': weights, 'needs': _need(weights, needed)} for weights in directions]
+
+    # Needed parameters that no direction names; those with the same motion in one entry.
+    named: set[str] = set().union(*directions)
     sd_in_tolerances = dict(zip(solution.param_names, solution.sd / tolerances))
-    for sds, need in _in_no_direction(directions, needed, sd_in_tolerances):
-        entries.append({'parameters': sds, 'needs': need})
+    sds_of_motion: dict[str, dict[str, float]] = {}
+    for name, (motion, _) in needed.items():
+        if name not in named:
+            sds_of_motion.setdefault(motion, {})[name] = round(float(sd_in_tolerances[name]), 3)
+    for motion, sds in sds_of_motion.items():
+        entries.append({'parameters': sds, 'needs': motion})
     return tuple(entries)
 
 
@@ -150,21 +157,3 @@ def _need(weights: Mapping[str, float], needed: Mapping[str, tuple[str, float]])
         if name in needed:
             return needed[name][0]
     return 'more of the same motion'
-
-
-def _in_no_direction(
-    directions: Sequence[Mapping[str, float]],
-    needed: Mapping[str, tuple[str, float]],
-    in_tolerances: Mapping[str, float],
-) -> list[tuple[dict[str, float], str]]:
-    """
-    Return (name -> sd in tolerances, motion) of needed parameters that no direction names.
-
-    Parameters with the same motion are in one item.
-    """
-    named: set[str] = set().union(*directions)
-    sds_of_motion: dict[str, dict[str, float]] = {}
-    for name, (motion, _) in needed.items():
-        if name not in named:
-            sds_of_motion.setdefault(motion, {})[name] = round(float(in_tolerances[name]), 3)
-    return [(sds, motion) for motion, sds in sds_of_motion.items()]

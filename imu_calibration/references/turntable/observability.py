@@ -21,6 +21,12 @@ REST_SAMPLES = 500.0
 """Samples of a rest."""
 SAMPLES_PER_POINT = 2.0
 """Samples of a moving piece for each of its points in time: 100 Hz."""
+MAX_WEAK_DIRECTIONS = 6
+"""Weak directions that are reported: a motion for the worst ones changes the other ones too."""
+MIN_MEMBER_WEIGHT = 0.2
+"""Weight of a parameter over the largest of a direction from which it is reported."""
+MAX_SD_RATIO = 0.7
+"""Largest ratio of the sd of a parameter after a motion to that before, for the motion to help."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,26 +169,28 @@ def tolerance_scaled_singular_values(information: np.ndarray, tolerances: np.nda
 
 
 def weak_directions(
-    covariance: np.ndarray, tolerances: np.ndarray, names: Sequence[str], *, limit: int = 6
+    covariance: np.ndarray, tolerances: np.ndarray, names: Sequence[str]
 ) -> list[dict[str, float]]:
     """
     Return the directions in which the standard deviation exceeds the tolerance, worst first.
 
+    At most `MAX_WEAK_DIRECTIONS` are returned.
+
     Returns
     -------
     list of dict
-        {name: weight}, the weights in tolerances, members below 0.2 of the largest left out.
+        {name: weight}, the weights in tolerances, without members below `MIN_MEMBER_WEIGHT`.
 
     """
     scaled = covariance / np.outer(tolerances, tolerances)
     variances, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
     directions = []
     for variance, vector in sorted(zip(variances, vectors.T), key=lambda pair: -pair[0]):
-        if variance <= 1.0 or len(directions) >= limit:
+        if variance <= 1.0 or len(directions) >= MAX_WEAK_DIRECTIONS:
             break
         # The largest weight is positive; small ones are omitted.
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
-        is_large = np.abs(vector) >= 0.2 * np.max(np.abs(vector))
+        is_large = np.abs(vector) >= MIN_MEMBER_WEIGHT * np.max(np.abs(vector))
         weights = {names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(is_large).tolist()}
         directions.append(weights)
     return directions
@@ -215,11 +223,11 @@ def needed_motions(
     base = _information_of(solution, prior_sd)
     # A motion reduces the noise only: the ratio of the sd with model errors to that without them
     # is assumed to be constant.
-    ratio = np.maximum(solution.sd / _sd_of(base), 1.0)
+    ratio = np.maximum(solution.sd / sd_of_information(base), 1.0)
     information = MotionInformation(solution.model, solution.values, solution.noise, gravity)
     predicted = {}
     for motion in MOTIONS if possible is None else possible:
-        predicted[motion] = _sd_of(base + information.added_by(motion)) * ratio
+        predicted[motion] = sd_of_information(base + information.added_by(motion)) * ratio
     needed = {}
     for k in lacking.tolist():
         name = solution.param_names[k]
@@ -233,7 +241,7 @@ def sd_of_data(solution: Solution, prior_sd: np.ndarray) -> np.ndarray:
 
     With the information of the recording and the prior, without model errors or held parameters.
     """
-    return _sd_of(_information_of(solution, prior_sd))
+    return sd_of_information(_information_of(solution, prior_sd))
 
 
 def _information_of(solution: Solution, prior_sd: np.ndarray) -> np.ndarray:
@@ -241,7 +249,7 @@ def _information_of(solution: Solution, prior_sd: np.ndarray) -> np.ndarray:
     return solution.information + np.diag(1 / prior_sd**2)
 
 
-def _sd_of(information: np.ndarray) -> np.ndarray:
+def sd_of_information(information: np.ndarray) -> np.ndarray:
     """Return the standard deviations of an information matrix, shape (n_params,)."""
     return np.sqrt(np.clip(np.diag(inverse_normal(information)), 1e-300, None))
 
@@ -256,7 +264,7 @@ def _best(
     all parameters after it.
     """
     motion = min(predicted, key=lambda m: predicted[m][index], default=None)
-    if motion is not None and predicted[motion][index] <= 0.7 * solution.sd[index]:
+    if motion is not None and predicted[motion][index] <= MAX_SD_RATIO * solution.sd[index]:
         return motion.text, float(predicted[motion][index])
     if one_joint:
         return OTHER_MOUNT, float('nan')

@@ -8,11 +8,13 @@ import numpy as np
 from imu_calibration.calibration.coverage import Coverage, Step, is_done, sd_excess, share_gained
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.prior import GAUGE_SD, make_prior
-from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import LACKING, REMEDY_KEYS
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.references.turntable.needs import possible_motions
-from imu_calibration.references.turntable.observability import MotionInformation
+from imu_calibration.references.turntable.observability import (
+    MotionInformation,
+    sd_of_information,
+)
 from imu_calibration.references.turntable.standard_motions import MOTIONS, REST_WITH_UP, Motion
 from imu_calibration.references.turntable.window_observations import TableResult, WindowObservations
 
@@ -52,27 +54,23 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     solution = result.solution
     requested = result.calibration.requested
     # Parameters that motions can determine: not the ones with another remedy.
-    wanted = np.array(
-        [
-            name in requested and not _has_remedy(result, name)
-            for name in result.calibration.param_names
-        ]
-    )
+    wanted = np.zeros(len(solution.values), bool)
+    for index, name in enumerate(result.calibration.param_names):
+        need, _ = result.needed.get(name, ('', 0.0))
+        wanted[index] = name in requested and need not in REMEDY_KEYS
     prior = make_prior(solution.model)
     gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge
     base = solution.information + np.diag(1 / prior.sd**2) + gauge.T @ gauge
 
-    def expected_sd(information: np.ndarray) -> np.ndarray:
-        """Return the standard deviations of the parameters from an information matrix."""
-        return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
-
     # Unmodelled effects make the standard deviations larger than the information matrix predicts.
     # The same factor is assumed after further motions.
-    factor = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
+    factor = np.maximum(result.calibration.sd / np.maximum(sd_of_information(base), 1e-300), 1.0)
 
     def excess(information: np.ndarray) -> np.ndarray:
         """Return the excess of the standard deviations over the tolerances (`sd_excess`)."""
-        return sd_excess((factor * expected_sd(information))[wanted], result.tolerances[wanted])
+        return sd_excess(
+            (factor * sd_of_information(information))[wanted], result.tolerances[wanted]
+        )
 
     added = MotionInformation(
         solution.model, solution.values, solution.noise, result.gravity
@@ -100,11 +98,6 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
         arms=_arms(result),
         frame_id=frame_id,
     )
-
-
-def _has_remedy(result: TableResult, name: str) -> bool:
-    """Return whether the need of a parameter is a remedy other than a motion."""
-    return name in result.needed and result.needed[name][0] in REMEDY_KEYS
 
 
 def _plan_ahead(

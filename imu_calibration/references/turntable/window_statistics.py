@@ -1,7 +1,7 @@
 """Statistics of one window, in pieces."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -185,6 +185,11 @@ class WindowStatistics:
     """
 
 
+def measured(window: Window, sensor: str) -> np.ndarray:
+    """Return the measured output of a sensor in a window, shape (n, 3)."""
+    return window.force_s if sensor == 'accelerometer' else window.rate_s
+
+
 def references_of(windows: Sequence[Window], model: SensorModel, table: Table) -> References:
     """Return the reference motion of both sensors at the samples of all windows, joined."""
     motion, temperature = joined_motion(windows)
@@ -196,11 +201,10 @@ def reduce_windows(
     model: SensorModel,
     table: Table,
     *,
-    session: int = 0,
     column_function: Callable = columns,
 ) -> list[WindowStatistics]:
     """
-    Reduce windows to their statistics without pieces.
+    Return the statistics of windows of the first recording, without pieces.
 
     The columns of all windows are computed in one call.
 
@@ -212,8 +216,6 @@ def reduce_windows(
         Defines the columns.
     table : Table
         Reference kinematics.
-    session : int
-        Recording of the windows.
     column_function : callable
         Same signature as `effects.forward_equations.columns`.
 
@@ -224,73 +226,57 @@ def reduce_windows(
     reduced = []
     for window, first, last in zip(windows, edges, edges[1:]):
         of_window = {sensor: design[first:last] for sensor, design in designs.items()}
-        reduced.append(_reduced(window, of_window, session))
+        reduced.append(_reduced(window, of_window))
     return reduced
 
 
 def reduce_window(
     window: Window, model: SensorModel, table: Table, *, session: int = 0
 ) -> WindowStatistics:
-    """Reduce one window to its statistics, with the short pieces for held-out evaluation."""
+    """Return the statistics of one window, with the short pieces for held-out evaluation."""
     references = references_of([window], model, table)
     designs = {sensor: columns(references, sensor) for sensor in SENSORS}
-    inputs = {sensor: model.columns_of(sensor, Role.LINEAR) for sensor in SENSORS}
-    return _reduced(window, designs, session, inputs)
+    true_inputs = {}
+    for sensor, design in designs.items():
+        true_inputs[sensor] = design[:, model.columns_of(sensor, Role.LINEAR)]
+    reduced = _reduced(window, designs)
+    pieces = {}
+    for sensor, statistics in reduced.sensors.items():
+        if window.kind == 'static':
+            pieces[sensor] = pieces_at_rest(statistics.mean, reduced.duration)
+        else:
+            pieces[sensor] = moving_pieces(
+                np.concatenate([designs[sensor], measured(window, sensor)], axis=1),
+                window.time,
+                true_inputs[sensor],
+                rate_s=true_inputs['gyroscope'],
+            )
+    return replace(reduced, session=session, pieces=pieces)
 
 
-def _reduced(
-    window: Window,
-    designs: dict[str, np.ndarray],
-    session: int,
-    inputs: dict[str, slice] | None = None,
-) -> WindowStatistics:
+def _reduced(window: Window, designs: dict[str, np.ndarray]) -> WindowStatistics:
     """
-    Return a window's statistics.
+    Return the statistics of a window of the first recording, without pieces.
 
-    Parameters
-    ----------
-    window : Window
-    designs : dict
-        Sensor -> columns, shape (n, n_columns).
-    session : int
-    inputs : dict, optional
-        Sensor -> columns of the true input; with them the short pieces are included.
-
+    `designs`: sensor -> columns, shape (n, n_columns).
     """
-    outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
-    static = window.kind == 'static'
-    length = _piece_length(window)
-    duration = float(window.time[-1] - window.time[0])
-    sensors, pieces = {}, {}
+    sensors = {}
     for sensor, design in designs.items():
         if sensor in window.absent:
             continue
-        output = outputs[sensor]
-        if static:
+        output = measured(window, sensor)
+        if window.kind == 'static':
             sensors[sensor] = _reduce_static(design, output)
         else:
-            sensors[sensor] = _reduce_moving(design, output, length)
-        if inputs is None:
-            continue
-        if static:
-            pieces[sensor] = pieces_at_rest(sensors[sensor].mean, duration)
-        else:
-            pieces[sensor] = moving_pieces(
-                np.concatenate([design, output], axis=1),
-                window.time,
-                design[:, inputs[sensor]],
-                rate_s=designs['gyroscope'][:, inputs['gyroscope']],
-            )
+            sensors[sensor] = _reduce_moving(design, output, _piece_length(window))
     step = 0.0 if window.joint_step is None else float(np.max(window.joint_step, initial=0.0))
     return WindowStatistics(
         kind=window.kind,
         time=float(window.time.mean()),
-        duration=duration,
+        duration=float(window.time[-1] - window.time[0]),
         count=len(window.time),
         sensors=sensors,
-        session=session,
         encoder_step=step,
-        pieces=pieces,
     )
 
 
@@ -323,9 +309,7 @@ def _reduce_moving(design: np.ndarray, output: np.ndarray, length: int) -> Senso
 
 
 def _piece_length(window: Window) -> int:
-    """Return the number of samples in SLOW_TIME, at least one; zero for a static window."""
-    if window.kind == 'static':
-        return 0
+    """Return the number of samples in SLOW_TIME, at least one."""
     span = window.time[-1] - window.time[0]
     if span <= 0:
         return 1

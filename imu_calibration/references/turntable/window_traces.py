@@ -21,7 +21,7 @@ from imu_calibration.kinematics.strapdown import dead_reckoning_errors
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import StoredWindows, Window, all_samples, chunks
 from imu_calibration.references.turntable.residuals.residual_blocks import residuals
-from imu_calibration.references.turntable.selection.saturation import measured
+from imu_calibration.references.turntable.window_statistics import measured
 from imu_calibration.selection.regime_variables import block_means
 from imu_calibration.simulation.replay import predict_windows
 
@@ -151,20 +151,19 @@ def _blocks_of(
 def _joined(parts: Sequence[ResidualBlocks]) -> ResidualBlocks:
     """Return all blocks in one object; with temperatures only if each part has them."""
     temperatures = [part.temperature_c for part in parts if part.temperature_c is not None]
-    before, after = {}, {}
+    before = {}
+    after = {}
     for sensor in parts[0].before:
         before[sensor] = np.concatenate([part.before[sensor] for part in parts])
         after[sensor] = np.concatenate([part.after[sensor] for part in parts])
+    arrays = {}
+    for name in ('time', 'kind', 'position', 'force_s', 'rate_s', 'samples'):
+        arrays[name] = np.concatenate([getattr(part, name) for part in parts])
     return ResidualBlocks(
-        time=np.concatenate([part.time for part in parts]),
-        kind=np.concatenate([part.kind for part in parts]),
-        position=np.concatenate([part.position for part in parts]),
-        force_s=np.concatenate([part.force_s for part in parts]),
-        rate_s=np.concatenate([part.rate_s for part in parts]),
         temperature_c=np.concatenate(temperatures) if len(temperatures) == len(parts) else None,
         before=before,
         after=after,
-        samples=np.concatenate([part.samples for part in parts]),
+        **arrays,
     )
 
 

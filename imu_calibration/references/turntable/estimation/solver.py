@@ -60,7 +60,6 @@ def solve(
     accumulator: Accumulator,
     model: SensorModel,
     *,
-    allow_holding: bool = True,
     noise: dict[str, NoiseModel] | None = None,
     bias_processes: dict[str, tuple[BiasProcess, ...]] | None = None,
 ) -> Solution:
@@ -76,8 +75,6 @@ def solve(
     accumulator : Accumulator
         Rows of windows, reduced with the columns of `model`.
     model : SensorModel
-    allow_holding : bool
-        Whether parameters that the data do not determine may be fixed at their prior.
     noise : dict, optional
         Sensor -> NoiseModel, if known.
     bias_processes : dict, optional
@@ -91,7 +88,7 @@ def solve(
     Raises
     ------
     NotObservableError
-        When no parameter is determined, or one is undetermined and `allow_holding` is False.
+        When no parameter is determined.
 
     """
     if not accumulator.rows:
@@ -101,7 +98,7 @@ def solve(
             code='no_windows',
         )
     system = WeightedSystem(accumulator, model)
-    problem = _WindowProblem(system, allow_holding, noises_are_known=noise is not None)
+    problem = _WindowProblem(system, noises_are_known=noise is not None)
     values = start(system)
     noises = noise or first_noise(system, values, bias_processes or {})
     joint = estimate(problem, _Fit(values, noises))
@@ -145,8 +142,6 @@ class _WindowProblem:
     """Estimate from accumulated windows (`EstimateProblem`)."""
 
     system: WeightedSystem
-    allow_holding: bool
-    """Whether parameters may be fixed at their prior."""
     noises_are_known: bool
     """Whether the noise is not estimated."""
 
@@ -225,7 +220,11 @@ class _WindowProblem:
             tie=EQUALLY_WEAK,
         )
         held |= not_separable(self.system.accumulator, self.system.model)
-        _refuse_held(held, self.asked, self.system.model, self.allow_holding)
+        if (held | ~self.asked).all():
+            raise NotObservableError(
+                'the recording must determine at least one parameter, it determines none; '
+                'record static positions in at least four different attitudes'
+            )
         return held
 
     def holding(self, fit: _Fit, held: np.ndarray) -> _Fit:
@@ -246,14 +245,12 @@ class _WindowProblem:
 
     def not_believed(self, fit: _Fit, free: np.ndarray, sd: np.ndarray) -> Mapping[int, float]:
         """
-        Return number -> value of the `implausible_parameters`.
-
-        None if parameters must not be fixed, or if no parameter would remain free.
+        Return number -> value of the `implausible_parameters`; none if all free ones are.
         """
         implausible = implausible_parameters(
             self.system, fit.values, sd=sd, noises=fit.noises, free=free
         )
-        if not self.allow_holding or not (free & ~implausible).any():
+        if not (free & ~implausible).any():
             return {}
         return {int(number): float(fit.values[number]) for number in np.flatnonzero(implausible)}
 
@@ -276,24 +273,6 @@ class _WeightedWindows:
         """Return the part of the covariance that is due to offsets and bias processes."""
         information = self.system.bias_information(self.fit.values, self.fit.noises)
         return covariance @ information @ covariance
-
-
-def _refuse_held(
-    held: np.ndarray, free: np.ndarray, model: SensorModel, allow_holding: bool
-) -> None:
-    """Raise if no free parameter is determined, or if one is not and `allow_holding` is False."""
-    if (held | ~free).all():
-        raise NotObservableError(
-            'the recording must determine at least one parameter, it determines none; '
-            'record static positions in at least four different attitudes'
-        )
-    if held.any() and not allow_holding:
-        names = [name for name, flag in zip(model.param_names, held) if flag]
-        raise NotObservableError(
-            f'every parameter must be determined, {len(names)} are not: {", ".join(names)}; '
-            'record more motion or allow holding',
-            code='undetermined',
-        )
 
 
 def start(system: WeightedSystem) -> np.ndarray:

@@ -29,7 +29,7 @@ from imu_calibration.references.turntable.residuals.jitter_of_blocks import (
 from imu_calibration.references.turntable.selection.linearised_problem import LinearisedProblem
 from imu_calibration.references.turntable.selection.noise_beside_effects import natural_processes
 from imu_calibration.references.turntable.selection.reduced_recording import columns_with_bank
-from imu_calibration.references.turntable.selection.saturation import measured
+from imu_calibration.references.turntable.window_statistics import measured
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
 from imu_calibration.selection.regime_variables import block_means
 from imu_calibration.selection.stamp_jitter import StampJitter
@@ -188,28 +188,23 @@ class _CutWindows:
         length = max(MIN_BLOCK_SECONDS, moving_time / MAX_RESIDUAL_BLOCKS)
         used = _used_windows(windows, length)
         windows_in_use = [windows[k] for k in used]
-        cuts = []
+        cuts = [_cut(window, length) for window in windows_in_use]
         motions = []
-        rows_per_block = []
         first_samples = []
-        places = []
         n_samples = 0
-        for place, window in enumerate(windows_in_use):
-            cut = _cut(window, length)
-            cuts.append(cut)
+        for window, cut in zip(windows_in_use, cuts):
             motions.append(window.motion.select(cut.rows))
-            rows_per_block.append(cut.per_block)
             first_samples.append(n_samples + cut.starts)
-            places.append(np.full(len(cut.starts), place))
             n_samples += len(window)
+        rows_per_block = np.concatenate([cut.per_block for cut in cuts])
         return cls(
             windows=windows_in_use,
             used=used,
             motion=JointMotion.concatenate(motions),
             temperature_c=_temperatures(windows_in_use, cuts),
-            first_row=np.cumsum([0, *np.concatenate(rows_per_block)[:-1]]),
+            first_row=np.cumsum([0, *rows_per_block[:-1]]),
             first_sample=np.concatenate(first_samples),
-            place_of_window=np.concatenate(places),
+            place_of_window=np.repeat(np.arange(len(cuts)), [len(cut.starts) for cut in cuts]),
         )
 
     def sample_means(self, samples: np.ndarray) -> np.ndarray:
@@ -668,11 +663,8 @@ class BlockFits:
         noise = ABOVE_NOISE * np.sqrt(2.0 * selection.sum())
         least_excess = min(noise, 0.99 * excess.max())
         squares = excess * np.median(self.blocks.variance[selection], axis=0)
-        named = []
-        for axis in largest_axes(squares):
-            if excess[AXES.index(axis)] > least_excess:
-                named.append(axis)
-        return tuple(named)
+        largest_first = largest_axes(squares)
+        return tuple(axis for axis in largest_first if excess[AXES.index(axis)] > least_excess)
 
     @property
     def sigma(self) -> float:

@@ -90,9 +90,8 @@ class SearchedWindows:
 
         With columns of some `effects`, by default of all.
         """
-        if effects is None:
-            return LinearisedProblem(self, point)
-        return LinearisedProblem(replace(self, effects=effects), point)
+        searched = self if effects is None else replace(self, effects=effects)
+        return LinearisedProblem(searched, point)
 
 
 class LinearisedProblem:
@@ -110,14 +109,12 @@ class LinearisedProblem:
     def __init__(
         self, searched: SearchedWindows, point: tuple[SensorModel, np.ndarray] | None = None
     ):
-        windows = searched.windows
         baseline = searched.baseline
         effects = searched.effects
         self.baseline = baseline
         self.effects = effects
-        locked = searched.locked
-        self.locked = locked
-        self.duration = max(float(window.time[-1]) for window in windows)
+        self.locked = searched.locked
+        self.duration = max(float(window.time[-1]) for window in searched.windows)
         """Duration of the recording, s."""
         self.constants = time_constants(self.duration)
         """Time constants of the bank, s."""
@@ -126,7 +123,7 @@ class LinearisedProblem:
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
         recording = reduce_recording(
-            windows,
+            searched.windows,
             searched.table,
             model,
             values=values,
@@ -137,7 +134,7 @@ class LinearisedProblem:
         places = range(len(values))
         parts = [places[model.slices[effect.key]] for effect in baseline.effects]
         in_baseline = tuple(chain.from_iterable(parts))
-        of_selection = recording.select(~locked)
+        of_selection = recording.select(~self.locked)
         if point is None:
             of_selection = _at_baseline(of_selection, baseline, in_baseline)
             recording = recording.rebased(of_selection.values)
@@ -253,10 +250,10 @@ class LinearisedProblem:
 
         Such an effect is a lag, a delay or an error of the table, with values that are not zero.
         """
-        kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
+        in_choice = self._effects_with(chosen)
         model = self.recording.model
         for effect in model.effects:
-            is_other = effect.warp is not None and effect.key not in kept
+            is_other = effect.warp is not None and effect.key not in in_choice
             if is_other and np.any(model.point_of(effect)):
                 return True
         return False
@@ -267,32 +264,38 @@ class LinearisedProblem:
 
         The model has columns of all effects, the amplitudes of those that are not chosen are zero.
         """
-        values = self.values(chosen)
+        # Effects with a time constant have columns only in a model with them.
         model = extended_model(self.baseline, self.effects)
         for question in chosen:
             if question.effect.time_constant:
                 model = model.with_effect(question.sensor, question.name)
+
+        # The fitted values of the effects that this linearisation has already.
+        values = self.values(chosen)
+        in_choice = self._effects_with(chosen)
         start = model.start()
         for effect in model.effects:
-            part = self.recording.model.slices.get(effect.key)
-            if part is None:
-                continue
-            start[model.slices[effect.key]] = values[part]
-            if effect.time_constant:
-                # A step along the tangent may pass zero.
-                last = model.slices[effect.key].stop - 1
-                shortest = 0.25 * self.constants[0]
-                longest = 4.0 * self.constants[-1]
-                start[last] = np.clip(start[last], shortest, longest)
+            part = model.slices[effect.key]
+            part_here = self.recording.model.slices.get(effect.key)
+            if part_here is not None:
+                start[part] = values[part_here]
+                if effect.time_constant:
+                    # A step along the tangent may pass zero.
+                    shortest = 0.25 * self.constants[0]
+                    longest = 4.0 * self.constants[-1]
+                    start[part.stop - 1] = np.clip(start[part.stop - 1], shortest, longest)
+            if effect.key not in in_choice:
+                start[part][: effect.n_amplitudes] = 0.0
+
+        # Warm-ups of the bank join the model.
         for question in chosen:
             if '@' in question.label:
-                part = model.slices[question.sensor, question.name]
-                start[part] = self._warm_up(chosen, question, values)
-        kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
-        for effect in model.effects:
-            if effect.key not in kept:
-                start[model.slices[effect.key]][: effect.n_amplitudes] = 0.0
+                start[model.slices[question.effect.key]] = self._warm_up(chosen, question, values)
         return model.at(start), start
+
+    def _effects_with(self, chosen: Sequence[Question]) -> set[tuple[str, str]]:
+        """Return the keys of the effects of the baseline and of a choice."""
+        return {question.effect.key for question in chosen}.union(self.baseline.slices)
 
     def _warm_up(
         self, chosen: Sequence[Question], question: Question, values: np.ndarray

@@ -17,7 +17,7 @@ from imu_calibration.references.turntable.selection.window_evidence import (
     MIN_FOLD_WINDOWS,
     locked_windows,
 )
-from imu_calibration.references.turntable.window_statistics import references_of
+from imu_calibration.references.turntable.window_statistics import measured, references_of
 
 CLIP_MARGIN_SDS = 4.0
 """
@@ -34,6 +34,8 @@ tenth for each sample.
 """
 MIN_LEFT_SAMPLES = 20
 """A window with fewer samples left is dropped."""
+THINNED_SAMPLES = 50
+"""Samples of a moving window that a simple fit uses, at least: a few parameters need no more."""
 SAME_LEVEL = 1 - 1e-12
 """Share of the largest output from which an output equals it but for rounding."""
 
@@ -86,11 +88,6 @@ def predictions(
     return predicted
 
 
-def measured(window: Window, sensor: str) -> np.ndarray:
-    """Return the measured output of a sensor in a window, shape (n, 3)."""
-    return window.force_s if sensor == 'accelerometer' else window.rate_s
-
-
 def sample_sd_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
     """
     Return the median over static windows of the sd of their samples, shape (3,).
@@ -121,7 +118,13 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     """
     start = np.where(np.isfinite(model.start()), model.start(), 0.0)
     prior, sd = model.prior()
-    thinned = [_thinned(window) for window in windows]
+    # About `THINNED_SAMPLES` of a moving window.
+    thinned = []
+    for window in windows:
+        stride = len(window.time) // THINNED_SAMPLES
+        if window.kind != 'static' and stride > 1:
+            window = window.select(slice(None, None, stride))
+        thinned.append(window)
     normal = np.zeros((len(start) + 1,) * 2)
     references = references_of(thinned, model, table)
     for sensor in sensors_of(windows):
@@ -142,13 +145,6 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
             normal += weight[axis] * rows.T @ rows
     step, _ = solve_normal(normal, np.arange(len(start)), sd, prior_mean=prior - start)
     return start + step
-
-
-def _thinned(window: Window, most: int = 50) -> Window:
-    """Return a moving window with every n-th sample only, so that about `most` remain."""
-    if window.kind == 'static' or len(window.time) <= most:
-        return window
-    return window.select(slice(None, None, len(window.time) // most))
 
 
 def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
