@@ -496,14 +496,14 @@ def test_counts_against_the_joints(capsys, tmp_path, session, table):
     from imu_calibration.effects.sensor_model import SensorModel
     from imu_calibration.kinematics.table import Table
     from imu_calibration.preprocessing.joint_checks import against_joints
-    from imu_calibration.references.turntable.collector import Collector
+    from imu_calibration.references.turntable.collector import Collector, GatherStep
 
     model, description = (
         SensorModel(joint_names=session.joints.names),
         Table.from_mapping(session.table),
     )
     for factor, expected in ((1.0, []), (7.0, ['rate_unit']), (180 / np.pi, ['rate_unit'])):
-        collector = Collector(description, model)
+        collector = Collector(GatherStep(description, model))
         collector.push(
             SampleBlock(replace(session.imu, rate_s=factor * session.imu.rate_s), session.joints)
         )

@@ -23,20 +23,20 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
     noise = SimpleNamespace(
         bias_variance=1e-2,
     )
+    explained = SimpleNamespace(
+        floor=SimpleNamespace(noise={'gyroscope': noise}),
+        numbers={'gyroscope': np.array([3 * n, 1])},
+        sigma=lambda sensor, excess: (20.0, 0.0),
+    )
     problem = SimpleNamespace(
+        explained=explained,
         space=SimpleNamespace(
             mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]
         ),
         recording=SimpleNamespace(mean_variance=lambda noise: np.full((n, 3), 4e-6)),
     )
-    explained = SimpleNamespace(
-        floor=SimpleNamespace(noise={'gyroscope': noise}),
-        n_means=3 * n,
-        n_within=1,
-        sigma=lambda sensor, excess: (20.0, 0.0),
-    )
     rest = unexplained_windows._unexplained(
-        problem, explained, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1)
+        problem, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1)
     )
     assert rest.significant
     np.testing.assert_allclose(rest.rms, 3 * 2e-3)

@@ -966,7 +966,6 @@ def rest_of(sigma, residual):
     explained.floor = SimpleNamespace(
         noise={'accelerometer': NoiseModel(np.full(3, 100.0), np.ones(3))}
     )
-    explained.n_means, explained.n_within = 3.0 * count, 0.0
     explained.numbers = {'accelerometer': np.array([3.0 * count, 0.0])}
     return rests._unexplained(
         SimpleNamespace(space=space, recording=recording, explained=explained),

@@ -312,144 +312,6 @@ def _effects_text(model: SensorModel) -> str:
     return f'{effects} at {model.temperature_ref_c:g} C'
 
 
-class Collector:
-    """
-    Finds the windows in blocks of samples and adds their statistics to a `SessionData`.
-
-    The same object serves bags and live topics.
-
-    Parameters
-    ----------
-    table : Table
-        The reference.
-    model : SensorModel
-        Defines the columns.
-    settings : WindowSettings
-        How windows are found.
-    nominal : RawReadings, optional
-        For readings in volts or counts.
-    session : int
-        Number of the recording.
-    watchers : sequence of Watcher
-        Checks that see the cleaned samples.
-    windows : optional
-        Receives all windows with their samples, unused ones too.
-    keep_for_search : bool
-        Whether windows are kept for the search of effects.
-    judged_from : float
-        Windows from this time on are judged by a proof, s.
-    without : array, shape (n, 2)
-        Ranges of stamps whose samples are omitted, ns.
-    unusable : sequence of str
-        Sensors that are omitted.
-
-    """
-
-    def __init__(
-        self,
-        table: Table,
-        model: SensorModel,
-        settings: WindowSettings = WindowSettings(),
-        *,
-        nominal: RawReadings | None = None,
-        session: int = 0,
-        watchers: Sequence[Watcher] = (),
-        windows: StoredWindows | KeptWindows | list | None = None,
-        keep_for_search: bool = False,
-        judged_from: float = 0.0,
-        without: np.ndarray = NO_RANGES,
-        unusable: Sequence[str] = (),
-    ):
-        self.table = table
-        self.model = model
-        self.session = session
-        self.windows = windows
-        self.keep_for_search = keep_for_search
-        # Cleans the samples, joins the streams and finds the windows.
-        self.gatherer = MotionGatherer(
-            table,
-            settings,
-            windows is not None,
-            nominal=nominal,
-            watchers=watchers,
-            without=without,
-            unusable=unusable,
-        )
-        self.gathered = SessionData(judged_from=judged_from)
-
-    def push(self, block: SampleBlock) -> list[Window]:
-        """Process a block and return the windows that it completed."""
-        if block.imu is not None and len(block.imu):
-            self._note_imu(block.imu)
-        if block.temperature is not None and len(block.temperature):
-            self._note_temperature(block.temperature.temperature_c)
-        return self._take(self.gatherer.push(block))
-
-    def finish(self) -> SessionData:
-        """Close the last window and return the gathered data."""
-        self._take(self.gatherer.finish())
-        self.update_counts()
-        return self.gathered
-
-    def update_counts(self) -> None:
-        """Bring the counts up to date."""
-        counts = Counter(self.gatherer.counts)
-        counts.update(self.gatherer.cleaner.lost)
-        self.gathered.counts = dict(counts)
-
-    def _note_imu(self, imu: ImuSamples) -> None:
-        """Update the frame and the first and last stamp."""
-        gathered = self.gathered
-        if gathered.first_stamp_ns is None:
-            gathered.first_stamp_ns = int(imu.stamp_ns[0])
-            gathered.frame_id = imu.frame_id
-        gathered.last_stamp_ns = max(int(imu.stamp_ns[-1]), gathered.last_stamp_ns or 0)
-
-    def _note_temperature(self, temperature_c: np.ndarray) -> None:
-        """Extend the range of temperatures."""
-        finite = temperature_c[np.isfinite(temperature_c)]
-        if len(finite):
-            low, high = self.gathered.temperature_c or (np.inf, -np.inf)
-            self.gathered.temperature_c = (
-                float(min(low, finite.min())),
-                float(max(high, finite.max())),
-            )
-
-    def _take(self, windows: Sequence[Window]) -> list[Window]:
-        """Add all windows except unused ones to the gathered data, and return them."""
-        if self.windows is not None:
-            self.windows.extend(windows)
-        used = [window for window in windows if window.kind != 'unused']
-        for window in used:
-            self._add(window)
-        return used
-
-    def _add(self, window: Window) -> None:
-        """Add the statistics, the pose and the largest readings of a window."""
-        reduced = reduce_window(window, self.model, self.table, session=self.session)
-        gathered = self.gathered
-        gathered.take(reduced)
-        largest_force = float(np.max(np.abs(window.force_s)))
-        gathered.largest_force = max(gathered.largest_force, largest_force)
-        if window.kind == 'static':
-            gathered.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
-            del gathered.poses[:-KEPT_POSES]
-        else:
-            largest_rate = float(np.sqrt((window.rate_s**2).sum(axis=1).max()))
-            gathered.largest_rate = max(gathered.largest_rate, largest_rate)
-        self._store(window, reduced)
-
-    def _store(self, window: Window, _reduced: WindowStatistics) -> None:
-        """Keep the samples of moving windows for plots, and windows for the search of effects."""
-        kept = self.gathered.kept
-        if window.kind != 'static':
-            n_samples = sum(len(w.time) for w in kept) + len(window.time)
-            if n_samples <= KEPT_SAMPLES:
-                kept.append(window)
-        if self.keep_for_search:
-            self.gathered.for_search[0].add(owned_window(window))
-
-
 @dataclass(frozen=True)
 class GatherStep:
     """How recordings are read and reduced; it can be sent to another process or machine."""
@@ -529,21 +391,139 @@ class GatherStep:
     ) -> SessionData:
         """Return the data of a recording without the samples of `without` and `unusable`."""
         collector = Collector(
-            self.table,
-            self.model,
-            self.windows,
-            nominal=self.nominal,
+            self,
             session=session,
             watchers=watchers,
             windows=windows,
-            keep_for_search=self.keep_for_search,
-            judged_from=self.judged_from,
             without=without,
             unusable=unusable,
         )
         for block in self.blocks(source):
             collector.push(block)
         return collector.finish()
+
+
+class Collector:
+    """
+    Finds the windows in blocks of samples and adds their statistics to a `SessionData`.
+
+    The same object serves bags and live topics.
+
+    Parameters
+    ----------
+    step : GatherStep
+        How the recording is reduced.
+    session : int
+        Number of the recording.
+    watchers : sequence of Watcher
+        Checks that see the cleaned samples.
+    windows : optional
+        Receives all windows with their samples, unused ones too.
+    without : array, shape (n, 2)
+        Ranges of stamps whose samples are omitted, ns.
+    unusable : sequence of str
+        Sensors that are omitted.
+
+    """
+
+    def __init__(
+        self,
+        step: GatherStep,
+        *,
+        session: int = 0,
+        watchers: Sequence[Watcher] = (),
+        windows: StoredWindows | KeptWindows | list | None = None,
+        without: np.ndarray = NO_RANGES,
+        unusable: Sequence[str] = (),
+    ):
+        self.step = step
+        self.model = step.model
+        """Defines the columns; in a live session it may change."""
+        self.session = session
+        self.windows = windows
+        # Cleans the samples, joins the streams and finds the windows.
+        self.gatherer = MotionGatherer(
+            step.table,
+            step.windows,
+            windows is not None,
+            nominal=step.nominal,
+            watchers=watchers,
+            without=without,
+            unusable=unusable,
+        )
+        self.gathered = SessionData(judged_from=step.judged_from)
+
+    def push(self, block: SampleBlock) -> list[Window]:
+        """Process a block and return the windows that it completed."""
+        if block.imu is not None and len(block.imu):
+            self._note_imu(block.imu)
+        if block.temperature is not None and len(block.temperature):
+            self._note_temperature(block.temperature.temperature_c)
+        return self._take(self.gatherer.push(block))
+
+    def finish(self) -> SessionData:
+        """Close the last window and return the gathered data."""
+        self._take(self.gatherer.finish())
+        self.update_counts()
+        return self.gathered
+
+    def update_counts(self) -> None:
+        """Bring the counts up to date."""
+        counts = Counter(self.gatherer.counts)
+        counts.update(self.gatherer.cleaner.lost)
+        self.gathered.counts = dict(counts)
+
+    def _note_imu(self, imu: ImuSamples) -> None:
+        """Update the frame and the first and last stamp."""
+        gathered = self.gathered
+        if gathered.first_stamp_ns is None:
+            gathered.first_stamp_ns = int(imu.stamp_ns[0])
+            gathered.frame_id = imu.frame_id
+        gathered.last_stamp_ns = max(int(imu.stamp_ns[-1]), gathered.last_stamp_ns or 0)
+
+    def _note_temperature(self, temperature_c: np.ndarray) -> None:
+        """Extend the range of temperatures."""
+        finite = temperature_c[np.isfinite(temperature_c)]
+        if len(finite):
+            low, high = self.gathered.temperature_c or (np.inf, -np.inf)
+            self.gathered.temperature_c = (
+                float(min(low, finite.min())),
+                float(max(high, finite.max())),
+            )
+
+    def _take(self, windows: Sequence[Window]) -> list[Window]:
+        """Add all windows except unused ones to the gathered data, and return them."""
+        if self.windows is not None:
+            self.windows.extend(windows)
+        used = [window for window in windows if window.kind != 'unused']
+        for window in used:
+            self._add(window)
+        return used
+
+    def _add(self, window: Window) -> None:
+        """Add the statistics, the pose and the largest readings of a window."""
+        reduced = reduce_window(window, self.model, self.step.table, session=self.session)
+        gathered = self.gathered
+        gathered.take(reduced)
+        largest_force = float(np.max(np.abs(window.force_s)))
+        gathered.largest_force = max(gathered.largest_force, largest_force)
+        if window.kind == 'static':
+            gathered.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
+            del gathered.poses[:-KEPT_POSES]
+        else:
+            largest_rate = float(np.sqrt((window.rate_s**2).sum(axis=1).max()))
+            gathered.largest_rate = max(gathered.largest_rate, largest_rate)
+        self._store(window, reduced)
+
+    def _store(self, window: Window, _reduced: WindowStatistics) -> None:
+        """Keep the samples of moving windows for plots, and windows for the search of effects."""
+        kept = self.gathered.kept
+        if window.kind != 'static':
+            n_samples = sum(len(w.time) for w in kept) + len(window.time)
+            if n_samples <= KEPT_SAMPLES:
+                kept.append(window)
+        if self.step.keep_for_search:
+            self.gathered.for_search[0].add(owned_window(window))
 
 
 class LiveCollector(Collector):
@@ -574,7 +554,9 @@ class LiveCollector(Collector):
         session: int,
         store: WindowStore,
     ):
-        super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
+        super().__init__(
+            GatherStep(table, model, options.windows, options.nominal), session=session
+        )
         self.store = store
         self.gathered.for_search = [DecimatedWindows(MAX_LIVE_SAMPLES)]
 
@@ -590,7 +572,7 @@ class LiveCollector(Collector):
 
         The statistics of all stored windows are computed again.
         """
-        windows = self.store.reduced(model, self.table, self.session)
+        windows = self.store.reduced(model, self.step.table, self.session)
         self.gathered = self.gathered.with_windows(windows)
         self.model = model
 
@@ -601,7 +583,17 @@ class LiveCollector(Collector):
         With `pending`, open windows are closed in the copies.
         """
         twin = copy.copy(self)
-        twin.gathered = copied(self.gathered)
+        # What is shared is never changed in place.
+        gathered = self.gathered
+        twin.gathered = replace(
+            gathered,
+            accumulator=gathered.accumulator.copy(),
+            held_out=gathered.held_out.copy(),
+            poses=list(gathered.poses),
+            kept=[],
+            counts=dict(gathered.counts),
+            for_search=[kept.copy() for kept in gathered.for_search],
+        )
         twin.store = self.store.copy()
         if pending:
             twin.gatherer = copy.deepcopy(self.gatherer)
@@ -609,16 +601,3 @@ class LiveCollector(Collector):
         else:
             twin.update_counts()
         return twin.gathered, twin.store
-
-
-def copied(gathered: SessionData) -> SessionData:
-    """Return a copy that shares only objects that are never changed in place."""
-    return replace(
-        gathered,
-        accumulator=gathered.accumulator.copy(),
-        held_out=gathered.held_out.copy(),
-        poses=list(gathered.poses),
-        kept=[],
-        counts=dict(gathered.counts),
-        for_search=[kept.copy() for kept in gathered.for_search],
-    )

@@ -45,7 +45,7 @@ def motions_needed(
 
     """
     prior_sd = make_prior(solution.model).sd
-    needed = needed_motions(
+    standard_motions = needed_motions(
         solution,
         tolerances,
         table.gravity_value,
@@ -62,9 +62,9 @@ def motions_needed(
     for effect in solution.model.effects:
         if effect.known_size:
             earth_rate_names.update(effect.param_names())
-    for name in list(needed):
+    needed = {}
+    for name, motion in standard_motions.items():
         if name not in counted:
-            del needed[name]
             continue
         if name in earth_rate_names:
             needed[name] = (earth_rate_remedy, float('nan'))
@@ -85,8 +85,7 @@ def motions_needed(
         if not text and wanders and wander_variance[index] > tolerances[index] ** 2:
             # The mean of the bias over the recording is as uncertain after more motions.
             text = WANDER_REMEDY
-        if text:
-            needed[name] = (text, float('nan'))
+        needed[name] = (text, float('nan')) if text else motion
     return needed
 
 

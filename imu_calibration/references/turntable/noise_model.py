@@ -142,9 +142,7 @@ class NoiseModel(SensorNoise):
 
         """
         no_excess = np.ones(3)
-        factors = []
-        for kind in kinds:
-            factors.append(self.moving[kind].means if kind in self.moving else no_excess)
+        factors = [self.moving[kind].means if kind in self.moving else no_excess for kind in kinds]
         variance = self.low_variance * np.stack(factors) / np.asarray(counts, float)[:, None]
         if self.shaken and keys:
             variance = np.maximum(variance, [self.shaken.get(key, np.zeros(3)) for key in keys])

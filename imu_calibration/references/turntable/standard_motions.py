@@ -1,7 +1,7 @@
 """Standard motions of the sensor, for the prediction of their information."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -57,25 +57,6 @@ class Motion:
         return seconds
 
 
-@dataclass(frozen=True, eq=False)
-class _Surroundings:
-    """Conditions of a piece of a motion in addition to the turn; None: without."""
-
-    arm: np.ndarray | None = None
-    """Arm from the axis of the turn, m, shape (3,)."""
-    temperature_c: np.ndarray | None = None
-    """Shape (n,)."""
-    branch: np.ndarray | None = None
-    """Thermal branch, shape (n,)."""
-    warming: np.ndarray | None = None
-    """Slope of the temperature, K/s, shape (n,)."""
-    shaking: np.ndarray | None = None
-    """Variance of vibration, (m/s^2)^2, shape (3,)."""
-
-
-NO_SURROUNDINGS = _Surroundings()
-
-
 def _turn(
     axis: ArrayLike,
     time: np.ndarray,
@@ -85,7 +66,7 @@ def _turn(
     alpha: np.ndarray,
     gravity: float,
     up: ArrayLike,
-    surroundings: _Surroundings = NO_SURROUNDINGS,
+    arm: np.ndarray | None = None,
 ) -> Reference:
     """
     Return the reference of a sensor that turns about its own `axis`.
@@ -98,7 +79,8 @@ def _turn(
     gravity : float
     up : array, shape (3,)
         The vertical in the sensor at angle zero, of any length.
-    surroundings : _Surroundings
+    arm : array, shape (3,), optional
+        Arm from the axis of the turn, m.
 
     """
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
@@ -108,7 +90,6 @@ def _turn(
     alpha_s = alpha[:, None] * axis
     # f = g + alpha x r + omega x (omega x r)
     force = gravity * up_s
-    arm, shaking = surroundings.arm, surroundings.shaking
     if arm is not None:
         force = force + np.cross(alpha_s, arm) + np.cross(rate_s, np.cross(rate_s, arm))
     return Reference(
@@ -118,10 +99,6 @@ def _turn(
         rate_s=rate_s,
         alpha_s=alpha_s,
         gravity=gravity,
-        temperature_c=surroundings.temperature_c,
-        branch=surroundings.branch,
-        shaking=None if shaking is None else np.tile(shaking, (len(time), 1)),
-        warming=surroundings.warming,
     )
 
 
@@ -160,7 +137,7 @@ def _spin(
                     alpha=still,
                     gravity=gravity,
                     up=np.roll(axis, 1) if up is None else up,
-                    surroundings=_Surroundings(arm=arm),
+                    arm=arm,
                 )
             )
         return pieces
@@ -175,36 +152,26 @@ def _oscillation(axis: ArrayLike, up: ArrayLike | None = None) -> Pieces:
 
     def make(gravity: float) -> list[Reference]:
         """Return the oscillation as one piece."""
-        turn = _turn(
-            axis,
-            MOTION_TIME,
-            angle=a * np.sin(w * MOTION_TIME),
-            rate=a * w * np.cos(w * MOTION_TIME),
-            alpha=-a * w**2 * np.sin(w * MOTION_TIME),
-            gravity=gravity,
-            up=OBLIQUE if up is None else up,
-        )
-        return [turn]
+        return [
+            _turn(
+                axis,
+                MOTION_TIME,
+                angle=a * np.sin(w * MOTION_TIME),
+                rate=a * w * np.cos(w * MOTION_TIME),
+                alpha=-a * w**2 * np.sin(w * MOTION_TIME),
+                gravity=gravity,
+                up=OBLIQUE if up is None else up,
+            )
+        ]
 
     return make
 
 
-def _rest(
-    up: ArrayLike, number: int, gravity: float, surroundings: _Surroundings = NO_SURROUNDINGS
-) -> Reference:
+def _rest(up: ArrayLike, number: int, gravity: float) -> Reference:
     """Return a rest: one sample, a minute after the rest before it."""
     zero = np.zeros(1)
     time = zero + 60.0 * number
-    return _turn(
-        (0, 0, 1),
-        time,
-        angle=zero,
-        rate=zero,
-        alpha=zero,
-        gravity=gravity,
-        up=up,
-        surroundings=surroundings,
-    )
+    return _turn((0, 0, 1), time, angle=zero, rate=zero, alpha=zero, gravity=gravity, up=up)
 
 
 def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ()) -> Pieces:
@@ -212,21 +179,21 @@ def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ())
 
     def make(gravity: float) -> list[Reference]:
         """Return a piece for each rest."""
+        rests = [_rest(up, number, gravity) for number, up in enumerate(directions)]
         if not temperatures:
-            return [_rest(up, number, gravity) for number, up in enumerate(directions)]
-        rests = list(enumerate(directions))
+            return rests
         pieces = []
         branch = ThermalBranch()
         slope = TemperatureSlope()
         for step, temperature_c in enumerate(temperatures):
             temperature = np.full(1, temperature_c)
             stamp_ns = np.array([step * len(rests) * 60 * 10**9])
-            warmth = _Surroundings(
-                temperature_c=temperature,
-                branch=branch.of(temperature),
-                warming=slope.of(stamp_ns, temperature),
-            )
-            pieces += [_rest(up, number, gravity, warmth) for number, up in rests]
+            warm = branch.of(temperature)
+            warming = slope.of(stamp_ns, temperature)
+            for rest in rests:
+                pieces.append(
+                    replace(rest, temperature_c=temperature, branch=warm, warming=warming)
+                )
         return pieces
 
     return make
@@ -234,10 +201,10 @@ def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ())
 
 def _shaken(gravity: float) -> list[Reference]:
     """Return rests with each face up, quiet and while the sensor is shaken along each axis."""
+    rests = [_rest(up, number, gravity) for number, up in enumerate(FACES_UP)]
     pieces = []
-    for shaking in (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3)):
-        shaken = _Surroundings(shaking=shaking)
-        pieces += [_rest(up, number, gravity, shaken) for number, up in enumerate(FACES_UP)]
+    for variance in (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3)):
+        pieces += [replace(rest, shaking=variance[None]) for rest in rests]
     return pieces
 
 

@@ -99,10 +99,8 @@ class _Samples:
         """Return the columns of a sensor in the windows of an accumulator."""
         counts = np.array([row.count for row in accumulator.rows], float)
         means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
-        within = []
-        for (owner, _), factor in accumulator.within.items():
-            if owner == sensor:
-                within.append(factor)
+        factors = accumulator.within.items()
+        within = [factor for (owner, _), factor in factors if owner == sensor]
         return cls(counts, means, within, true_input)
 
     def squares_without(

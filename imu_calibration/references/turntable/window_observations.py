@@ -81,14 +81,15 @@ class WindowObservations:
 
     def gauge(self, solution: Solution) -> dict[str, Any]:
         """Return the conventions of origin and axes."""
-        model = solution.model
-        both_arms = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
+        # The gauge of the prior fixes the mean of the sensitive points where it is estimated.
+        is_mean = len(make_prior(solution.model).gauge) > 0
         gauge: dict[str, Any] = {
-            'origin': 'mean_of_sensitive_points' if both_arms else 'mount',
+            'origin': 'mean_of_sensitive_points' if is_mean else 'mount',
             'axes': MOUNT_AXES,
         }
-        if model.joint_names.angle_sd is not None:
-            gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
+        joint_names = solution.model.joint_names
+        if joint_names.angle_sd is not None:
+            gauge['zeros_as_described'] = list(joint_names.taken_as_described)
         return gauge
 
     def findings(self, solution: Solution) -> tuple[CheckFinding, ...]:

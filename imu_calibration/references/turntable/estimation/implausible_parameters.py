@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.effects.base import Effect, Role
+from imu_calibration.effects.base import Role
 from imu_calibration.references.turntable.estimation.weighted_system import WeightedSystem
 from imu_calibration.references.turntable.noise_model import NoiseModel
 
@@ -50,7 +50,10 @@ def implausible_parameters(
     mask = np.zeros(len(values), bool)
     for effect in system.model.effects:
         part = system.model.slices[effect.key]
-        limit = _plausible_limit(effect)
+        # The largest deviation from the prior that known instruments have.
+        limit = effect.largest
+        if effect.role is Role.LINEAR:
+            limit = MAX_PRIOR_SDS * float(np.max(effect.prior_sds()))
         if effect.role is Role.OFFSET or not np.isfinite(limit):
             continue
         size = np.abs(values[part] - system.prior.mean[part])
@@ -64,13 +67,6 @@ def implausible_parameters(
         else:
             mask[part] = free[part] & implausible.any()
     return mask
-
-
-def _plausible_limit(effect: Effect) -> float:
-    """Return the largest deviation from the prior that known instruments have."""
-    if effect.role is Role.LINEAR:
-        return MAX_PRIOR_SDS * float(np.max(effect.prior_sds()))
-    return effect.largest
 
 
 def _shift_of_misfit(

@@ -44,20 +44,14 @@ def model_error(
     waves = waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free=free)
     error, misfits = errors_of_waves(waves, system.model)
     if 'accelerometer' in misfits:
-        # An error that depends on the attitude has a mean as large as its scatter, absorbed by the
-        # bias.
+        # An error that depends on the attitude scatters the means as offsets or a fast bias process
+        # do. It has a mean as large as its scatter, absorbed by the bias.
+        noise = noises['accelerometer']
+        processes = [p for p in noise.bias_processes if p.time < SHORTEST_BIAS_TIME]
+        scatter = noise.offset_sd**2 + sum(process.sd**2 for process in processes)
         bias = system.model.part('accelerometer', Role.OFFSET)
-        scatter = _scatter_of_means(noises['accelerometer'])
         error.scatter_variance[bias] += COMMON_MEAN_FACTOR * scatter
     return error
-
-
-def _scatter_of_means(noise: NoiseModel) -> float:
-    """
-    Return the variance of the means between windows, by offsets and by fast bias processes.
-    """
-    processes = [p for p in noise.bias_processes if p.time < SHORTEST_BIAS_TIME]
-    return noise.offset_sd**2 + sum(process.sd**2 for process in processes)
 
 
 def _block_scores(

@@ -202,10 +202,10 @@ def _candidate(
     clear = ~np.isin(np.arange(rows.count), (last, last + 1))
     compared = rows.selected(clear)
     changing = compared.changing(of_group)
-    step_columns = changing.along(_after(rows, last))
+    step_columns = changing.changes_along(_after(rows, last))
     constant = compared.fit(chosen)
     step = compared.fit(fitted, step_columns)
-    gradual = compared.fit(fitted, changing.along(_curves(rows.space.recording.time)))
+    gradual = compared.fit(fitted, changing.changes_along(_curves(rows.space.recording.time)))
     before = compared.excess(chosen, constant)
     after = compared.excess(fitted, step, step_columns)
     if after.squares >= (1 - MIN_EXPLAINED_SHARE) * before.squares:
@@ -257,7 +257,7 @@ def _loss_of_step(
 
     `in_second_state` is 1 in these windows and 0 in the other ones, shape (n, 1).
     """
-    return rows.fit(fitted, changing.along(in_second_state)).loss
+    return rows.fit(fitted, changing.changes_along(in_second_state)).loss
 
 
 def _follows_temperature(

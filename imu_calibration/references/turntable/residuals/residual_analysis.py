@@ -316,12 +316,11 @@ class ResidualAnalysis(Investigation):
     @property
     def further_moves(self) -> list[tuple[Mapping[str, float], float]]:
         """(parameter -> its possible error, weight) by the unexplained residual and by rivals."""
-        moves: list[tuple[Mapping[str, float], float]] = []
-        for errors in biases_off(self.problem.baseline, self.residual_of):
-            moves.append((errors, 1.0))
-        for rival in self.rivals:
-            moves.append((rival.moves, rival.weight))
-        return moves
+        errors_of_biases = biases_off(self.problem.baseline, self.residual_of)
+        moves: list[tuple[Mapping[str, float], float]] = [
+            (error, 1.0) for error in errors_of_biases
+        ]
+        return moves + [(rival.moves, rival.weight) for rival in self.rivals]
 
     def unexplained_rests(self) -> dict[str, Unexplained]:
         """

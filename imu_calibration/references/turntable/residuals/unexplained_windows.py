@@ -120,14 +120,15 @@ def _unexplained(
     floor = explained.floor.noise[sensor]
     white = recording.mean_variance(floor)
     noise_sd = np.sqrt(white + floor.bias_variance)
+    n_means, n_within = explained.numbers[sensor]
     sigma_means, sigma_within = explained.sigma(sensor, excess)
     # At least the excess of one axis, which negative values of other axes would lower.
     excess_of_means, excess_within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
     sigma = sigma_means
-    if excess_within > WITHIN_SHARE * explained.n_within:
+    if excess_within > WITHIN_SHARE * n_within:
         sigma = max(sigma_means, sigma_within)
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
-    significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
+    significant = bool(sigma > SIGNIFICANT_SDS and n_means >= 3 * MIN_EXPLAINED_WINDOWS)
     unexplained = Unexplained(
         significant=significant,
         rms=rms,
@@ -144,12 +145,12 @@ def _unexplained(
     if sigma_means <= SIGNIFICANT_SDS:
         moving_kinds = np.unique(recording.kind[recording.moving])
         variance = np.mean([floor.row_variance(kind) for kind in moving_kinds])
-        rms_within = np.sqrt(variance * excess_within / explained.n_within)
+        rms_within = np.sqrt(variance * excess_within / n_within)
         return replace(unexplained, rms=float(rms_within))
 
     # The means differ by less than the wander of the bias, but neighbours by more than white noise.
     if rms == 0:
-        rms = float(np.sqrt(np.mean(white) * excess_of_means / explained.n_means))
+        rms = float(np.sqrt(np.mean(white) * excess_of_means / n_means))
     # The fit has absorbed the part of the cause that the columns of the model resemble.
     fitted = []
     for axis in range(3):

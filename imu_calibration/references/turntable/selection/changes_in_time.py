@@ -273,9 +273,13 @@ class ChangingColumns:
     axes: tuple[_ChangingOfAxis, ...]
     """The axes that have some of the columns."""
 
-    def along(self, functions: np.ndarray) -> Changes:
+    def changes_along(self, functions: np.ndarray) -> Changes:
         """
-        Return the Changes of the parameters along functions of time.
+        Return the Changes of the parameters along functions f of time.
+
+        With all columns A of a part and those that may change, B, white::
+
+            cross = A' (f B),   squares = (f B)' (g B)   for all functions f and g
 
         Parameters
         ----------
@@ -287,8 +291,9 @@ class ChangingColumns:
         n_changes = n_functions * self.count
         cross = np.zeros((self.n_parts, self.size, n_changes))
         squares = np.zeros((self.n_parts, n_changes, n_changes))
-        pairs = functions[:, :, None] * functions[:, None]
+        products = functions[:, :, None] * functions[:, None]  # f g in each window, (n, m, m)
         for axis in self.axes:
+            # The changes along the first function are first, in the order of the parameters.
             rows = axis.rows
             places = (np.arange(n_functions)[:, None] * self.count + axis.order).ravel()
             at_cross = (rows.places[:, None], places)
@@ -302,7 +307,7 @@ class ChangingColumns:
 
             # Within windows, where the function is constant: sum_w f_w P_w and sum_w f_w g_w P_w.
             with_model = np.tensordot(axis.within, functions, (0, 0)).transpose(0, 2, 1)
-            of_pairs = np.tensordot(pairs, axis.squares, (0, 0)).transpose(0, 2, 1, 3)
+            of_products = np.tensordot(products, axis.squares, (0, 0)).transpose(0, 2, 1, 3)
             cross[rows.part + 1][at_cross] += with_model.reshape(len(rows.places), -1)
-            squares[rows.part + 1][at_squares] += of_pairs.reshape(len(places), -1)
+            squares[rows.part + 1][at_squares] += of_products.reshape(len(places), -1)
         return Changes(cross, squares)

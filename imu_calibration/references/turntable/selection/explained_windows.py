@@ -37,12 +37,8 @@ class ExplainedWindows(Explained):
         scatter = scatter_of_each(evidence.space, evidence.noise, values)
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
         """Evidence with this noise."""
-        self.n_means = 3.0 * len(recording.windows)
-        """Number of squares of means, all axes."""
-        self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
-        """Number of squares within moving windows, all axes."""
-        super().__init__(
-            search,
-            self.floor.unpredicted,
-            dict.fromkeys(evidence.space.sensors, np.array([self.n_means, self.n_within])),
-        )
+        # Squares of all axes.
+        n_means = 3.0 * len(recording.windows)
+        n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
+        numbers = dict.fromkeys(evidence.space.sensors, np.array([n_means, n_within]))
+        super().__init__(search, self.floor.unpredicted, numbers)

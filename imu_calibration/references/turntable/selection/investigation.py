@@ -25,8 +25,10 @@ from imu_calibration.references.turntable.selection.extended_model import (
 )
 from imu_calibration.references.turntable.selection.extended_solution import extended_solution
 from imu_calibration.references.turntable.selection.lag_explanations import (
+    Explanation,
     LagExplanations,
     lag_explanations,
+    simplest,
 )
 from imu_calibration.references.turntable.selection.linearised_problem import (
     LinearisedProblem,
@@ -54,9 +56,9 @@ LINEARISATIONS = 5
 """Largest number of linearisations."""
 EXPLANATIONS = 4
 """Explanations of the lags that are tried, at most."""
-LEFT = 0.1
+MAX_REMAINING_SHARE = 0.1
 """Largest remaining share of a significant excess after pairs, or effects of implausible size."""
-LEFT_BEFORE = 3 * LEFT
+MAX_SHARE_BEFORE = 3 * MAX_REMAINING_SHARE
 """
 The same before the choice is relinearised: a larger share is rejected at once, because a trial
 needs up to eight linearisations.
@@ -151,7 +153,7 @@ def investigate(
     )
 
     # Search for constant parameters.
-    result = _explained(searched.linearised(), searched)
+    result = _search_result(searched.linearised(), searched)
 
     # An excess remains: do parameters change at one moment?
     onset = None
@@ -164,7 +166,7 @@ def investigate(
     step = next((effect for effect in testable if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
         with_step = _with_clock_step(searched, step, onset)
-        if with_step.outcome.rest < LEFT * result.outcome.rest:
+        if with_step.outcome.rest < MAX_REMAINING_SHARE * result.outcome.rest:
             result = with_step
             onset = None
 
@@ -226,10 +228,10 @@ def _with_clock_step(searched: SearchedWindows, step: Effect, onset: Onset) -> _
     searched = replace(searched, effects=effects)
     problem = searched.linearised(point_with(searched.baseline, effects, values))
     start = [question for question in problem.questions if question.name == step.name]
-    return _explained(problem, searched, start)
+    return _search_result(problem, searched, start)
 
 
-def _explained(
+def _search_result(
     problem: LinearisedProblem, searched: SearchedWindows, start: Sequence[Question] = ()
 ) -> _SearchResult:
     """
@@ -238,10 +240,11 @@ def _explained(
     Lags are explained together (`lag_explanations`); they are resolved effects in further searches.
     Without lags, timing effects are compared at their own linearisations (`settle_rivals`).
     """
-    found = problem.search.run(start)
+    likeliest = problem.search.run(start)
+    # Lags on which the windows disagree need no explanation.
     chosen = []
-    for question in found:
-        if question.name not in FAMILY or problem.windows_agree(found, question):
+    for question in likeliest:
+        if question.name not in FAMILY or problem.windows_agree(likeliest, question):
             chosen.append(question)
     explanations = lag_explanations(problem, [*chosen, *problem.search.early(chosen)], searched)
     if explanations is not None:
@@ -294,7 +297,7 @@ class _Trial:
         return len(self.lags & named), len(self.lags & chosen), -self.number
 
     @property
-    def helps(self) -> bool:
+    def names_all_lags(self) -> bool:
         """Whether all of its lags are named."""
         return self.rank[0] == len(self.lags)
 
@@ -313,11 +316,11 @@ def _with_lags(
     is not, another explanation. To save time, a trial is relinearised at its choice only if all of
     its lags are named before, or if no trial succeeds and it is the best.
     """
-    max_effects = None  # of the next explanation
-    refused = []  # explanations of which some lags are not named
+    candidates = explanations.explanations
+    refused: list[Explanation] = []  # explanations of which some lags are not named
     tried = []
     for number in range(EXPLANATIONS):
-        selected = explanations.select(max_effects, refused)
+        selected = simplest(candidates, explanations.cost_without_lag)
         at_lags = explanations.settled(selected, searched)
         chosen = at_lags.problem.search.run(at_lags.chosen)
         settled, rivals = settle_rivals(at_lags.problem, chosen, searched)
@@ -325,14 +328,14 @@ def _with_lags(
             chosen = _chosen_again(settled, chosen)
         outcome = _outcome(settled, chosen)
         trial = _Trial(number, selected.lags.keys(), outcome, [*at_lags.rivals, *rivals])
-        if trial.helps:
+        if trial.names_all_lags:
             trial = trial.finished(searched)
-            if trial.helps:
+            if trial.names_all_lags:
                 return trial.outcome, trial.rivals
         tried.append(trial)
-        max_effects = max(len(selected.lags) - 1, 1)
-        refused = [*refused, selected]
-        if not explanations.others(max_effects, refused):
+        refused.append(selected)
+        candidates = explanations.others(max(len(selected.lags) - 1, 1), refused)
+        if not candidates:
             break
     best = _best_of(tried, searched)
     return best.outcome, best.rivals
@@ -379,7 +382,7 @@ def _looked_again(
     best = min(choices, key=search.cost)
     if _labels(best) in tried:
         return outcome
-    if outcome.problem.explained.rest(best) >= LEFT_BEFORE * outcome.rest:
+    if outcome.problem.explained.rest(best) >= MAX_SHARE_BEFORE * outcome.rest:
         return outcome
     # Implausible sizes have a price; without them the better choice has the lower cost.
     if not searched.any_size and search.cost(best) >= search.cost(outcome.chosen):
@@ -387,7 +390,7 @@ def _looked_again(
 
     tried.add(_labels(best))
     other = _settled(searched, problem, best)
-    return other if other.rest < LEFT * outcome.rest else outcome
+    return other if other.rest < MAX_REMAINING_SHARE * outcome.rest else outcome
 
 
 def _settled(

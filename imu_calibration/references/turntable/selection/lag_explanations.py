@@ -123,25 +123,18 @@ class LagExplanations:
     cost_without_lag: float | None
     """Held-out cost without any lag, nats, without rests; None where rests determine the noise."""
 
-    def others(
-        self, most: int | None = None, refused: Sequence[Explanation] = ()
-    ) -> list[Explanation]:
+    def others(self, max_effects: int, refused: Sequence[Explanation]) -> list[Explanation]:
         """
-        Return the explanations with at most `most` effects, without the refused ones.
+        Return the explanations with at most `max_effects` effects, without the refused ones.
 
         Explanations with the same columns as a refused one have its cost, and are refused too.
         """
         refused_costs = {explanation.cost for explanation in refused}
         others = []
         for explanation in self.explanations:
-            few_enough = most is None or len(explanation.lags) <= most
-            if few_enough and explanation.cost not in refused_costs:
+            if len(explanation.lags) <= max_effects and explanation.cost not in refused_costs:
                 others.append(explanation)
         return others
-
-    def select(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
-        """Return the simplest explanation with at most `most` effects that is not refused."""
-        return simplest(self.others(most, refused), self.cost_without_lag)
 
     def settled(self, selected: Explanation, searched: SearchedWindows) -> 'SettledLags':
         """Return an explanation with the problem linearised at its lags."""
@@ -211,7 +204,7 @@ def lag_explanations(
         if question.name in CLOCKS:
             for k in question.parameters:
                 clocks[problem.space.names[k]] = float(values[k])
-    hypotheses = _described(searched, effects, rest=rest, clocks=clocks or None)
+    hypotheses = _hypotheses(searched, effects, rest=rest, clocks=clocks or None)
 
     judges = [each.problem for each in hypotheses]
     names = [name for name in hypotheses[0].values if name.split('.')[1] not in FAMILY]
@@ -255,7 +248,7 @@ def simplest(
     return simplest(with_common_clock) if with_common_clock else selected
 
 
-def _described(
+def _hypotheses(
     searched: SearchedWindows,
     effects: Mapping[str, Effect],
     *,
@@ -357,11 +350,10 @@ def _explanations(
         options.append(of_sensor)
 
     explanations = []
-    for one, two in product(*options):
-        if one.kind or two.kind:
-            for explanation in _described_together(one, two, names):
-                if explanation.cost < cost_without:
-                    explanations.append(explanation)
+    for of_accelerometer, of_gyroscope in product(*options):
+        for explanation in _explanations_of_pair(of_accelerometer, of_gyroscope, names):
+            if explanation.cost < cost_without:
+                explanations.append(explanation)
     return explanations
 
 
@@ -442,13 +434,17 @@ def _cost(
     return 0.5 * float(np.mean(losses))
 
 
-def _described_together(one: _Option, two: _Option, names: Sequence[str]) -> Iterator[Explanation]:
+def _explanations_of_pair(
+    one: _Option, two: _Option, names: Sequence[str]
+) -> Iterator[Explanation]:
     """
-    Yield the explanations of two sensors' lags in which the lags of the sensors are positive.
+    Yield the explanations of the lags of both sensors, `one` and `two`, with positive lags.
 
-    The lags are separate, or a common clock and the additional lags of each sensor. `names` are the
-    parameters of which an explanation has the values.
+    The lags are separate, or a common clock and the additional lags of each sensor. Nothing if no
+    sensor has a lag. `names` are the parameters of which an explanation has the values.
     """
+    if not (one.kind or two.kind):
+        return
     values = {}
     for name in names:
         of_its_sensor = two if name.startswith(two.sensor) else one

@@ -252,27 +252,20 @@ def _with_moving_factors(
     `is_correlated` it grows by the ratio of the mean square of the residual along the columns of
     each window to this variance, which is 1 for white noise.
     """
+    recording = space.recording
     weights = weights_of(range(space.size), values, space.size)
     moving = {}
-    for kind in np.unique(space.recording.kind[space.recording.moving]):
-        of_kind = space.recording.kind == kind
-        dof = (space.recording.count[of_kind] - 1).sum()
+    for kind in np.unique(recording.kind[recording.moving]):
+        of_kind = recording.kind == kind
+        dof = (recording.count[of_kind] - 1).sum()
         variances = np.zeros(3)
-        column_variances = np.zeros(3)  # mean square of the residual along the window's columns
+        column_variances = np.zeros(3)
         for axis in range(3):
             # The residual is its products with the columns times these weights.
             of_axis = weights[space.places(sensor, axis)]
             if is_correlated:
-                squares = 0.0
-                rank = 0
-                for products in space.within_each(sensor, axis, of_kind):
-                    # With the residual of the fit in place of that of the linearisation.
-                    products[:, :, -1] = products @ of_axis
-                    variances[axis] += (of_axis @ products[:, :, -1].T).sum() / dof
-                    squares_of_windows, rank_of_windows = misfit_along(products)
-                    squares = squares + squares_of_windows
-                    rank = rank + rank_of_windows
-                column_variances[axis] = squares / max(rank, 1)
+                scatter = _scatter_in_windows(space, sensor, axis, of_kind, of_axis, dof)
+                variances[axis], column_variances[axis] = scatter
             else:
                 variances[axis] = of_axis @ space.within_sum(sensor, axis, of_kind) @ of_axis / dof
         correlation = 1.0
@@ -284,6 +277,33 @@ def _with_moving_factors(
             factor, slow=factor, means=np.maximum(factor, 1.0), correlation=correlation
         )
     return replace(noise, moving=moving)
+
+
+def _scatter_in_windows(
+    space: ParameterSpace,
+    sensor: str,
+    axis: int,
+    rows: np.ndarray,
+    weights: np.ndarray,
+    dof: float,
+) -> tuple[float, float]:
+    """
+    Return (variance of the residual of an axis, its mean square along the columns of each window).
+
+    `rows`: mask of the windows, with `dof` degrees of freedom; `weights`: those of the residual in
+    the rows of the axis.
+    """
+    variance = 0.0
+    squares = 0.0
+    rank = 0
+    for products in space.within_each(sensor, axis, rows):
+        # With the residual of the fit in place of that of the linearisation.
+        products[:, :, -1] = products @ weights
+        variance += (weights @ products[:, :, -1].T).sum() / dof
+        squares_of_windows, rank_of_windows = misfit_along(products)
+        squares += squares_of_windows
+        rank += rank_of_windows
+    return variance, squares / max(rank, 1)
 
 
 def _with_bias_process(
