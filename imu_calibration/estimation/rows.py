@@ -91,7 +91,7 @@ class Rows(AlignedArrays):
         return self.variance if self.drift is None else self.variance + self.drift
 
     @property
-    def at(self) -> Any:
+    def index_in_normal(self) -> Any:
         """Index of the normal matrix of the rows in one of all parameters."""
         return ... if self.places is None else np.ix_(self.places, self.places)
 
@@ -208,7 +208,7 @@ def normal_of_rows(
     total = np.zeros((size + 1, size + 1))
     for block in blocks:
         white = flat(block.white() if select is None else block.white()[select])
-        total[block.at] += white.T @ white
+        total[block.index_in_normal] += white.T @ white
     return total
 
 

@@ -14,7 +14,7 @@ from imu_calibration.selection.search import Search
 
 MIN_EXPLAINED_SHARE = 0.7
 """
-Share of the unexplained that a finding must remove from held-out windows, where a significant rest
+Share of the excess that a finding must remove from held-out windows, where a significant part
 remains.
 """
 MIN_SMOOTH_SHARE = 0.9
@@ -85,14 +85,14 @@ class Explained:
         sd_of_axis = sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE
         return excess.sum(axis=1) / sd, excess / sd_of_axis[:, None]
 
-    def rest(self, chosen: Sequence[Question]) -> float:
+    def remaining_excess(self, chosen: Sequence[Question]) -> float:
         """Return the sum of the excess over the sensors, parts and axes where it is significant."""
         total = 0.0
         for sensor, excess in self.excess(chosen).items():
-            total += self._rest(sensor, excess).sum()
+            total += self._significant_excess(sensor, excess).sum()
         return float(total)
 
-    def _rest(self, sensor: str, excess: np.ndarray) -> np.ndarray:
+    def _significant_excess(self, sensor: str, excess: np.ndarray) -> np.ndarray:
         """
         Return the significant excess of one sensor in each part, shape (n_parts,).
 
@@ -117,7 +117,7 @@ class Explained:
             shares.append(removed / (removed + remaining))
         return min(shares, default=0.0)
 
-    def rest_beside(self, chosen: Sequence[Question], question: Question) -> float:
+    def remaining_beside(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the significant excess of the choice in the parts on which the effect acts."""
         return sum(remaining for _, remaining in self._where_it_shows(chosen, question))
 
@@ -143,7 +143,7 @@ class Explained:
             if not removed.sum() >= SHOWS * strongest > 0:
                 continue
             in_part = removed >= self.least_part * removed.max()
-            remaining = self._rest(sensor, excess_with[sensor])
+            remaining = self._significant_excess(sensor, excess_with[sensor])
             shows.append((float(removed[in_part].sum()), float(remaining[in_part].sum())))
         return shows
 

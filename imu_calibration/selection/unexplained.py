@@ -144,20 +144,18 @@ def correlate(
         # A variable with nearly as many columns as windows would fit any residual.
         if known.sum() < WINDOWS_PER_COLUMN * columns.shape[1] + SPARE_WINDOWS:
             continue
-        squares_without = 0.0
-        dof_without = 0
-        squares_with = 0.0
-        dof_with = 0
+        # (sum of squares, degrees of freedom) of the fits to all axes.
+        without_variable = np.zeros(2)
+        with_variable = np.zeros(2)
         for axis, fitted_columns in enumerate(fitted):
             weight = 1 / noise_sd[known, axis, None]
             design = weight * np.column_stack([bias, fitted_columns, columns])[known]
             values = weight[:, 0] * residual[known, axis]
-            squares, dof = _residual_squares(design[:, : 1 + fitted_columns.shape[1]], values)
-            squares_without += squares
-            dof_without += dof
-            squares, dof = _residual_squares(design, values)
-            squares_with += squares
-            dof_with += dof
+            n_fitted = 1 + fitted_columns.shape[1]
+            without_variable += _residual_squares(design[:, :n_fitted], values)
+            with_variable += _residual_squares(design, values)
+        squares_without, dof_without = without_variable
+        squares_with, dof_with = with_variable
         n_added = dof_without - dof_with
         if min(n_added, dof_with) <= 0:
             continue

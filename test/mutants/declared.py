@@ -318,7 +318,7 @@ SEARCH = _of(
     ),
     (
         'the quiet of two axes hides the third',
-        'Explained._rest',
+        'Explained._significant_excess',
         'np.where(_1 > SIGNIFICANT_REST, _2, 0.0)',
         'np.where(_1 > 1000000000.0, _2, 0.0)',
         'test_search.py::test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others',

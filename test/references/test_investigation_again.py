@@ -29,9 +29,9 @@ def looked_again(monkeypatch):
         search = SimpleNamespace(run=lambda start: best, resolved=(), cost=len)
         problem = SimpleNamespace(search=search, questions=[])
         problem.asking_any_size = lambda: problem
-        problem.explained = SimpleNamespace(rest=lambda chosen: before)
+        problem.explained = SimpleNamespace(remaining_excess=lambda chosen: before)
         first = SimpleNamespace(
-            rest=100.0,
+            remaining_excess=100.0,
             problem=problem,
             chosen=[SimpleNamespace(label=label, name=label) for label in ('one', 'two')],
         )
@@ -39,7 +39,7 @@ def looked_again(monkeypatch):
 
         def settled(searched, problem, chosen):
             trials.append(chosen)
-            return SimpleNamespace(rest=after)
+            return SimpleNamespace(remaining_excess=after)
 
         monkeypatch.setattr(investigation, '_settled', settled)
         outcome, tried = first, set()
@@ -47,7 +47,7 @@ def looked_again(monkeypatch):
             if outcome is first:
                 of_size = SimpleNamespace(any_size=any_size)
                 outcome = investigation._looked_again(outcome, of_size, tried)
-        return outcome.rest, len(trials)
+        return outcome.remaining_excess, len(trials)
 
     return look
 

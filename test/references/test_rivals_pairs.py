@@ -83,9 +83,9 @@ def test_a_pair_of_which_one_does_nothing_does_not_survive():
 
 
 def outcome(search, named, rest):
-    explained = SimpleNamespace(rest=lambda chosen: 0.0)
+    explained = SimpleNamespace(remaining_excess=lambda chosen: 0.0)
     problem = SimpleNamespace(search=search, explained=explained)
-    return SimpleNamespace(problem=problem, chosen=named, named=named, rest=rest)
+    return SimpleNamespace(problem=problem, chosen=named, named=named, remaining_excess=rest)
 
 
 @pytest.mark.parametrize(

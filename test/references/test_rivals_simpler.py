@@ -56,6 +56,6 @@ def test_the_simpler_of_two_is_told_where_a_rest_stays_and_the_residual_does_not
         module, 'gain_in_turn', lambda *args, **options: SimpleNamespace(ci95=(least, np.nan))
     )
     explained = SimpleNamespace(
-        rest_beside=lambda chosen, question: rest, share=lambda chosen, question: share
+        remaining_beside=lambda chosen, question: rest, share=lambda chosen, question: share
     )
     assert module.simpler(SimpleNamespace(search=Search(), explained=explained), [ARMS]) == [told]

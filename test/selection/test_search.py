@@ -406,7 +406,7 @@ def test_an_effect_is_compared_with_the_excess_of_the_parts_in_which_it_counts(l
         least_part=least_part,
     )
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
-    assert explained.rest([QUADRATIC]) == pytest.approx(1000.0)
+    assert explained.remaining_excess([QUADRATIC]) == pytest.approx(1000.0)
 
 
 def alike(means, within):
@@ -424,10 +424,13 @@ def test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others():
     explained.numbers, explained.least_part = {'accelerometer': np.array([300.0, 3000.0])}, SHOWS
     alone = np.array([[-20.0, 100.0, -20.0], [0.0, 0.0, 0.0]])
     explained.excess = lambda excess: {'accelerometer': excess}
-    assert explained.sigma('accelerometer', alone)[0] > 5.0 and explained.rest(alone) == 100.0
     assert (
-        explained.rest(alike(60.0, 0.0))
-        == explained.rest(np.array([[0.0, 80.0, 0.0], [0.0, 0.0, 0.0]]))
+        explained.sigma('accelerometer', alone)[0] > 5.0
+        and explained.remaining_excess(alone) == 100.0
+    )
+    assert (
+        explained.remaining_excess(alike(60.0, 0.0))
+        == explained.remaining_excess(np.array([[0.0, 80.0, 0.0], [0.0, 0.0, 0.0]]))
         == 0.0
     )
     explained.excess = lambda chosen: {

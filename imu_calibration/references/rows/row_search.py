@@ -162,11 +162,11 @@ class RowTests(EffectTests):
         problem has that search from then on.
         """
         explained = self.problem.explained
-        if not explained.rest(named):
+        if not explained.remaining_excess(named):
             return named
         search_of_any_size = self.problem.search.asking_any_size()
         of_any_size = pruned(search_of_any_size.run(), explained.share)
-        if not explained.rest(of_any_size) < explained.rest(named):
+        if not explained.remaining_excess(of_any_size) < explained.remaining_excess(named):
             return named
         self.problem.search = search_of_any_size
         return of_any_size

@@ -131,12 +131,13 @@ class HeldOutWindows(HeldOutData[Solution]):
         n_pieces = 0
         for block in self.windows.blocks:
             n_pieces += sum(count_pieces(row.duration) for row in block.accumulator.rows)
-        # Another regime of the same session has its drift; another session has the applied values.
-        trials = (
+        # Another regime of the same session has its drift; another part of the session stands for
+        # another session, in which compensation applies the values at the centre.
+        groups_and_centres = (
             (_groups_by_regime(self.windows, sensor), None),
             (_groups_by_time(self.windows, sensor), self.centre),
         )
-        for groups, applied_at in trials:
+        for groups, centre in groups_and_centres:
             if len(groups) < 2:
                 continue
             of_model = _error_on_groups(
@@ -145,7 +146,7 @@ class HeldOutWindows(HeldOutData[Solution]):
                 sensor,
                 values=self.solution.values,
                 free=free,
-                centre=applied_at,
+                centre=centre,
                 prior=prior,
                 n_pieces=n_pieces,
             )
@@ -323,7 +324,9 @@ class _Correction:
         self.coefficients = coefficients(model, sensor, values)
         """Of the columns, shape (n_columns, 3): ``output = columns @ coefficients``."""
         self.matrix = model.matrix(sensor, values)
+        """Scales and axes, ``output = matrix @ true + ...``, shape (3, 3)."""
         self.inverse = np.linalg.inv(self.matrix)
+        """Its inverse, with which compensation corrects readings."""
         arm = model.part(sensor, Role.ARM)
         self.arm_slopes = _slopes(model, sensor, values, range(arm.start, arm.stop))
         """Derivative of the coefficients by each component of the arm."""

@@ -82,14 +82,14 @@ def residual_traces(
         residuals_of_models = [
             residuals(group, table, model.model, values=model.values) for model in models
         ]
-        old = residuals_of_models[0]
-        new = residuals_of_models[-1]
+        residual_before = residuals_of_models[0]
+        residual_after = residuals_of_models[-1]
         for window, stop in zip(group, np.cumsum([len(window) for window in group])):
             rows = slice(stop - len(window), stop)
-            old_rows = {sensor: residual[rows] for sensor, residual in old.items()}
-            new_rows = {sensor: residual[rows] for sensor, residual in new.items()}
-            sums.add(window, [old_rows, new_rows], before.noise)
-        blocks_of_groups.append(_blocks_of(group, table, before, old, new))
+            before_rows = {sensor: values[rows] for sensor, values in residual_before.items()}
+            after_rows = {sensor: values[rows] for sensor, values in residual_after.items()}
+            sums.add(window, [before_rows, after_rows], before.noise)
+        blocks_of_groups.append(_blocks_of(group, table, before, residual_before, residual_after))
 
     blocks = _joined(blocks_of_groups)
     recording = _Recording(windows, spans, table, models)

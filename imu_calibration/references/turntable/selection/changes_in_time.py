@@ -150,7 +150,7 @@ class WindowRows:
         size = self.space.size + 1
         normals = np.zeros((len(self.expected), size, size))
         for rows in self.axes:
-            at = rows.means.at
+            at = rows.means.index_in_normal
             normals[rows.part][at] += rows.white.T @ rows.white
             normals[rows.part + 1][at] += rows.within.sum(axis=0)
         return normals

@@ -157,7 +157,7 @@ def investigate(
 
     # An excess remains: do parameters change at one moment?
     onset = None
-    if result.outcome.rest:
+    if result.outcome.remaining_excess:
         outcome = result.outcome
         onset = find_onset(outcome.problem, outcome.named, windows=used, table=table)
 
@@ -166,7 +166,10 @@ def investigate(
     step = next((effect for effect in testable if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
         with_step = _with_clock_step(searched, step, onset)
-        if with_step.outcome.rest < MAX_REMAINING_SHARE * result.outcome.rest:
+        if (
+            with_step.outcome.remaining_excess
+            < MAX_REMAINING_SHARE * result.outcome.remaining_excess
+        ):
             result = with_step
             onset = None
 
@@ -271,9 +274,9 @@ class _Outcome:
     """Those whose estimates from both halves differ significantly."""
 
     @cached_property
-    def rest(self) -> float:
+    def remaining_excess(self) -> float:
         """Significant excess over noise with the findings in the model."""
-        return self.problem.explained.rest(self.named)
+        return self.problem.explained.remaining_excess(self.named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,7 +376,7 @@ def _looked_again(
     excess of a different cause somewhat: together they must remove nearly all. Otherwise `outcome`
     is returned. `tried`: labels of the choices that were linearised; the new one is added.
     """
-    if not outcome.rest:
+    if not outcome.remaining_excess:
         return outcome
     problem = outcome.problem.asking_any_size() if searched.any_size else outcome.problem
     search = problem.search
@@ -382,7 +385,10 @@ def _looked_again(
     best = min(choices, key=search.cost)
     if _labels(best) in tried:
         return outcome
-    if outcome.problem.explained.rest(best) >= MAX_SHARE_BEFORE * outcome.rest:
+    if (
+        outcome.problem.explained.remaining_excess(best)
+        >= MAX_SHARE_BEFORE * outcome.remaining_excess
+    ):
         return outcome
     # Implausible sizes have a price; without them the better choice has the lower cost.
     if not searched.any_size and search.cost(best) >= search.cost(outcome.chosen):
@@ -390,7 +396,11 @@ def _looked_again(
 
     tried.add(_labels(best))
     other = _settled(searched, problem, best)
-    return other if other.rest < MAX_REMAINING_SHARE * outcome.rest else outcome
+    return (
+        other
+        if other.remaining_excess < MAX_REMAINING_SHARE * outcome.remaining_excess
+        else outcome
+    )
 
 
 def _settled(
@@ -518,7 +528,7 @@ def _needed_reduction(
     noise.
     """
     has_rests = not problem.recording.moving.all()
-    if has_rests and not problem.explained.rest_beside(chosen, question):
+    if has_rests and not problem.explained.remaining_beside(chosen, question):
         return 0.0
     return LEAST_REDUCTION
 

@@ -118,7 +118,7 @@ class LagExplanations:
     """Linearised where no lag acts."""
     explanations: Sequence[Explanation]
     """Each costs less than no lag."""
-    rest: Sequence[Question]
+    other_effects: Sequence[Question]
     """Chosen effects that are no lags."""
     cost_without_lag: float | None
     """Held-out cost without any lag, nats, without rests; None where rests determine the noise."""
@@ -149,7 +149,7 @@ class LagExplanations:
 
         questions = _questions_by_name(settled)
         lags = [questions[name] for name in selected.lags]
-        chosen = [*lags, *same_questions(settled, self.rest)]
+        chosen = [*lags, *same_questions(settled, self.other_effects)]
         near = [each for each in self.explanations if each.cost < selected.cost + TIE]
         return SettledLags(settled, chosen, _rivals(settled, selected, near))
 
@@ -195,7 +195,7 @@ def lag_explanations(
     has_lag = any(question.name in FAMILY for question in chosen)
     if not has_lag or not FAMILY <= set(effects):
         return None
-    rest = [each for each in chosen if each.name not in FAMILY and '@' not in each.label]
+    other_effects = [each for each in chosen if each.name not in FAMILY and '@' not in each.label]
 
     # Lags are nonlinear at a clock of zero where a clock changes.
     values = problem.values(chosen)
@@ -204,7 +204,7 @@ def lag_explanations(
         if question.name in CLOCKS:
             for k in question.parameters:
                 clocks[problem.space.names[k]] = float(values[k])
-    hypotheses = _hypotheses(searched, effects, rest=rest, clocks=clocks or None)
+    hypotheses = _hypotheses(searched, effects, other_effects=other_effects, clocks=clocks or None)
 
     judges = [each.problem for each in hypotheses]
     names = [name for name in hypotheses[0].values if name.split('.')[1] not in FAMILY]
@@ -217,7 +217,7 @@ def lag_explanations(
     if problem.recording.moving.all():
         without = [question for question in hypotheses[0].chosen if question.name not in FAMILY]
         cost_without_lag = sum(_cost(hypotheses[0], without, judges, sensor) for sensor in SENSORS)
-    return LagExplanations(problem, explanations, rest, cost_without_lag)
+    return LagExplanations(problem, explanations, other_effects, cost_without_lag)
 
 
 def simplest(
@@ -252,7 +252,7 @@ def _hypotheses(
     searched: SearchedWindows,
     effects: Mapping[str, Effect],
     *,
-    rest: Sequence[Question],
+    other_effects: Sequence[Question],
     clocks: dict[str, float] | None,
 ) -> list[LagHypothesis]:
     """
@@ -263,14 +263,14 @@ def _hypotheses(
     searched : SearchedWindows
     effects : dict
         Name -> candidate effect.
-    rest : sequence of Question
+    other_effects : sequence of Question
         Chosen effects that are no lags.
     clocks : dict, optional
         Parameter of a clock that changes -> value for the first linearisation.
 
     """
     # Delays only, at zero; without an observable curvature all kinds have the same columns.
-    first = _hypothesis(searched, DELAY, clocks, effects=effects, rest=rest)
+    first = _hypothesis(searched, DELAY, clocks, effects=effects, other_effects=other_effects)
     curvatures = []
     for question in first.chosen:
         if question.name in FAMILY:
@@ -279,7 +279,7 @@ def _hypotheses(
         return [first]
 
     # Delays at their own estimate, then each other kind from there.
-    first = _hypothesis(searched, DELAY, first.values, effects=effects, rest=rest)
+    first = _hypothesis(searched, DELAY, first.values, effects=effects, other_effects=other_effects)
     hypotheses = [first]
     for kind in LAG_KINDS[1:]:
         values = dict(first.values)
@@ -293,7 +293,9 @@ def _hypotheses(
                 values[effects[lag_name(sensor, ending)].param_names()[0]] = lag
         # A delay with a low-pass is linearised at its own estimate.
         for _ in range(DELAY_LINEARISATIONS if len(kind) > 1 else 1):
-            hypothesis = _hypothesis(searched, kind, values, effects=effects, rest=rest)
+            hypothesis = _hypothesis(
+                searched, kind, values, effects=effects, other_effects=other_effects
+            )
             values = hypothesis.values
         hypotheses.append(hypothesis)
     return hypotheses
@@ -305,18 +307,18 @@ def _hypothesis(
     values: dict[str, float] | None,
     *,
     effects: Mapping[str, Effect],
-    rest: Sequence[Question],
+    other_effects: Sequence[Question],
 ) -> LagHypothesis:
     """Return the lags of one kind, linearised at values of parameters or at the baseline."""
     names = [lag_name(sensor, ending) for ending, sensor in product(kind, SENSORS)]
-    asked = [effects[name] for name in names] + [question.effect for question in rest]
+    asked = [effects[name] for name in names] + [question.effect for question in other_effects]
     point = None
     if values is not None:
         point = point_with(searched.baseline, asked, values)
     there = searched.linearised(point, effects=asked)
     known = _questions_by_name(there)
     lags = [known[name] for name in names]
-    return LagHypothesis(kind, there, [*lags, *same_questions(there, rest)])
+    return LagHypothesis(kind, there, [*lags, *same_questions(there, other_effects)])
 
 
 def _explanations(

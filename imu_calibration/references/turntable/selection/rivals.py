@@ -188,7 +188,7 @@ def simpler(problem: LinearisedProblem, named: Sequence[Question]) -> Sequence[Q
     """
     kept = list(named)
     for place, question in enumerate(named):
-        if not problem.explained.rest_beside(kept, question):
+        if not problem.explained.remaining_beside(kept, question):
             continue
         for other in _fewer(problem.search, kept, question):
             instead = with_exchanged(kept, place, other)
