@@ -10,8 +10,8 @@ import pytest
 
 from imu_calibration.references.turntable.selection import investigation
 from imu_calibration.references.turntable.selection.investigation import (
-    MAX_REMAINING_SHARE,
-    MAX_SHARE_BEFORE,
+    MAX_REMAINING_EXCESS,
+    MAX_EXCESS_BEFORE,
 )
 
 
@@ -53,12 +53,12 @@ def looked_again(monkeypatch):
 
 
 def test_a_choice_that_removes_nearly_all_is_adopted(looked_again):
-    assert looked_again(100.0 * MAX_REMAINING_SHARE, 0.0) == (0.0, 1)
+    assert looked_again(100.0 * MAX_REMAINING_EXCESS, 0.0) == (0.0, 1)
 
 
 def test_a_choice_that_leaves_much_is_not_linearised(looked_again):
-    assert looked_again(100.0 * MAX_SHARE_BEFORE, 0.0) == (100.0, 0)
+    assert looked_again(100.0 * MAX_EXCESS_BEFORE, 0.0) == (100.0, 0)
 
 
 def test_a_choice_is_linearised_once(looked_again):
-    assert looked_again(100.0 * MAX_REMAINING_SHARE, 100.0 * MAX_REMAINING_SHARE) == (100.0, 1)
+    assert looked_again(100.0 * MAX_REMAINING_EXCESS, 100.0 * MAX_REMAINING_EXCESS) == (100.0, 1)

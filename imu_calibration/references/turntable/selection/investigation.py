@@ -56,9 +56,9 @@ LINEARISATIONS = 5
 """Largest number of linearisations."""
 EXPLANATIONS = 4
 """Explanations of the lags that are tried, at most."""
-MAX_REMAINING_SHARE = 0.1
+MAX_REMAINING_EXCESS = 0.1
 """Largest remaining share of a significant excess after pairs, or effects of implausible size."""
-MAX_SHARE_BEFORE = 3 * MAX_REMAINING_SHARE
+MAX_EXCESS_BEFORE = 3 * MAX_REMAINING_EXCESS
 """
 The same before the choice is relinearised: a larger share is rejected at once, because a trial
 needs up to eight linearisations.
@@ -168,7 +168,7 @@ def investigate(
         with_step = _with_clock_step(searched, step, onset)
         if (
             with_step.outcome.remaining_excess
-            < MAX_REMAINING_SHARE * result.outcome.remaining_excess
+            < MAX_REMAINING_EXCESS * result.outcome.remaining_excess
         ):
             result = with_step
             onset = None
@@ -387,7 +387,7 @@ def _looked_again(
         return outcome
     if (
         outcome.problem.explained.remaining_excess(best)
-        >= MAX_SHARE_BEFORE * outcome.remaining_excess
+        >= MAX_EXCESS_BEFORE * outcome.remaining_excess
     ):
         return outcome
     # Implausible sizes have a price; without them the better choice has the lower cost.
@@ -398,7 +398,7 @@ def _looked_again(
     other = _settled(searched, problem, best)
     return (
         other
-        if other.remaining_excess < MAX_REMAINING_SHARE * outcome.remaining_excess
+        if other.remaining_excess < MAX_REMAINING_EXCESS * outcome.remaining_excess
         else outcome
     )
 
