@@ -15,7 +15,7 @@ from imu_calibration.references.turntable.selection.lag_explanations import (
     MAX_CLOCK_LOSS,
     Explanation,
     LagExplanations,
-    _described_together,
+    _explanations_of_pair,
     _Option,
     _rivals,
     simplest,
@@ -111,7 +111,7 @@ def test_two_delays_share_a_clock_at_the_price_of_their_difference():
         option('accelerometer', ('delay',), [9.0e-3]),
         option('gyroscope', ('delay',), [9.02e-3]),
     )
-    told = {tuple(each.lags): each for each in _described_together(one, two, [])}
+    told = {tuple(each.lags): each for each in _explanations_of_pair(one, two, [])}
     assert set(told) == {
         ('accel_delay', 'gyro_delay'),
         ('time_offset',),
@@ -131,9 +131,9 @@ def test_a_filter_is_never_negative_but_a_clock_may_be_early():
         option('accelerometer', ('delay',), [-3e-3]),
         option('gyroscope', ('delay', 'bandwidth'), [-3e-3, 4e-3]),
     )
-    told = [each.lags for each in _described_together(one, two, [])]
+    told = [each.lags for each in _explanations_of_pair(one, two, [])]
     assert told == [pytest.approx({'time_offset': -3e-3, 'gyro_bandwidth': 4e-3})]
-    assert not list(_described_together(one, option('gyroscope', ('bandwidth',), [-1e-3]), []))
+    assert not list(_explanations_of_pair(one, option('gyroscope', ('bandwidth',), [-1e-3]), []))
 
 
 def test_rivals_are_the_members_of_other_explanations_and_only_the_nearest_moves_parameters():

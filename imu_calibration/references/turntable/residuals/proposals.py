@@ -162,11 +162,9 @@ def find_formulas(blocks: BlockMeans, problem: LinearisedProblem) -> list[Formul
     Each one is significant in addition to the earlier ones. They are chosen on the selection
     windows, with all plausible contributions of the catalogue projected out.
     """
-    # To two digits, because the texts contain time constants.
-    duration = float(f'{max(float(np.ptp(blocks.time)), 1.0):.2g}')
     search = FormulaSearch(
         blocks,
-        grammar(blocks.ref.joint_angle.shape[1], blocks.warms, duration),
+        _grammar(blocks),
         _plausible_sizes(blocks.sensor, problem),
         reference_temperature=problem.recording.model.temperature_ref_c,
     )
@@ -236,6 +234,13 @@ def _plausible_sizes(sensor: str, problem: LinearisedProblem) -> np.ndarray:
             factor = np.linalg.cholesky(known[-n:, -n:])
             plausible[np.ix_(parameters, parameters)] = OTHER_SENSOR * factor
     return plausible
+
+
+def _grammar(blocks: BlockMeans) -> tuple[Formula, ...]:
+    """Return the formulas that are tried in a recording."""
+    # To two digits, because the texts contain time constants.
+    duration = float(f'{max(float(np.ptp(blocks.time)), 1.0):.2g}')
+    return grammar(blocks.ref.joint_angle.shape[1], blocks.warms, duration)
 
 
 def _joined(choices: Sequence[FormulaChoice]) -> np.ndarray:
