@@ -48,14 +48,14 @@ class EstimateProblem(Protocol[StateT, RowsT]):
         """Standard deviations of the parameters before any data, shape (n,)."""
 
     @property
-    def asked(self) -> np.ndarray:
+    def adjustable(self) -> np.ndarray:
         """False where a convention fixes a parameter, shape (n,)."""
 
     def fitted(self, state: StateT) -> StateT:
         """Return the values of least cost with the priors, and the noise, estimated alternately."""
 
     def undetermined(self, state: StateT) -> np.ndarray:
-        """Return a mask of the asked parameters that the data do not determine."""
+        """Return a mask of the adjustable parameters that the data do not determine."""
 
     def holding(self, state: StateT, held: np.ndarray) -> StateT:
         """Return the values of least cost with the held parameters (mask) at their prior."""
@@ -111,7 +111,7 @@ def estimate(
     #    too, until none is left.
     not_believed: dict[int, float] = {}
     while True:
-        free = problem.asked & ~held
+        free = problem.adjustable & ~held
         state = problem.holding(state, held)
         rows = problem.weighted(state)
         of_free, of_held = covariance_with_held(rows.design, free, held, prior_sd=problem.prior_sd)

@@ -161,10 +161,7 @@ class Evidence:
     def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
         """Return the residuals of each block, every row under the fit without its fold."""
         weights = self.heldout_weights(used)
-        residuals = []
-        for block, fold in zip(self.blocks, self.folds):
-            residuals.append(block.residuals_at(weights[fold]))
-        return residuals
+        return [block.residuals_at(weights[fold]) for block, fold in zip(self.blocks, self.folds)]
 
     def heldout_weights(self, used: Sequence[int]) -> np.ndarray:
         """

@@ -112,10 +112,8 @@ class Explained:
         excess with it. In each sensor only the parts with the effect count (means of windows,
         within windows, or both): an unexplained excess in the other part does not hide it.
         """
-        shares = []
-        for removed, remaining in self._where_it_shows(chosen, question):
-            shares.append(removed / (removed + remaining))
-        return min(shares, default=0.0)
+        shows = self._where_it_shows(chosen, question)
+        return min((removed / (removed + remaining) for removed, remaining in shows), default=0.0)
 
     def remaining_beside(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the significant excess of the choice in the parts on which the effect acts."""

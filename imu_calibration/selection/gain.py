@@ -80,10 +80,9 @@ def gain_of(
 
     `pair`: (sums of squares, numbers of squares) before and after, each of shape (n_groups,).
     """
-    rms = []
-    for squares, number in pair:
-        rms.append(float(np.sqrt(squares.sum() / max(number.sum(), 1))))
-    before, after = rms
+    before, after = [
+        float(np.sqrt(squares.sum() / max(number.sum(), 1))) for squares, number in pair
+    ]
     n_groups = len(pair[0][0])
     return Gain(
         sensor=sensor,

@@ -10,8 +10,8 @@ import pytest
 
 from imu_calibration.references.turntable.selection import investigation
 from imu_calibration.references.turntable.selection.investigation import (
-    MAX_REMAINING_EXCESS,
     MAX_EXCESS_BEFORE,
+    MAX_REMAINING_EXCESS,
 )
 
 

@@ -98,9 +98,9 @@ def estimate_rows(
         Parameters to hold at their prior in any case.
 
     """
-    asked = ~reference.fixed
-    held = np.zeros(len(asked), bool) if withheld is None else withheld & asked
-    problem = _RowProblem(reference, fallback, held, asked, reference.priors)
+    adjustable = ~reference.fixed
+    held = np.zeros(len(adjustable), bool) if withheld is None else withheld & adjustable
+    problem = _RowProblem(reference, fallback, held, adjustable, reference.priors)
     joint = estimate(problem, _Iterated(state, _known_scatter(fallback)))
     last = joint.state
     return RowEstimate(
@@ -141,7 +141,7 @@ class _RowProblem:
     """Variances of the components where the data are too few, shape (n_components,)."""
     withheld: np.ndarray
     """True where a parameter is held in any case, shape (n,)."""
-    asked: np.ndarray
+    adjustable: np.ndarray
     """False where a convention fixes a parameter, shape (n,)."""
     prior_sd: np.ndarray
     """Standard deviations of the parameters before any data, shape (n,)."""
@@ -156,14 +156,16 @@ class _RowProblem:
 
         `prior_sd`: standard deviations of the priors that count in this fit, shape (n,).
         """
-        squares = _RowSquares(self.reference, self.asked & ~held, prior_sd, self.fallback)
+        squares = _RowSquares(self.reference, self.adjustable & ~held, prior_sd, self.fallback)
         return gauss_newton(squares, state, n_steps=MAX_NEWTON_STEPS)
 
     def undetermined(self, state: _Iterated) -> np.ndarray:
         """Return a mask of the parameters that the data alone do not determine."""
         flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * self.prior_sd))
         rows = np.vstack([self.weighted(state).design, flat_prior])
-        return undetermined_parameters(rows, self.prior_sd, free=self.asked, held=self.withheld)
+        return undetermined_parameters(
+            rows, self.prior_sd, free=self.adjustable, held=self.withheld
+        )
 
     def holding(self, state: _Iterated, held: np.ndarray) -> _Iterated:
         """Return the values from the data almost without priors, the held ones nominal."""

@@ -339,10 +339,7 @@ def chosen_columns(
     factors: dict[tuple[str, str], np.ndarray], chosen: dict[str, np.ndarray]
 ) -> dict[tuple[str, str], np.ndarray]:
     """Return (sensor, kind) -> factor with the columns `chosen` of the sensor only."""
-    restricted = {}
-    for (sensor, kind), factor in factors.items():
-        restricted[sensor, kind] = factor[:, chosen[sensor]]
-    return restricted
+    return {(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in factors.items()}
 
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:

@@ -100,6 +100,7 @@ def solve(
     system = WeightedSystem(accumulator, model)
     problem = _WindowProblem(system, noises_are_known=noise is not None)
     values = start(system)
+    # The fit begins with the known noise, or with one before any residual.
     noises = noise or first_noise(system, values, bias_processes or {})
     joint = estimate(problem, _Fit(values, noises))
     values = joint.state.values
@@ -151,7 +152,7 @@ class _WindowProblem:
         return self.system.prior.sd
 
     @property
-    def asked(self) -> np.ndarray:
+    def adjustable(self) -> np.ndarray:
         """True for the parameters that are not fixed by the model, shape (n_params,)."""
         return ~fixed_parameters(self.system.model)
 
@@ -168,7 +169,7 @@ class _WindowProblem:
                 for sensor, noise in fit.noises.items():
                     noises[sensor] = replace(noise, left_out=noise.left_out | outliers[sensor])
                 fit = self._values_and_noise(_Fit(fit.values, noises))
-        return self._minimised(fit.values, self._weighed(fit), self.asked)
+        return self._minimised(fit.values, self._weighed(fit), self.adjustable)
 
     def _values_and_noise(self, fit: _Fit) -> _Fit:
         """
@@ -180,7 +181,9 @@ class _WindowProblem:
         """
         for _ in range(NOISE_ROUNDS):
             before = self._weighed(fit)
-            values = self._minimised(fit.values, before, self.asked, SMALL_STEP_OF_NOISE).values
+            values = self._minimised(
+                fit.values, before, self.adjustable, SMALL_STEP_OF_NOISE
+            ).values
             noises = {}
             for sensor, noise in before.noises.items():
                 noises[sensor] = updated_noise(self.system, sensor, values, noise=noise)
@@ -191,9 +194,8 @@ class _WindowProblem:
 
     def _weighed(self, fit: _Fit) -> _Fit:
         """Return the fit with the triangular factors of the rows weighted by its noise."""
-        factors = {}
-        for sensor in self.system.sensors:
-            factors[sensor] = self.system.factors(sensor, fit.noises[sensor])
+        system = self.system
+        factors = {sensor: system.factors(sensor, fit.noises[sensor]) for sensor in system.sensors}
         return replace(fit, factors=factors)
 
     def _minimised(
@@ -215,12 +217,12 @@ class _WindowProblem:
         held = undetermined_parameters(
             rows.design,
             self.prior_sd,
-            free=self.asked,
-            held=self.asked & weak_alone(rows.data, self.prior_sd),
+            free=self.adjustable,
+            held=self.adjustable & weak_alone(rows.data, self.prior_sd),
             tie=EQUALLY_WEAK,
         )
         held |= not_separable(self.system.accumulator, self.system.model)
-        if (held | ~self.asked).all():
+        if (held | ~self.adjustable).all():
             raise NotObservableError(
                 'the recording must determine at least one parameter, it determines none; '
                 'record static positions in at least four different attitudes'
@@ -236,7 +238,7 @@ class _WindowProblem:
         if not held.any():
             return fit
         values = np.where(held, self.system.prior.mean, fit.values)
-        return self._minimised(values, fit, self.asked & ~held)
+        return self._minimised(values, fit, self.adjustable & ~held)
 
     def weighted(self, fit: _Fit) -> '_WeightedWindows':
         """Return the rows at a fit."""

@@ -51,9 +51,8 @@ def outlier_windows(
     for sensor in system.sensors:
         fit = _MeanFit.of(system, sensor, values, noises[sensor])
         excluded = np.array([key in noises[sensor].left_out for key in system.keys])
-        of_kinds = []
-        for kind in np.unique(system.kind):
-            of_kinds.append(_outliers_of_kind(system.kind == kind, excluded, fit))
+        kinds = np.unique(system.kind)
+        of_kinds = [_outliers_of_kind(system.kind == kind, excluded, fit) for kind in kinds]
         least_probable = min(of_kinds, key=lambda outliers: outliers.least_p_value)
         outliers_of[sensor] = frozenset(system.keys[window] for window in least_probable.numbers)
     return outliers_of

@@ -133,13 +133,13 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
         Length of the recording, s, to two digits: texts hold time constants.
 
     """
-    formulas = []
-    for entry in (*_of_motion(), *_slow(thermal, duration)):
-        formulas.append(Formula((entry.text,), entry.factors))
-    formulas += _harmonics(n_joints, thermal)
-    formulas += _of_joint_rates(n_joints)
-    formulas += _with_the_table(n_joints, thermal)
-    return tuple(formulas)
+    products = (*_of_motion(), *_slow(thermal, duration))
+    return (
+        *(Formula((entry.text,), entry.factors) for entry in products),
+        *_harmonics(n_joints, thermal),
+        *_of_joint_rates(n_joints),
+        *_with_the_table(n_joints, thermal),
+    )
 
 
 def _atoms(*letters: str) -> list[Product]:
@@ -164,9 +164,7 @@ def _times(*parts: Product) -> Product:
     for part in parts:
         powers[part.text] = powers.get(part.text, 0) + 1
         factors += part.factors
-    texts = []
-    for text, power in powers.items():
-        texts.append(text if power == 1 else f'{text} ** {power}')
+    texts = [text if power == 1 else f'{text} ** {power}' for text, power in powers.items()]
     return Product(' * '.join(texts), factors)
 
 

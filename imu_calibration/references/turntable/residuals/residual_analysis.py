@@ -6,7 +6,7 @@ temperature replaces, and describes the residual of each sensor.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from itertools import chain
@@ -101,8 +101,7 @@ class ResidualAnalysis(Investigation):
         """
         if isinstance(investigation, cls):
             return investigation
-        values = {each.name: getattr(investigation, each.name) for each in fields(investigation)}
-        return cls(**values)
+        return cls(**vars(investigation))
 
     @cached_property
     def residual_of(self) -> dict[str, Unexplained]:

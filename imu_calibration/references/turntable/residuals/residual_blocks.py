@@ -500,9 +500,10 @@ def _cut(window: Window, length: float) -> _Cut:
     edges = np.unique(np.linspace(0, len(window), n_blocks + 1).round().astype(int))
     # Rows in the middles of equal parts of each block; short blocks have fewer.
     middles = (np.arange(WITHIN) + 0.5) / WITHIN
-    rows = []
-    for start, end in zip(edges, edges[1:]):
-        rows.append(np.unique((start + middles * (end - start)).astype(int)))
+    rows = [
+        np.unique((start + middles * (end - start)).astype(int))
+        for start, end in zip(edges, edges[1:])
+    ]
     return _Cut(edges[:-1], np.concatenate(rows), np.array([len(part) for part in rows]))
 
 
@@ -573,10 +574,8 @@ class BlockFits:
         # [SELECTION or LOCKED][axis]: whitened rows [columns | residual].
         self._design = []
         for whitener in blocks.white:
-            of_axes = []
-            for axis, rows in enumerate(blocks.design):
-                of_axes.append(whitener.whiten_axis(rows, axis))
-            self._design.append(of_axes)
+            designs = enumerate(blocks.design)
+            self._design.append([whitener.whiten_axis(rows, axis) for axis, rows in designs])
         # Per axis the places of the parameters in use among the columns.
         self._used_places = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
 

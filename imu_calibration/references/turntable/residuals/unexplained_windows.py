@@ -38,10 +38,11 @@ def unexplained(problem: LinearisedProblem, chosen: Sequence[Question]) -> dict[
     """Return sensor -> Unexplained with the effects `chosen` in the model."""
     used = problem.search.indices(chosen)
     values = weights_of(used, problem.evidence.fit(used)[0], problem.space.size)
-    of_sensors = {}
-    for sensor, excess in problem.explained.excess(chosen).items():
-        of_sensors[sensor] = _unexplained(problem, sensor, excess, values)
-    return of_sensors
+    excess_of = problem.explained.excess(chosen)
+    return {
+        sensor: _unexplained(problem, sensor, excess, values)
+        for sensor, excess in excess_of.items()
+    }
 
 
 def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> Unexplained:

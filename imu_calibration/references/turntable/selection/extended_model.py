@@ -30,9 +30,8 @@ def point_with(
     They have the given `values`, parameter -> value, else the start of the model.
     """
     extended = extended_model(model, effects)
-    parameters = []
-    for name, start in zip(extended.param_names, extended.start()):
-        parameters.append(values.get(name, start))
+    starts = zip(extended.param_names, extended.start())
+    parameters = [values.get(name, start) for name, start in starts]
     point = np.where(np.isfinite(parameters), parameters, 0.0)
     return extended.at(point), point
 

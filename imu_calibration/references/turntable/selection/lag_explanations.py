@@ -311,11 +311,11 @@ def _hypothesis(
 ) -> LagHypothesis:
     """Return the lags of one kind, linearised at values of parameters or at the baseline."""
     names = [lag_name(sensor, ending) for ending, sensor in product(kind, SENSORS)]
-    asked = [effects[name] for name in names] + [question.effect for question in other_effects]
+    compared = [effects[name] for name in names] + [question.effect for question in other_effects]
     point = None
     if values is not None:
-        point = point_with(searched.baseline, asked, values)
-    there = searched.linearised(point, effects=asked)
+        point = point_with(searched.baseline, compared, values)
+    there = searched.linearised(point, effects=compared)
     known = _questions_by_name(there)
     lags = [known[name] for name in names]
     return LagHypothesis(kind, there, [*lags, *same_questions(there, other_effects)])
@@ -430,9 +430,9 @@ def _cost(
     It is the mean over the noise and the band of each of the `judges`.
     """
     used = hypothesis.problem.search.indices(chosen)
-    losses = []
-    for judge in judges:
-        losses.append(hypothesis.problem.judged_by(judge).heldout_parts(used)[sensor].sum())
+    losses = [
+        hypothesis.problem.judged_by(judge).heldout_parts(used)[sensor].sum() for judge in judges
+    ]
     return 0.5 * float(np.mean(losses))
 
 

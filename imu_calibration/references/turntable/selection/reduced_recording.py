@@ -90,10 +90,9 @@ class BankEntry:
 
     def columns(self, ref: Reference) -> np.ndarray:
         """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
-        columns_of_groups = []
-        for used in self.used:
-            columns_of_groups.append(used.group.columns(ref, self.point)[:, used.indices])
-        return np.concatenate(columns_of_groups, axis=1)
+        return np.concatenate(
+            [used.group.columns(ref, self.point)[:, used.indices] for used in self.used], axis=1
+        )
 
 
 def make_bank(

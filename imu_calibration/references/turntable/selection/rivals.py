@@ -115,9 +115,8 @@ def settle_rivals(
             pair for pair in zip(choices[best], choice) if pair[0].name != pair[1].name
         )
         question, other = same_questions(settled, different)
-        moves = {}
-        for name in problem.baseline.param_names:
-            moves[name] = values[k][name] - values[best][name]
+        names = problem.baseline.param_names
+        moves = {name: values[k][name] - values[best][name] for name in names}
         behind = float(costs[k] - costs[best])
         rivals.append(Rival(question, other, behind=behind, moves=moves))
     return settled, rivals
@@ -137,10 +136,8 @@ def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> li
         if with_label:
             same.append(with_label[0])
             continue
-        losses = []
-        for question in of_effect:
-            losses.append(problem.evidence.loss(problem.search.indices([question])))
-        same.append(of_effect[int(np.argmin(losses))])
+        likeliest = min(of_effect, key=lambda q: problem.evidence.loss(problem.search.indices([q])))
+        same.append(likeliest)
     return same
 
 

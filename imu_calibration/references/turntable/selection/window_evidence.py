@@ -131,10 +131,10 @@ class WindowEvidence(Evidence):
         Over the columns of an axis, ``space.places(sensor, axis)``.
         """
         noise = self.noise[sensor]
-        normals = []
-        for in_fold in self._in_fold:
-            normals.append(within_of_axis(space, noise, sensor, axis=axis, select=in_fold))
-        return normals
+        return [
+            within_of_axis(space, noise, sensor, axis=axis, select=in_fold)
+            for in_fold in self._in_fold
+        ]
 
     def _of_sensor(self, sensor: str) -> np.ndarray:
         """Return the normal matrices of a sensor for each fold, (n_folds, q + 1, q + 1)."""
