@@ -79,7 +79,7 @@ def test_a_prior_draws_the_parameters_to_its_mean(rows):
 class Line:
     """Rows of a line through points, of which a third parameter is undetermined (`estimate`)."""
 
-    asked = np.array([True, True, True])
+    adjustable = np.array([True, True, True])
     prior_sd = np.array([10.0, 10.0, 2.0])
     design = np.column_stack([np.ones(20), np.linspace(-1, 1, 20), np.zeros(20)])
 

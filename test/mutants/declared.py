@@ -506,7 +506,7 @@ SEARCH = _of(
     ),
     (
         'pairs may leave most of a rest',
-        'LEFT',
+        'MAX_REMAINING_EXCESS',
         '...',
         '1.0',
         'test_rivals_pairs.py::test_pairs_are_tested_for_a_remaining_excess',
@@ -514,7 +514,7 @@ SEARCH = _of(
     (
         'another look where nothing is left',
         '_looked_again',
-        'not _1.rest',
+        'not _1.remaining_excess',
         'False',
         'test_rivals_pairs.py::test_pairs_are_tested_for_a_remaining_excess',
     ),

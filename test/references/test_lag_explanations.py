@@ -68,8 +68,8 @@ def test_a_story_that_did_not_help_gives_way_to_a_shorter_one():
         explanation(50.0, time_offset=10e-3),
     )
     explanations = LagExplanations(None, [both, one], [], None)
-    assert explanations.select() is both
-    assert explanations.select(1, [both]) is one
+    assert simplest(explanations.explanations) is both
+    assert explanations.others(1, [both]) == [one]
 
 
 def test_what_did_not_help_is_not_tried_again_under_another_name():
@@ -78,7 +78,7 @@ def test_what_did_not_help_is_not_tried_again_under_another_name():
         explanation(0.0, gyro_filter=3e-3),
         explanation(1.0, time_offset=3e-3),
     )
-    assert LagExplanations(None, [both, same, other], [], None).others(None, [both]) == [other]
+    assert LagExplanations(None, [both, same, other], [], None).others(1, [both]) == [other]
 
 
 def test_what_costs_more_than_no_lag_explains_nothing(monkeypatch):
