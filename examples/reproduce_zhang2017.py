@@ -27,7 +27,6 @@ from papers.zhang2017_joint_fit import (
 
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.kinematics import strapdown
 from imu_calibration.report.calibration_sections import axis_readings
 
 G = STANDARD_GRAVITY
@@ -238,7 +237,7 @@ def print_spins():
     ):
         growth = zhang.spin_growth(SENSOR.cosines, ARMS, axis, seconds=seconds)
         (body_v, body_p), (level_v, level_p) = (
-            [strapdown.largest(part) for part in growth[key]] for key in ('body', 'level')
+            [zhang.largest(part) for part in growth[key]] for key in ('body', 'level')
         )
         print(
             f'axis {axis!s:11s} {seconds:3d} s: {body_v:5.2f} m/s {body_p:6.1f} m | {level_v:6.3f}'
@@ -367,8 +366,8 @@ def findings():
     yield (
         f'"3 m/s and 150 m in 100 s" is {100 * acceleration:.2f} m/s and {5000 * acceleration:.0f}'
         ' m by arithmetic, but the error turns with the body: with Table 3 it stays below'
-        f' {strapdown.largest(growth["level"][0]):.3f} m/s and'
-        f' {strapdown.largest(growth["level"][1]):.1f} m.'
+        f' {zhang.largest(growth["level"][0]):.3f} m/s and'
+        f' {zhang.largest(growth["level"][1]):.1f} m.'
     )
     constant = 4.0**2 / (2 * 100.0)
     yield (

@@ -100,34 +100,30 @@ CORRECTED = 'corrected'
 """Word after the unit in the header of a log that holds corrected readings."""
 RAW_UNIT = 'raw'
 """Unit of columns that are read without conversion."""
-COLUMN_PATTERNS = (
-    (
-        'time',
+COLUMN_PATTERNS = {
+    'time': (
         r'((logging|sensor|device|imu|sample|gps) ?)?time|timestamp|t|epoch|seconds|sec|'
         r'time ?stamp.*|(.* )?stamp|.*elapsed|time ?(since )?start.*|millis|micros|nanos|ms|us|ns|'
-        r'rtc ?time|time of day|sample ?time ?fine|(gps )?(sow|i? ?tow)|seconds of week',
+        r'rtc ?time|time of day|sample ?time ?fine|(gps )?(sow|i? ?tow)|seconds of week'
     ),
-    (
-        'force',
+    'force': (
         r'(a|ac|acc|acc smooth|accel|accelerometer|acceleration|f|specific force|a rs'
         r' s|accl|(accelerometer|acc|raw|imu|total) ?accel\w*|(uncomp\w*|uncal\w*) ?acc\w*|'
         r'g ?f(orce)?|(.* )?lin(ear)? ?acc(eleration)?|d ?vel|(delta|d) ?v|delta ?vel(ocity)?|'
-        r'vel(ocity)? ?inc(rement)?s?)',
+        r'vel(ocity)? ?inc(rement)?s?)'
     ),
-    (
-        'rate',
+    'rate': (
         r'(g|w|gy|gyr|gyro|gyro adc|gyroscope|omega|rate|w rs s|'
         r'(ang|angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
         r'(uncomp\w*|uncal\w*) ?gyr\w*|'
         r'(.* )?ang(ular)? ?vel(ocity)?|(d|delta) ?(theta|ang|angle)|'
-        r'(ang|angle|theta) ?inc(rement)?s?)',
+        r'(ang|angle|theta) ?inc(rement)?s?)'
     ),
-    (
-        'temperature',
+    'temperature': (
         r'((imu|sensor|chip|die|board|device|mpu|gyro\w*|acc\w*) )?(tmp|temp|temperature)'
-        r'( (imu|sensor|chip|die))?',
+        r'( (imu|sensor|chip|die))?'
     ),
-)
+}
 """
 Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force
 and rate.
@@ -145,14 +141,15 @@ GROUPED_NUMBER = re.compile(r'\s*[-+]?\d{1,3}(,\d{3})+\s*')
 """Digits in groups of three: of a quoted cell it is not known whether the comma is decimal."""
 COMMENT = re.compile(r'(?:^|\s)#(?!N/A|NAME\?|VALUE!|DIV/0!|REF!|NUM!|NULL!).*')
 """A comment after the cells, which is none of the errors that spreadsheets print."""
+DATE = re.compile(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d')
+"""Beginning of a date with time that is read."""
 TIME_OF_DAY = re.compile(
     r'\s*(?:\d{1,2}[./-]\d{1,2}[./-]\d{2,4},?[ T]\s*)?(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?\s*'
     r'(?:([AaPp])\.?[Mm]\.?)?\s*'
 )
 """
 Time of day: hours, minutes, seconds, decimals, half of the day. A date with the day or the month
-first is not read,
-because the order is unknown; midnights are counted.
+first is not read, because the order is unknown; midnights are counted.
 """
 DAY_NS = 86_400 * 10**9
 NO_TIME = np.iinfo(np.int64).min
@@ -306,43 +303,28 @@ def read_csv(
         table = _Table(path, row_groups[0].sensor)
         where = (*where, row_groups[0].condition)
 
-    # Columns of the user, then those of the header for the other quantities and joints.
-    chosen = [table.stated(_parse(text)) for text in columns]
-    stated = {(each.quantity, each.joint) for each in chosen}
-    for guess in _guess(table, {quantity for quantity, _ in stated}):
-        if (guess.quantity, guess.joint) not in stated:
-            chosen.append(guess)
-    chosen = [_as_raw(each) if each.quantity in raw else each for each in chosen]
-    by_quantity = {each.quantity: each for each in chosen}
-    missing = _missing_quantity(table, by_quantity, stated=bool(columns))
-    if missing:
-        raise InputError(
-            f'{path} must have a column of'
-            f' {missing}{"" if missing == "time" else " per axis"}, got the columns'
-            f' {shortened(", ".join(table.names), 300)}{_unnamed_axes(table)}; {REMEDY}',
-            key='columns',
-        )
+    chosen = _chosen_columns(table, columns, raw)
+    table.load([name for each in chosen for name in each.names], where)
 
     # Values and units, in the order in which a unit may depend on another one.
-    table.load([name for each in chosen for name in each.names], where)
+    by_quantity = {each.quantity: each for each in chosen}
     time, counted = _times(table, by_quantity['time'])
     stamp_ns = counted.stamp_ns
     readings = _sensors(table, by_quantity, stamp_ns, time)
     used = [time, *readings.columns]
     temperature = None
-    joints = []
+    if 'temperature' in by_quantity:
+        column = _with_unit(by_quantity['temperature'], lambda: 'C', path)
+        temperature = TemperatureSamples(stamp_ns, table.values(column.names)[:, 0])
+        used.append(column)
     angles = {}
     for each in chosen:
-        if each.quantity == 'temperature':
-            used.append(_with_unit(each, lambda: 'C', path))
-            temperature = TemperatureSamples(stamp_ns, table.values(each.names)[:, 0])
-        elif each.quantity == 'joint':
-            joint = _with_unit(each, lambda: None, path)
-            joints.append(joint)
-            assert joint.unit is not None
-            unit_rad = COLUMN_UNITS['joint'][joint.unit]
-            angles[joint.joint] = table.values(joint.names)[:, 0] * unit_rad
-    used += joints
+        if each.quantity == 'joint':
+            column = _with_unit(each, lambda: None, path)
+            assert column.unit is not None
+            unit_rad = COLUMN_UNITS['joint'][column.unit]
+            angles[column.joint] = table.values(column.names)[:, 0] * unit_rad
+            used.append(column)
     return CsvLog(
         columns=tuple(used),
         imu=readings.imu,
@@ -355,6 +337,29 @@ def read_csv(
         joined=readings.joined,
         text=_text_of(table, used, stamp_ns, readings.joined),
     )
+
+
+def _chosen_columns(table: _Table, columns: Sequence[str], raw: Sequence[str]) -> list[Columns]:
+    """
+    Return the Columns of the user, then those of the header for the other quantities and joints.
+
+    `columns` and `raw` as for `read_csv`. Raises InputError where a needed quantity is missing.
+    """
+    chosen = [table.stated(_parse(text)) for text in columns]
+    stated = {(each.quantity, each.joint) for each in chosen}
+    for guess in _guess(table, {quantity for quantity, _ in stated}):
+        if (guess.quantity, guess.joint) not in stated:
+            chosen.append(guess)
+    by_quantity = {each.quantity: each for each in chosen}
+    missing = _missing_quantity(table, by_quantity, stated=bool(columns))
+    if missing:
+        raise InputError(
+            f'{table.path} must have a column of'
+            f' {missing}{"" if missing == "time" else " per axis"}, got the columns'
+            f' {shortened(", ".join(table.names), 300)}{_unnamed_axes(table)}; {REMEDY}',
+            key='columns',
+        )
+    return [_as_raw(each) if each.quantity in raw else each for each in chosen]
 
 
 def _unused_names(table: _Table, used: Iterable[Columns]) -> list[str]:
@@ -451,9 +456,7 @@ def _times(table: _Table, columns: Columns) -> tuple[Columns, CounterStamps]:
         columns = _with_unit(columns, lambda: _unit_of_sample_time_fine(values), table.path)
     columns = _with_unit(columns, lambda: _time_unit(values), table.path)
     tick_ns = 1e9 * _time_size(columns.unit)
-    counter_ns = None
-    if values.dtype.kind == 'f':
-        counter_ns = values * tick_ns
+    counter_ns = values * tick_ns if values.dtype.kind == 'f' else None
     return columns, without_overflows(table.stamps(columns), tick_ns, counter_ns)
 
 
@@ -919,9 +922,7 @@ def _parse(text: str) -> Columns:
     if unit is not None and scaled and quantity in SENSOR_OF:
         unit = unit_of(SENSOR_OF[quantity], unit).unit
     elif unit is not None and unit not in units and (quantity != 'time' or not _tick_size(unit)):
-        ticks = ''
-        if quantity == 'time':
-            ticks = ', or a tick such as 25us or 1/32768s'
+        ticks = ', or a tick such as 25us or 1/32768s' if quantity == 'time' else ''
         raise InputError(
             f'the unit of {quantity} must be one of {", ".join(units)}{ticks}, got {unit!r};'
             f' correct {text!r}',
@@ -1017,6 +1018,22 @@ def split_cells(line: str, delimiter: str | None, path: Path) -> list[str]:
         ) from error
 
 
+def _head_lines(path: Path) -> tuple[list[str], bool]:
+    """Return the first lines of a text log, and whether the last one is cut off."""
+    if not path.is_file():
+        raise InputError(f'a text log must be a regular file, got {path}; check the path')
+    _refuse_compressed(path)
+    with _opened(path) as file:
+        head = file.read(HEAD_BYTES)
+    lines = plain_lines(head.splitlines())
+    if not lines or '\0' in head:
+        raise InputError(
+            f'{path} must be a text log, got {"an empty file" if not lines else "binary data"};'
+            ' check the path'
+        )
+    return lines, len(head) >= HEAD_BYTES
+
+
 class _Table:
     """
     Header and columns of a text log.
@@ -1025,24 +1042,12 @@ class _Table:
     """
 
     def __init__(self, path: Path, sensor: str = ''):
-        self.sensor = sensor
-        if not path.is_file():
-            raise InputError(f'a text log must be a regular file, got {path}; check the path')
         self.path = path
-        _refuse_compressed(path)
-        with _opened(path) as file:
-            head = file.read(HEAD_BYTES)
-        lines = plain_lines(head.splitlines())
-        if not lines or '\0' in head:
-            raise InputError(
-                f'{path} must be a text log, got {"an empty file" if not lines else "binary data"};'
-                ' check the path'
-            )
+        self.sensor = sensor
+        lines, is_cut = _head_lines(path)
         self.delimiter = _delimiter(lines)
         """None for white space."""
-        # The last line of a longer file is cut.
-        complete_lines = lines if len(head) < HEAD_BYTES else lines[:-1]
-        rows = [self._cells(line) for line in complete_lines]
+        rows = [self._cells(line) for line in (lines[:-1] if is_cut else lines)]
         first = _first_row(rows)
         if first is None:
             raise InputError(
@@ -1058,15 +1063,10 @@ class _Table:
         )
         self.names = _unique(self._header_names(rows[:first]))
         """Names of the columns, all different."""
-        self.dates = set()
+        self.dates = {k for k, cell in enumerate(self.first_row) if DATE.match(cell)}
         """Indexes of the columns of dates."""
-        self.clocks = set()
+        self.clocks = {k for k, cell in enumerate(self.first_row) if TIME_OF_DAY.fullmatch(cell)}
         """Indexes of the columns of times of day."""
-        for k, cell in enumerate(self.first_row):
-            if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell):
-                self.dates.add(k)
-            if TIME_OF_DAY.fullmatch(cell):
-                self.clocks.add(k)
         self.word_columns = []
         """Names of the columns with a word in each row."""
         for k, name in enumerate(self.names):
@@ -1153,40 +1153,41 @@ class _Table:
         Rows that do not fulfil the conditions `where` are left out.
         """
         wanted = sorted({self.column(name) for name in names})
+        self.lines = self._complete(self._selected(self._rows, where), wanted[-1] + 1)
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
-        options: dict[str, Any] = {
-            'delimiter': self.delimiter,
-            'encoding': 'utf-8-sig',
-            'comments': None,
-        }
-        lines = self._complete(self._selected(self._rows, where), wanted[-1] + 1)
-        self.lines = lines
-        number_lines = [self._as_numbers(line) for line in lines]
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore', UserWarning)  # files without rows
-            try:
-                data = np.loadtxt(number_lines, usecols=numbers, ndmin=2, **options)
-            except ValueError:  # empty cells, text such as "nan" in other languages
-                data = np.genfromtxt(
-                    number_lines, usecols=numbers, invalid_raise=False, **options
-                ).reshape(-1, len(numbers))
-        if numbers and len(data) != len(lines):
-            # Readings and times would belong to different rows.
-            raise InputError(
-                f'each row of {self.path} must have the columns that are read, {len(lines)} rows'
-                f' gave {len(data)} samples; remove text between the rows',
-                code='csv_rows',
-            )
-        self._values = dict(zip(numbers, data.T, strict=True))
-        for k in set(wanted) & self.clocks:
-            self._values[k] = _times_of_day([self._cells(line)[k] for line in lines])
-        for k in set(wanted) & self.dates:
-            cells = [self._cells(line) for line in lines if line.strip()]
-            self._values[k] = _dates([row[k] if k < len(row) else '' for row in cells])
+        self._values = dict(zip(numbers, self._numbers(numbers).T, strict=True))
+        for k in set(wanted) - set(numbers):
+            cells = [self._cells(line)[k] for line in self.lines]
+            self._values[k] = _dates(cells) if k in self.dates else _times_of_day(cells)
         if min(map(len, self._values.values())) < 2:
             raise InputError(
                 f'{self.path} must have at least two rows of numbers, got fewer; check the file'
             )
+
+    def _numbers(self, columns: Sequence[int]) -> np.ndarray:
+        """Return columns of numbers by their indexes, shape (n, len(columns)); no number: NaN."""
+        options: dict[str, Any] = {
+            'usecols': columns,
+            'delimiter': self.delimiter,
+            'encoding': 'utf-8-sig',
+            'comments': None,
+        }
+        number_lines = [self._as_numbers(line) for line in self.lines]
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', UserWarning)  # files without rows
+            try:
+                data = np.loadtxt(number_lines, ndmin=2, **options)
+            except ValueError:  # empty cells, text such as "nan" in other languages
+                data = np.genfromtxt(number_lines, invalid_raise=False, **options)
+                data = data.reshape(-1, len(columns))
+        if columns and len(data) != len(self.lines):
+            # Readings and times would belong to different rows.
+            raise InputError(
+                f'each row of {self.path} must have the columns that are read, {len(self.lines)}'
+                f' rows gave {len(data)} samples; remove text between the rows',
+                code='csv_rows',
+            )
+        return data
 
     @cached_property
     def _rows(self) -> list[str]:
@@ -1451,73 +1452,87 @@ def _numeric(cell: str) -> bool:
     return re.fullmatch(r'\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*', cell) is not None
 
 
+AxisSets = dict[str, dict[str, Columns]]
+"""Set of axes of one quantity (`_Reading.group`) -> axis -> its column."""
+
+
 def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
     """
     Return the Columns that the header names, without force or rate if they are `stated`.
 
     Raises InputError for several sets of axes of one sensor.
     """
-    # Columns with one axis: quantity -> set of axes (`_Reading.group`) -> axis -> (name, unit or
-    # None). Other quantities have one column.
-    axes: dict[str, dict[str, dict[str, tuple[str, str | None]]]] = {'force': {}, 'rate': {}}
-    columns = []
-    sensor_of_file = _words(table.path.stem)[0]
+    axis_sets: dict[str, AxisSets] = {'force': {}, 'rate': {}}
+    single_columns: dict[str, Columns] = {}  # quantity without axes -> its column
+    joints = []
     for name in table.names:
-        words, unit_text = _words(name)
-        axis_name = re.fullmatch(r'([xyz])(?: axis)?', words)
-        if axis_name:  # a file of one sensor, which has the name of it, or sets by their units
-            words = f'{_sensor_of_unit(unit_text) or sensor_of_file} {axis_name[1]}'
-        if words in ('t', 't imu') and _unit('temperature', unit_text):
-            words = 'temperature'
+        words, unit_text = _words_in(table, name)
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
-        reading = _reading_of(words)
-        if table.sensor and reading is not None:
-            reading = replace(reading, sensor=table.sensor)
-        for quantity, pattern in COLUMN_PATTERNS:
-            unit = _unit(quantity, unit_text)
-            if quantity in axes:
-                if reading is not None and re.fullmatch(pattern, reading.sensor):
-                    if unit is None and re.fullmatch(r'g ?f(orce)?', reading.sensor):
-                        unit = 'g'
-                    axes[quantity].setdefault(reading.group, {})[reading.axis] = (name, unit)
-                continue
-            # The first column with the name. T (°C) is no time, and temp (F) is not read as °C.
-            is_first = quantity not in {each.quantity for each in columns}
-            has_fitting_unit = not unit_text or unit
-            if is_first and has_fitting_unit and re.fullmatch(pattern, words):
-                columns.append(Columns(quantity, (name,), unit))
         if joint:
-            columns.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
+            joints.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
+        for quantity in ('time', 'temperature'):
+            unit = _unit(quantity, unit_text)
+            # T (°C) is no time, and temp (F) is not read as °C.
+            has_fitting_unit = not unit_text or unit
+            if has_fitting_unit and re.fullmatch(COLUMN_PATTERNS[quantity], words):
+                # The first column with the name.
+                single_columns.setdefault(quantity, Columns(quantity, (name,), unit))
+        reading = _reading_of(words)
+        if reading is None:
+            continue
+        sensor = table.sensor or reading.sensor
+        for quantity, sets in axis_sets.items():
+            if re.fullmatch(COLUMN_PATTERNS[quantity], sensor):
+                unit = _unit(quantity, unit_text)
+                if unit is None and re.fullmatch(r'g ?f(orce)?', sensor):
+                    unit = 'g'
+                column = Columns(quantity, (name,), unit)
+                sets.setdefault(reading.group, {})[reading.axis] = column
 
     # Time: seconds and nanoseconds, a column with a usual name, or another one that may be it.
-    pair = _seconds_and_nanoseconds(table)
-    if pair:
-        columns = [pair, *(each for each in columns if each.quantity != 'time')]
-    if not any(each.quantity == 'time' for each in columns):
-        columns += _unnamed_time(table)
-
-    # Force and rate: the only set with three axes.
-    for quantity, groups in axes.items():
-        if quantity in stated:
-            continue
-        complete = {key: group for key, group in groups.items() if set(group) == set('xyz')}
-        if len(complete) > 1 and quantity == 'force':
-            complete = _with_gravity(complete)
-        if len(complete) > 1:
-            sets = '; '.join(
-                ', '.join(group[axis][0] for axis in 'xyz') for group in complete.values()
-            )
-            raise InputError(
-                f'{table.path} must have one column of {quantity} per axis, got {len(complete)}'
-                f' sets, as of several IMUs: {sets}; {REMEDY}',
-                key='columns',
-                code='several_sets',
-            )
-        for group in complete.values():
-            units = {group[axis][1] for axis in 'xyz'}
-            names = tuple(group[axis][0] for axis in 'xyz')
-            columns.append(Columns(quantity, names, units.pop() if len(units) == 1 else None))
+    time = _seconds_and_nanoseconds(table) or single_columns.get('time') or _unnamed_time(table)
+    if time is not None:
+        single_columns['time'] = time
+    columns = [*single_columns.values(), *joints]
+    for quantity, sets in axis_sets.items():
+        if quantity not in stated:
+            columns += _only_set(table.path, quantity, sets)
     return columns
+
+
+def _words_in(table: _Table, name: str) -> tuple[str, str]:
+    """Return words and unit of a column as `_words`, with a sensor or quantity found otherwise."""
+    words, unit_text = _words(name)
+    axis_name = re.fullmatch(r'([xyz])(?: axis)?', words)
+    if axis_name:  # a file of one sensor, which has the name of it, or sets by their units
+        words = f'{_sensor_of_unit(unit_text) or _words(table.path.stem)[0]} {axis_name[1]}'
+    if words in ('t', 't imu') and _unit('temperature', unit_text):
+        words = 'temperature'
+    return words, unit_text
+
+
+def _only_set(path: Path, quantity: str, sets: AxisSets) -> list[Columns]:
+    """
+    Return the Columns of the only set with three axes; [] without one, InputError for several.
+
+    A unit that only some axes have is not used.
+    """
+    complete = {key: axes for key, axes in sets.items() if len(axes) == 3}
+    if len(complete) > 1 and quantity == 'force':
+        complete = _with_gravity(complete)
+    ordered = [[axes[axis] for axis in 'xyz'] for axes in complete.values()]
+    names = [tuple(column.names[0] for column in columns) for columns in ordered]
+    if len(ordered) > 1:
+        raise InputError(
+            f'{path} must have one column of {quantity} per axis, got {len(ordered)}'
+            f' sets, as of several IMUs: {"; ".join(map(", ".join, names))}; {REMEDY}',
+            key='columns',
+            code='several_sets',
+        )
+    if not ordered:
+        return []
+    units = {column.unit for column in ordered[0]}
+    return [Columns(quantity, names[0], units.pop() if len(units) == 1 else None)]
 
 
 @dataclass(frozen=True)
@@ -1540,14 +1555,12 @@ def _reading_of(words: str) -> _Reading | None:
     """Return the `_Reading` of a name in lower-case words, None for a name without an axis."""
     # Additions of a logger after the axis: acc x raw, accel ln x cal.
     suffix = re.search(rf'(?<= ){DECORATION}$', words)
-    bare = words
-    if suffix:
-        bare = words[: suffix.start()].strip()
-    inner = re.fullmatch(r'(?:shimmer \w+ )?(.*) (ln|wr) ([xyz])', bare)
-    range_name = ''
-    if inner:
-        bare = f'{inner[1]} {inner[3]}'
-        range_name = inner[2]
+    decoration = suffix[0] if suffix else ''
+    bare = words.removesuffix(decoration).strip()
+    ranged = re.fullmatch(r'(?:shimmer \w+ )?(.*) (ln|wr) ([xyz])', bare)
+    if ranged:
+        bare = f'{ranged[1]} {ranged[3]}'
+        decoration = ranged[2] + decoration
     bare = re.sub(r'^shimmer \w+ ', '', bare)
     # The axis in front: x acc, xacc, x ang rate, after the name of a message.
     bare = re.sub(r'^(?:(?:.* )?imu\d? )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\2 \1', bare)
@@ -1566,9 +1579,6 @@ def _reading_of(words: str) -> _Reading | None:
     axis = re.fullmatch(r'(.*?) ?([xyz])', bare)
     if axis is None:
         return None
-    decoration = range_name
-    if suffix:
-        decoration += suffix[0]
     group = re.sub(r'[^a-z0-9]', '', of_imu + axis[1] + decoration)
     return _Reading(axis[1], axis[2], group)
 
@@ -1581,14 +1591,14 @@ def _sensor_of_unit(unit_text: str) -> str:
     return ''
 
 
-def _with_gravity(sets: dict[str, dict]) -> dict[str, dict]:
+def _with_gravity(sets: AxisSets) -> AxisSets:
     """
     Return the sets of force without the linear accelerations that a phone adds to them.
 
     Keys: `_Reading.group`, such as 'linacc'; of a g-force ('gf...') only its set is returned.
     """
-    with_gravity = {key: group for key, group in sets.items() if not key.startswith('lin')}
-    g_force = {key: group for key, group in with_gravity.items() if key.startswith('gf')}
+    with_gravity = {key: axes for key, axes in sets.items() if not key.startswith('lin')}
+    g_force = {key: axes for key, axes in with_gravity.items() if key.startswith('gf')}
     return g_force or with_gravity or sets
 
 
@@ -1612,9 +1622,9 @@ def _seconds_and_nanoseconds(table: _Table) -> Columns | None:
     return None
 
 
-def _unnamed_time(table: _Table) -> list[Columns]:
+def _unnamed_time(table: _Table) -> Columns | None:
     """
-    Return the column of time where no usual name has it, in a list; empty if several may be it.
+    Return the column of time where no usual name has it; None if several may be it.
 
     The only one with times of day or dates, else with a unit of time in brackets, else with "time"
     and "stamp" in its name.
@@ -1630,8 +1640,8 @@ def _unnamed_time(table: _Table) -> list[Columns]:
             stamps.append(name)
     for names in (clocks, with_unit, stamps):
         if len(names) == 1:
-            return [Columns('time', (names[0],), _unit('time', _words(names[0])[1]))]
-    return []
+            return Columns('time', (names[0],), _unit('time', _words(names[0])[1]))
+    return None
 
 
 ELEMENT = re.compile(r'(.*\S)\[([012])\]')
@@ -1725,15 +1735,18 @@ def _time_unit(values: np.ndarray) -> str | None:
     """Return the unit in which the median step is that of an IMU, or None."""
     if values.dtype.kind == 'M':
         return 'ns'
-    steps = np.diff(values)
-    steps = steps[steps > 0]
-    if not len(steps):
-        return None
-    median_step = float(np.median(steps))
+    median_step = _median_step(values)
     for unit, low, high in PERIODS:
         if low <= median_step <= high:
             return unit
     return None
+
+
+def _median_step(values: np.ndarray) -> float:
+    """Return the median of the positive steps; 0.0 without any."""
+    steps = np.diff(values)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) else 0.0
 
 
 SAMPLE_TIME_FINE = ('sample time fine', 'sampletimefine')
@@ -1746,11 +1759,7 @@ Median step of SampleTimeFine: from it on microseconds (Xsens DOT, at most 250 H
 
 def _unit_of_sample_time_fine(values: np.ndarray) -> str:
     """Return the unit of a column SampleTimeFine of an Xsens log."""
-    steps = np.diff(values)
-    steps = steps[steps > 0]
-    if len(steps) and np.median(steps) >= SLOWEST_TICKS:
-        return 'us'
-    return '100us'
+    return 'us' if _median_step(values) >= SLOWEST_TICKS else '100us'
 
 
 def _require_time_of_turns(time: Columns, rate: Columns, imu: ImuSamples, path: Path) -> None:
@@ -1773,24 +1782,16 @@ def _require_time_of_turns(time: Columns, rate: Columns, imu: ImuSamples, path: 
         return
     unit_s = _time_size(time.unit)
     unit_rad_s = _size_of(rate)
-    band = RATE_BAND
-    if rate.origin == 'values':
-        band = OWN_RATE_BAND
+    band = OWN_RATE_BAND if rate.origin == 'values' else RATE_BAND
     factor = _turning_factor(imu.stamp_ns, imu.force_s, imu.rate_s)
     if factor is not None and 1 / band < factor / unit_rad_s < band:
         return
 
-    # A wrong period may hide the turns, therefore stamps with the periods of usual IMUs. The factor
-    # is proportional to 1 / period: the true one is tried_period_s * tried_factor / unit_rad_s.
-    tick_s = None
-    for tried_period_s in TRIED_PERIODS:
-        samples = np.arange(len(imu.stamp_ns))
-        stamp_ns = np.round(samples * (tried_period_s * 1e9)).astype(np.int64)
-        tried_factor = _turning_factor(stamp_ns, imu.force_s, imu.rate_s)
-        if tried_factor is not None:
-            tick_s = tried_factor / unit_rad_s * tried_period_s / period_s * unit_s
-            break
-    if tick_s is None or abs(np.log(tick_s / unit_s)) < np.log(band):
+    true_period_s = _period_of_turns(imu, unit_rad_s)
+    if true_period_s is None:
+        return
+    tick_s = true_period_s / period_s * unit_s
+    if abs(np.log(tick_s / unit_s)) < np.log(band):
         return
     usual = [tick for tick in USUAL_TICKS if abs(tick_s / _tick_size(tick) - 1.0) < NEAR_TICK]
     ticks = ' or '.join(usual) or f'{tick_s * 1e6:.3g}us'
@@ -1801,6 +1802,22 @@ def _require_time_of_turns(time: Columns, rate: Columns, imu: ImuSamples, path: 
         key='columns',
         code='time_ticks',
     )
+
+
+def _period_of_turns(imu: ImuSamples, unit_rad_s: Any) -> float | None:
+    """
+    Return the sampling period with which the rates turn the force, s; None for too few turns.
+
+    A wrong period may hide the turns, therefore stamps with the periods of usual IMUs are tried.
+    The factor is proportional to 1 / period.
+    """
+    number = np.arange(len(imu.stamp_ns))
+    for period_s in TRIED_PERIODS:
+        stamp_ns = np.round(number * (period_s * 1e9)).astype(np.int64)
+        factor = _turning_factor(stamp_ns, imu.force_s, imu.rate_s)
+        if factor is not None:
+            return factor / unit_rad_s * period_s
+    return None
 
 
 def _force_unit(force: np.ndarray) -> str | None:
@@ -1830,9 +1847,7 @@ def _turning_factor(stamp_ns: np.ndarray, force_s: np.ndarray, rate: np.ndarray)
     good = np.isfinite(force_s).all(axis=1) & np.isfinite(rate).all(axis=1)
     series.push(stamp_ns[good], np.concatenate([force_s[good].T, rate[good].T]))
     turning = relate_turns(series.chunks())
-    if turning is None:
-        return None
-    return turning.factor
+    return None if turning is None else turning.factor
 
 
 def _rate_unit(stamp_ns: np.ndarray, force_s: np.ndarray, rate: np.ndarray) -> str | None:

@@ -253,7 +253,7 @@ def static_navigation(
     )
     for used_matrix, used_bias in ((unscaled, model.bias), (matrix, bias)):
         error = np.linalg.solve(used_matrix, (steady - used_bias)[..., None])[..., 0] - upright
-        constant = np.stack(strapdown.constant_error_growth(STANDARD_GRAVITY * error, seconds))
+        constant = np.stack(constant_error_growth(STANDARD_GRAVITY * error, seconds))
         scatter = np.linalg.solve(used_matrix[:, None], wander[..., None])[..., 0]
         ends.append(
             np.linalg.norm(constant + STANDARD_GRAVITY * np.moveaxis(scatter, 1, 0), axis=-1)
@@ -264,10 +264,41 @@ def static_navigation(
 def _noise_at_end(rng, noise_sd, seconds, sample_rate):
     """Return white output noise summed once and twice over the time, shape (2, 3)."""
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
-    velocity, position = strapdown.error_growth(
-        time, noise_sd * rng.standard_normal((len(time), 3))
-    )
+    velocity, position = error_growth(time, noise_sd * rng.standard_normal((len(time), 3)))
     return velocity[-1], position[-1]
+
+
+def error_growth(
+    time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the errors of velocity and position due to an error of specific force, each (n, 3).
+
+    In m/s and m, with a correct attitude. With ``mat_ns=None`` the components are summed in the
+    turning body frame, which is no navigation: an error that turns with the body then appears as a
+    steady drift (the explanation of Zhang's "3 m/s and 150 m").
+
+    """
+    force_error = np.asarray(force_error_s, float)
+    if mat_ns is not None:
+        force_error = np.einsum('nij,...nj->...ni', mat_ns, force_error)
+    return strapdown.dead_reckon(time, force_error, 0.0)
+
+
+def constant_error_growth(
+    force_error: np.ndarray | float, seconds: float
+) -> tuple[np.ndarray | float, np.ndarray | float]:
+    """
+    Return the velocity and position error, m/s and m, of a constant acceleration error.
+
+    The error, m/s^2, is along one axis of a body that does not turn.
+    """
+    return force_error * seconds, force_error * seconds**2 / 2
+
+
+def largest(vectors: np.ndarray) -> np.ndarray | float:
+    """Return the largest norm of vectors along the time axis, shape (..., n, 3) to (...)."""
+    return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
 
 
 def size_effect_error(
@@ -307,8 +338,8 @@ def spin_growth(
     mat_ns = Rotation.from_rotvec(rate * time[:, None]).as_matrix()
     return {
         'time': time,
-        'level': strapdown.error_growth(time, error, mat_ns),
-        'body': strapdown.error_growth(time, error),
+        'level': error_growth(time, error, mat_ns),
+        'body': error_growth(time, error),
         'axial_mg': 1e3 * float(error[0] @ axis) / STANDARD_GRAVITY,
     }
 
@@ -358,7 +389,7 @@ def arm_responses(motion: Tumbling, cosines: np.ndarray) -> tuple[np.ndarray, np
     errors = np.array(
         [size_effect_error(cosines, arms, motion.rate, alpha=motion.alpha) for arms in unit_arms]
     )
-    return strapdown.error_growth(motion.time, errors, motion.mat_ns)
+    return error_growth(motion.time, errors, motion.mat_ns)
 
 
 def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray, every: int = 5) -> np.ndarray:
@@ -372,5 +403,5 @@ def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray, every: int
     for response in responses:
         thinned = response[:, ::every]
         histories = (flat @ thinned.reshape(9, -1)).reshape(len(flat), -1, 3)
-        out.append(strapdown.largest(histories))
+        out.append(largest(histories))
     return np.array(out)

@@ -86,6 +86,10 @@ class AlignedArrays:
             fields[name] = value if name in self.unaligned else _selected(value, index)
         return type(self)(**fields)
 
+    def after(self, earlier: Any) -> Any:
+        """Return these rows after earlier ones; None: there are none."""
+        return self if earlier is None else type(self).concatenate([earlier, self])
+
     @classmethod
     def concatenate(cls, parts: Iterable[Any]) -> Any:
         """

@@ -1,5 +1,5 @@
 """
-Strapdown dead reckoning near one place, and the growth of errors in it.
+Strapdown dead reckoning near one place.
 
 The rotation between two instants with its derivative is included.
 
@@ -330,39 +330,6 @@ def strapdown(
     """
     mat_ns = integrate_attitude(time, rate_s, mat_ns0)
     return dead_reckon(time, np.einsum('nij,nj->ni', mat_ns, force_s), gravity)
-
-
-def error_growth(
-    time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the errors of velocity and position due to an error of specific force, each (n, 3).
-
-    In m/s and m, with a correct attitude. With ``mat_ns=None`` the components are summed in the
-    turning body frame, which is no navigation: an error that turns with the body then appears as a
-    steady drift (the explanation of Zhang's "3 m/s and 150 m").
-
-    """
-    force_error = np.asarray(force_error_s, float)
-    if mat_ns is not None:
-        force_error = np.einsum('nij,...nj->...ni', mat_ns, force_error)
-    return dead_reckon(time, force_error, 0.0)
-
-
-def constant_error_growth(
-    force_error: np.ndarray | float, seconds: float
-) -> tuple[np.ndarray | float, np.ndarray | float]:
-    """
-    Return the velocity and position error, m/s and m, of a constant acceleration error.
-
-    The error, m/s^2, is along one axis of a body that does not turn.
-    """
-    return force_error * seconds, force_error * seconds**2 / 2
-
-
-def largest(vectors: np.ndarray) -> np.ndarray | float:
-    """Return the largest norm of vectors along the time axis, shape (..., n, 3) to (...)."""
-    return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
 
 
 def dead_reckoning_errors(

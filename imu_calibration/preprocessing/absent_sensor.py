@@ -41,8 +41,7 @@ class SensorPresence:
         """Return the samples that can be processed, none while it is not known which exist."""
         if self._is_decided:
             return self._without_absent(samples)
-        if self._buffered is not None:
-            samples = ImuSamples.concatenate([self._buffered, samples])
+        samples = samples.after(self._buffered)
         missing = missing_sensors(samples.select(slice(MIN_ABSENT_SAMPLES)))
         if missing and len(samples) < MIN_ABSENT_SAMPLES:
             self._buffered = samples

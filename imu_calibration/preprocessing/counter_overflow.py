@@ -1,10 +1,11 @@
 """Stamps from a counter that overflows: the steps back are removed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 COUNTER_BITS = (16, 24, 31, 32)
 """Widths of counters of time."""
@@ -47,6 +48,18 @@ class CounterStamps:
     """
     Size of the counter, ns; 0 where it does not overflow. A gap may be longer by multiples of it.
     """
+
+    def without(self, places: np.ndarray, sizes_ns: ArrayLike) -> 'CounterStamps':
+        """Return the stamps without an overflow of a size, ns, after each of some samples."""
+        if not len(places):
+            return self
+        shift = np.zeros(len(self.stamp_ns), np.int64)
+        shift[places + 1] = sizes_ns
+        return CounterStamps(
+            self.stamp_ns + np.cumsum(shift),
+            self.n_overflows + len(places),
+            int(shift[places[-1] + 1]),
+        )
 
 
 def longer_gaps(size_ns: int, n_gaps: int) -> str:
@@ -134,46 +147,51 @@ def without_overflows(
         its end to its beginning.
 
     """
-    # 1. Overflows of counters of known sizes.
     search = OverflowSearch(tick_ns)
-    stamps = search.removed(stamp_ns)
-    # 2. Overflows in gaps, with the size found in step 1 or with the readings of the counter.
+    stamps = CounterStamps(search.removed(stamp_ns), search.count, search.size_ns)
     if search.count >= LEAST_EQUAL_STEPS:
-        # A gap of nearly the size of the counter leaves a small step back. After a late sample the
-        # stamps return, after an overflow they continue from there.
-        steps = np.diff(stamps)
-        period = np.median(steps[steps > 0])
-        back = np.flatnonzero(steps[:-1] < -LOST_PERIODS * period)
-        continues = back[stamps[back + 2] < stamps[back]]
-        shift = np.zeros(len(stamps), np.int64)
-        shift[continues + 1] = search.size_ns
-        stamps = stamps + np.cumsum(shift)
-        search.count += len(continues)
+        stamps = _without_overflows_in_gaps(stamps)
     elif counter_ns is not None:
-        for place in np.flatnonzero(np.diff(stamps) < -LEAST_STEP_NS):
-            size = _size_in_gap(counter_ns[place], counter_ns[place + 1], search.sizes_ns)
-            if size:
-                stamps[place + 1 :] += size
-                search.count += 1
-                search.size_ns = size
+        places = np.flatnonzero(np.diff(stamps.stamp_ns) < -LEAST_STEP_NS)
+        sizes = [
+            _size_in_gap(counter_ns[place], counter_ns[place + 1], search.sizes_ns)
+            for place in places
+        ]
+        stamps = stamps.without(places[np.array(sizes, bool)], [size for size in sizes if size])
+    return _without_unknown_counter(stamps)
 
-    # 3. A counter of another size: all remaining steps back are equal and begin at its end.
-    steps = np.diff(stamps)
+
+def _without_overflows_in_gaps(stamps: CounterStamps) -> CounterStamps:
+    """
+    Return stamps without the overflows in gaps of nearly the size of the counter, which is known.
+
+    They leave a small step back. After a late sample the stamps return, after an overflow they
+    continue from there.
+    """
+    stamp_ns = stamps.stamp_ns
+    steps = np.diff(stamp_ns)
+    period = np.median(steps[steps > 0])
+    back = np.flatnonzero(steps[:-1] < -LOST_PERIODS * period)
+    continues = back[stamp_ns[back + 2] < stamp_ns[back]]
+    return stamps.without(continues, np.full(len(continues), stamps.size_ns))
+
+
+def _without_unknown_counter(stamps: CounterStamps) -> CounterStamps:
+    """Return stamps without steps back that are all equal and begin at one end of a counter."""
+    steps = np.diff(stamps.stamp_ns)
     forward = steps[steps > 0]
     back = np.flatnonzero(steps < -LEAST_STEP_NS)
     if not len(forward) or len(back) < LEAST_EQUAL_STEPS:
-        return CounterStamps(stamps, search.count, search.size_ns)
+        return stamps
     # A step back is the period less the size of the counter.
     period = np.median(forward)
     sizes = period - steps[back]
     size = np.median(sizes)
     has_one_size = np.abs(sizes - size) < LOST_PERIODS * period
-    has_one_end = np.abs(np.diff(stamps[back])) < LOST_PERIODS * period
+    has_one_end = np.abs(np.diff(stamps.stamp_ns[back])) < LOST_PERIODS * period
     if not has_one_size.all() or not has_one_end.all():
-        return CounterStamps(stamps, search.count, search.size_ns)
-    shift = np.zeros(len(stamps), np.int64)
-    shift[back + 1] = np.round(sizes).astype(np.int64)
-    return CounterStamps(stamps + np.cumsum(shift), search.count + len(back), round(float(size)))
+        return stamps
+    return replace(stamps.without(back, np.round(sizes)), size_ns=round(float(size)))
 
 
 def _size_in_gap(before_ns: int, after_ns: int, sizes_ns: Sequence[int]) -> int:

@@ -50,7 +50,7 @@ class DeadBandSearch:
         thresholds = np.zeros(3)
         for axis, counts in enumerate(self._counts):
             # The first bin below which there are more readings than transients is not in the band.
-            n_below = np.concatenate([[0], np.cumsum(counts)])
+            n_below = np.append(0, np.cumsum(counts))
             first = int(np.searchsorted(n_below, MOST_STRAYS, side='right')) - 1
             threshold = SMALLEST * 2.0 ** (first / BINS_PER_OCTAVE)
             n_above = counts[first : first + BINS_PER_OCTAVE].sum()

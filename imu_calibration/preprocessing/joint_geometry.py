@@ -10,7 +10,7 @@ from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import nearest_rotation, rotation, rpy_from_rotation
 from imu_calibration.kinematics.table import Table, axis_error_directions
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
-from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window import MotionReadings, Window, motion_readings
 
 MAX_SAMPLES = 2_000
 """Samples that are compared."""
@@ -45,29 +45,21 @@ class Correction:
     """Unexplained share of the squared specific forces, with the mount of the table."""
 
 
-@dataclass(frozen=True, eq=False)
-class MovingReadings:
-    """Readings of moving windows that are compared with descriptions of the table."""
+def _rate_residual(readings: MotionReadings, table: Table, motion: JointMotion) -> np.ndarray:
+    """Return the residual of the rates with a table and a motion, rad/s, shape (n, 3)."""
+    return _residual(readings.rate_s, reference_motion(table, motion, attitude=False))
 
-    motion: JointMotion
-    """Joints at n instants."""
-    rate: np.ndarray
-    """Measured angular rates, rad/s, shape (n, 3)."""
-    force: np.ndarray
-    """Measured specific forces, m/s^2, shape (n, 3)."""
 
-    def rate_residual(self, table: Table, motion: JointMotion) -> np.ndarray:
-        """Return the residual of the rates, shape (n, 3)."""
-        return _residual(self.rate, reference_motion(table, motion, attitude=False))
-
-    def correction(self, words: str, table: Table, motion: JointMotion) -> Correction:
-        """Return a change of the table and of the motion with its unexplained shares."""
-        reference = reference_motion(table, motion)
-        return Correction(
-            words,
-            _share(_residual(self.rate, reference), self.rate),
-            _share(self.force - reference.force_s, self.force),
-        )
+def _correction(
+    words: str, readings: MotionReadings, table: Table, motion: JointMotion
+) -> Correction:
+    """Return a change of the table and of the motion with its unexplained shares."""
+    reference = reference_motion(table, motion)
+    return Correction(
+        words,
+        _share(_residual(readings.rate_s, reference), readings.rate_s),
+        _share(readings.force_s - reference.force_s, readings.force_s),
+    )
 
 
 def _residual(rate, reference):
@@ -134,16 +126,10 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
     windows = [window for window in windows if 2 < len(window) == len(window.motion)]
     if not windows:
         return None
-    n_samples = sum(len(window) for window in windows)
-    thinned = slice(None, None, max(1, n_samples // MAX_SAMPLES))
-    readings = MovingReadings(
-        JointMotion.concatenate(window.motion for window in windows).select(thinned),
-        np.concatenate([window.rate_s for window in windows])[thinned],
-        np.concatenate([window.force_s for window in windows])[thinned],
-    )
-    if not _spans_three(readings.rate):  # many descriptions have the same rates about one axis
+    readings = motion_readings(windows, MAX_SAMPLES)
+    if not _spans_three(readings.rate_s):  # many descriptions have the same rates about one axis
         return None
-    as_described = readings.correction('', table, readings.motion)
+    as_described = _correction('', readings, table, readings.motion)
     largest_share = min(LARGEST_UNEXPLAINED, as_described.rate_share / LEAST_IMPROVEMENT)
     corrections = list(_corrections(readings, table))
     smallest = min(correction.rate_share for correction in corrections)
@@ -167,30 +153,33 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
     )
 
 
-def _corrections(readings: MovingReadings, table: Table) -> Iterator[Correction]:
+def _corrections(readings: MotionReadings, table: Table) -> Iterator[Correction]:
     """Yield the best change of the zeros, then another axis of each joint."""
     zero_names = table.joint_names.zeros
     if zero_names:
         zeros = _fit_angles(
-            lambda zeros: readings.rate_residual(table, _shifted(readings.motion, table, zeros)),
+            lambda zeros: _rate_residual(readings, table, _shifted(readings.motion, table, zeros)),
             len(zero_names),
         )
         words = ', '.join(
             f'{name} reads {np.degrees(-zero):.2f} deg too much'
             for name, zero in zip(zero_names, zeros)
         )
-        yield readings.correction(words, table, _shifted(readings.motion, table, zeros))
+        yield _correction(words, readings, table, _shifted(readings.motion, table, zeros))
     for k, name in enumerate(table.joint_names):
         axes = [*_other_axes(np.array(table.joints[k].axis)), _fit_axis(readings, table, k)]
         for axis in axes:
             decimals = 0 if _is_coordinate_axis(axis) else 3
             shown = ', '.join(f'{value + 0.0:.{decimals}f}' for value in axis)
-            yield readings.correction(
-                f'the axis of {name} is [{shown}]', with_axis(table, k, axis), readings.motion
+            yield _correction(
+                f'the axis of {name} is [{shown}]',
+                readings,
+                with_axis(table, k, axis),
+                readings.motion,
             )
 
 
-def _correction_of_several(readings: MovingReadings, table: Table) -> Correction:
+def _correction_of_several(readings: MotionReadings, table: Table) -> Correction:
     """Return the change of all zeros and axes together that explains most of the rates."""
     n_zeros = len(table.joint_names.zeros)
 
@@ -202,10 +191,10 @@ def _correction_of_several(readings: MovingReadings, table: Table) -> Correction
         return changed_table, _shifted(readings.motion, table, angles[:n_zeros])
 
     angles = _fit_angles(
-        lambda angles: readings.rate_residual(*changed(angles)),
+        lambda angles: _rate_residual(readings, *changed(angles)),
         n_zeros + 2 * len(table.joints),
     )
-    return readings.correction('several of them are changed', *changed(angles))
+    return _correction('several of them are changed', readings, *changed(angles))
 
 
 def _fit_angles(residual, n_parameters):
@@ -234,7 +223,7 @@ def _fit_axis(readings, table, joint):
 
     def residual(angles):
         turned_table = with_axis(table, joint, _turned_axis(table, joint, angles))
-        return readings.rate_residual(turned_table, readings.motion)
+        return _rate_residual(readings, turned_table, readings.motion)
 
     axis = _turned_axis(table, joint, _fit_angles(residual, 2))
     return np.round(axis) if _is_coordinate_axis(axis) else axis

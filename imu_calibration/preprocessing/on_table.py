@@ -5,7 +5,7 @@ Exchanged or reversed axes, delay, and rotation against the table.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
-from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window import MotionReadings, Window, motion_readings
 
 MIN_MATCH = 0.8
 """Agreement from which on an exchange of axes describes the matrix."""
@@ -175,31 +175,24 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
     ]
     if not windows:
         return None
-    time = np.concatenate([window.time for window in windows])
-    thinned = slice(None, None, max(1, len(time) // MAX_TESTED_SAMPLES))
-    time = time[thinned]
-    motion = JointMotion.concatenate(window.motion for window in windows).select(thinned)
-    rate = np.concatenate([window.rate_s for window in windows])[thinned]
-    rate = rate - np.median(rate, axis=0)
-    force = np.concatenate([window.force_s for window in windows])[thinned]
+    readings = motion_readings(windows, MAX_TESTED_SAMPLES)
+    readings = replace(readings, rate_s=readings.rate_s - np.median(readings.rate_s, axis=0))
 
     # Pieces of the recording with motion, and those of them that the table does not explain.
-    piece = ((time - time.min()) / TESTED_PIECE_SECONDS).astype(int)
-    error = rate - reference_motion(table, motion).rate_s
+    piece = ((readings.time - readings.time.min()) / TESTED_PIECE_SECONDS).astype(int)
+    error = readings.rate_s - reference_motion(table, readings.motion).rate_s
     residual = np.bincount(piece, weights=(error**2).sum(axis=1))
-    power = np.bincount(piece, weights=(rate**2).sum(axis=1))
-    count = np.bincount(piece, weights=np.ones(len(time)))
-    moves = power > TESTED_RATE**2 * count
-    in_moving = moves[piece]
-    in_unexplained = (moves & (residual > (1.0 - SAME) * power))[piece]
-    if in_unexplained.sum() < MIN_TESTED_SAMPLES:
+    power = np.bincount(piece, weights=(readings.rate_s**2).sum(axis=1))
+    moves = power > TESTED_RATE**2 * np.bincount(piece)
+    moving = readings.select(moves[piece])
+    unexplained = readings.select((moves & (residual > (1.0 - SAME) * power))[piece])
+    if len(unexplained) < MIN_TESTED_SAMPLES:
         return None
 
     # An exchange in the complete recording, then one in the unexplained pieces only.
-    unexplained_time = time[in_unexplained]
-    unexplained_span = (float(unexplained_time.min()), float(unexplained_time.max()))
-    for used, span in ((in_moving, None), (in_unexplained, unexplained_span)):
-        best = _best_candidate(rate[used], force[used], motion.select(used), table)
+    unexplained_span = (float(unexplained.time.min()), float(unexplained.time.max()))
+    for tested, span in ((moving, None), (unexplained, unexplained_span)):
+        best = _best_candidate(tested, table)
         joints = _joint_phrases(table.joint_names, best.order, best.signs)
         axes = _axis_phrases(best.axes)
         if best.share >= LEAST_SHARE_EXPLAINED and (joints or axes):
@@ -224,9 +217,7 @@ class _Candidate:
     """Share of the rates that is explained."""
 
 
-def _best_candidate(
-    rate: np.ndarray, force: np.ndarray, motion: JointMotion, table: Table
-) -> _Candidate:
+def _best_candidate(readings: MotionReadings, table: Table) -> _Candidate:
     """
     Return the candidate that explains most of the rates, then of the force, with fewest changes.
 
@@ -234,6 +225,7 @@ def _best_candidate(
 
         1 - sum |P m - r|^2 / sum |m|^2 = (2 sum (P m) . r - sum |r|^2) / sum |m|^2
     """
+    motion = readings.motion
     candidates = _candidates(motion.position.shape[1])
     axes = signed_permutations()
     rate_share = np.empty((len(candidates), len(axes)))
@@ -247,8 +239,8 @@ def _best_candidate(
             motion.jerk[:, order] * signs,
         )
         reference = reference_motion(table, changed)
-        rate_share[k] = _shares_of_axes(axes, rate, reference.rate_s)
-        force_share[k] = _shares_of_axes(axes, force, reference.force_s)
+        rate_share[k] = _shares_of_axes(axes, readings.rate_s, reference.rate_s)
+        force_share[k] = _shares_of_axes(axes, readings.force_s, reference.force_s)
     is_near = rate_share >= rate_share.max() - AGREEMENT_TIE
     is_near &= force_share >= force_share[is_near].max() - AGREEMENT_TIE
 
@@ -538,12 +530,10 @@ def _estimate_delay(windows: Sequence[Window], table: Table) -> _DelayEstimate:
     inner = shares[1:-1]
     is_peak = (inner >= shares[:-2]) & (inner >= shares[2:])
     peaks = 1 + np.flatnonzero(is_peak & (inner >= shares.max() - SHARE_TIE))
-    best = int(np.argmax(shares))
-    if len(peaks):
-        best = int(peaks[np.argmin(np.abs(peaks - zero))])
-    shares_of_other_sign = shares[: max(zero - reach, 0)]
-    if best < zero:
-        shares_of_other_sign = shares[zero + reach + 1 :]
+    best = int(peaks[np.argmin(np.abs(peaks - zero))] if len(peaks) else np.argmax(shares))
+    shares_of_other_sign = (
+        shares[zero + reach + 1 :] if best < zero else shares[: max(zero - reach, 0)]
+    )
     ambiguous = (
         # A peak, not the slope of one beyond the range of a lag.
         0 < peak_near_zero - zero + reach < 2 * reach

@@ -230,7 +230,7 @@ def _chunk_floor(variance: np.ndarray, width: int, at_rest: np.ndarray | None) -
 
 def _free_of(flags: np.ndarray, width: int) -> np.ndarray:
     """Return whether the span of `width` cells from each cell on has no flagged cell."""
-    sums = np.concatenate([[0], np.cumsum(flags)])
+    sums = np.append(0, np.cumsum(flags))
     return sums[width:] == sums[:-width]
 
 
@@ -504,35 +504,29 @@ def _without_turns(values: np.ndarray, rests: list[slice], width: int) -> list[s
     The limit is `_LEAVES` sds of the low-passed readings, over `width` samples, in the middle half
     of the interval or of the median interval.
     """
-    low_passed_rests = []
+    # Of each interval: first and last sample of its middle half, squared deviations from the mean
+    # there, axes added, and the variance there.
     middles = []
-    centres = []
+    squared_deviations = []
     variances = []
     for rest in rests:
+        _, middle_start, _, middle_stop, _ = np.linspace(rest.start, rest.stop, 5).astype(int)
         readings = _low_passed_piece(values, rest.start, rest.stop, width)
-        quarters = np.linspace(rest.start, rest.stop, 5).astype(int) - rest.start
-        middle = slice(quarters[1], quarters[3])
-        centre = readings[middle].mean(axis=0)
-        low_passed_rests.append(readings)
-        middles.append(middle)
-        centres.append(centre)
-        variances.append(np.mean((readings[middle] - centre) ** 2))
+        middle = slice(middle_start - rest.start, middle_stop - rest.start)
+        squares = (readings - readings[middle].mean(axis=0)) ** 2
+        middles.append((middle_start, middle_stop))
+        squared_deviations.append(np.sum(squares, axis=1))
+        variances.append(np.mean(squares[middle]))
     variance = np.maximum(
         np.maximum(variances, np.median(variances)), least_variance(values) / 3 / width
     )
 
     trimmed = []
     for k, rest in enumerate(rests):
-        middle = middles[k]
-        distance_squared = np.sum((low_passed_rests[k] - centres[k]) ** 2, axis=1)
-        is_turn = distance_squared > 3 * _LEAVES**2 * variance[k]
-        turn_before = is_turn[: middle.start]
-        turn_after = is_turn[middle.stop :]
-        start, stop = rest.start, rest.stop
-        if turn_before.any():
-            start = rest.start + middle.start - int(np.argmax(turn_before[::-1]))
-        if turn_after.any():
-            stop = rest.start + middle.stop + int(np.argmax(turn_after))
+        middle_start, middle_stop = middles[k]
+        turns = rest.start + np.flatnonzero(squared_deviations[k] > 3 * _LEAVES**2 * variance[k])
+        start = turns[turns < middle_start].max(initial=rest.start - 1) + 1
+        stop = turns[turns >= middle_stop].min(initial=rest.stop)
         trimmed.append(slice(int(start), int(stop)))
     return trimmed
 

@@ -12,7 +12,11 @@ from imu_calibration.preprocessing.absent_sensor import without_sensor
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
 from imu_calibration.preprocessing.sensor_join import GyroscopeDelay, delay_of
-from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, ContinuedStamps, outside
+from imu_calibration.preprocessing.stream_cleaning import (
+    BlockCleaner,
+    ContinuedStamps,
+    samples_outside,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,18 +53,17 @@ def read_recording(
         When no usable sample remains.
 
     """
-    watchers = []
-    if preflight is not None:
-        watchers.append(preflight)
+    # 1. The cleaned samples. The epochs of the clock follow one another with a pause: no turn is
+    #    used across a reset.
+    watchers = [] if preflight is None else [preflight]
     cleaner = BlockCleaner(nominal=nominal, watchers=watchers, one_sensor=True)
-    # The epochs of the clock follow one another with a pause: no turn is used across a reset.
     stamps = ContinuedStamps()
     shift_of_epoch = {}
     joined = JoinedParts()
     temperatures = []
     for cleaned in cleaner.all_of(blocks):
-        for epoch, imu in cleaned.imu:
-            joined.add(stamps.moved(epoch, imu))
+        for epoch, part in cleaned.imu:
+            joined.add(stamps.moved(epoch, part))
             shift_of_epoch[epoch] = stamps.shift_ns
         temperatures += cleaned.temperature
     if not len(joined):
@@ -68,36 +71,45 @@ def read_recording(
             'the recording must hold Imu messages that can be used, it holds none; check the topic'
         )
     imu = joined.samples()
+
+    # 2. Without the samples that are no readings, and the findings of the checks.
     findings: tuple[CheckFinding, ...] = ()
     unusable_sensors: dict[str, str] = {}
     if preflight is not None:
-        unusable_sensors = preflight.unusable
         imu = _readings_only(imu, preflight.without_readings)
+        unusable_sensors = preflight.unusable
         for sensor in unusable_sensors:
             imu = without_sensor(imu, sensor)
     delay = delay_of(imu)
     if preflight is not None:
         findings = (*preflight.findings, *late_gyroscope(delay))
         preflight.findings = findings
+
+    # 3. The temperature at the samples, with the shifts of their epochs. An epoch without samples
+    #    has the last shift.
     temperature_c = None
     if temperatures:
         moved = []
-        for epoch, part in temperatures:
+        for epoch, readings in temperatures:
             shift_ns = shift_of_epoch.get(epoch, stamps.shift_ns)
-            moved.append(replace(part, stamp_ns=part.stamp_ns + shift_ns))
-        readings = TemperatureSamples.concatenate(moved)
-        start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
-        temperature_c = np.interp(
-            (imu.stamp_ns - start).astype(float),
-            (readings.stamp_ns - start).astype(float),
-            readings.temperature_c,
-        )
-    counts = dict(cleaner.lost)
+            moved.append(replace(readings, stamp_ns=readings.stamp_ns + shift_ns))
+        temperature_c = _temperature_at(imu.stamp_ns, TemperatureSamples.concatenate(moved))
+
+    counts = {reason: count for reason, count in cleaner.lost.items() if count}
     for reason, count in cleaner.counts.items():
-        if reason.startswith('imu '):
+        if count and reason.startswith('imu '):
             counts[reason] = count
-    counts = {reason: count for reason, count in counts.items() if count}
     return SampleRecording(imu, temperature_c, counts, findings, delay, unusable_sensors)
+
+
+def _temperature_at(stamp_ns: np.ndarray, readings: TemperatureSamples) -> np.ndarray:
+    """Return the temperature at stamps, interpolated linearly, degrees Celsius, shape (n,)."""
+    start_ns = stamp_ns[0]  # epochs in nanoseconds do not fit a float
+    return np.interp(
+        (stamp_ns - start_ns).astype(float),
+        (readings.stamp_ns - start_ns).astype(float),
+        readings.temperature_c,
+    )
 
 
 def late_gyroscope(delay: GyroscopeDelay | None) -> Iterator[CheckFinding]:
@@ -114,11 +126,11 @@ def late_gyroscope(delay: GyroscopeDelay | None) -> Iterator[CheckFinding]:
 
 def _readings_only(imu: ImuSamples, ranges: np.ndarray) -> ImuSamples:
     """Return the samples that are in none of the ranges of `Preflight.without_readings`."""
-    kept = outside(ranges, np.arange(len(imu)))
-    if not kept.any():
+    readings = samples_outside(ranges, imu)
+    if not len(readings):
         raise InputError(
             f'the recording must hold readings, in all of its {len(imu)} samples an output is'
             ' frozen; check the sensor and its driver',
             code='frozen',
         )
-    return imu if kept.all() else imu.select(kept)
+    return readings

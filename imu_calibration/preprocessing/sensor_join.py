@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.samples import AlignedArrays, ImuSamples
 from imu_calibration.kinematics.rotations import skew, unit_rows
 
 MAX_GAP_PERIODS = 5.0
@@ -46,7 +46,7 @@ MIN_EXPLAINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class SensorStream:
+class SensorStream(AlignedArrays):
     """Readings of one sensor."""
 
     stamp_ns: np.ndarray
@@ -99,9 +99,7 @@ class JoinedSensors:
     @property
     def text(self) -> str:
         """The method and the delay in one line."""
-        faster = 'gyroscope'
-        if self.slower == faster:
-            faster = 'accelerometer'
+        faster = 'accelerometer' if self.slower == 'gyroscope' else 'gyroscope'
         line = f'the {faster} is interpolated linearly to the stamps of the {self.slower}'
         if self.delay is None:
             return f'{line}; their delay is not determined by the motion'
@@ -134,12 +132,10 @@ class OtherSensor:
 
 def finite_stream(stamp_ns: np.ndarray, values: np.ndarray) -> SensorStream:
     """Return the finite readings of one sensor whose stamps exceed all stamps before."""
-    known = np.isfinite(values).all(axis=1)
-    stamp_ns = stamp_ns[known]
-    values = values[known]
-    newest = np.maximum.accumulate(stamp_ns)
-    advances = np.append(True, stamp_ns[1:] > newest[:-1])[: len(stamp_ns)]
-    return SensorStream(stamp_ns[advances], values[advances])
+    finite = SensorStream(stamp_ns, values).select(np.isfinite(values).all(axis=1))
+    newest = np.maximum.accumulate(finite.stamp_ns)
+    advances = np.append(True, finite.stamp_ns[1:] > newest[:-1])[: len(finite)]
+    return finite.select(advances)
 
 
 def join_sensors(
@@ -230,7 +226,7 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
 
 
 @dataclass(frozen=True, eq=False)
-class _GravityWindows:
+class _GravityWindows(AlignedArrays):
     """Rotation of the direction u of the specific force in short windows."""
 
     start: np.ndarray
@@ -246,12 +242,6 @@ class _GravityWindows:
     def rotation(self) -> np.ndarray:
         """Rotation of gravity, rad (small angles), shape (n,)."""
         return np.linalg.norm(self.change, axis=1)
-
-    def select(self, index: np.ndarray) -> '_GravityWindows':
-        """Return the windows at `index`."""
-        return _GravityWindows(
-            self.start[index], self.stop[index], self.middle[index], self.change[index]
-        )
 
 
 def _gravity_windows(accelerometer: SensorStream) -> _GravityWindows | None:
@@ -269,15 +259,15 @@ def _gravity_windows(accelerometer: SensorStream) -> _GravityWindows | None:
     direction = unit_rows(np.where(has_direction, accelerometer.values, 1.0))
 
     start = np.arange(0, len(time) - 2 * half, half)
-    middle = start + half
-    stop = start + 2 * half
     longest = 2.0 * DELAY_WINDOW + 4e-9 * accelerometer.period_ns
-    without_gap = time[stop] - time[start] < longest
-    start = start[without_gap]
-    middle = middle[without_gap]
-    stop = stop[without_gap]
-    change = direction[stop] - direction[start]
-    return _GravityWindows(time[start], time[stop], direction[middle], change)
+    start = start[time[start + 2 * half] - time[start] < longest]  # without a gap
+    stop = start + 2 * half
+    return _GravityWindows(
+        start=time[start],
+        stop=time[stop],
+        middle=direction[start + half],
+        change=direction[stop] - direction[start],
+    )
 
 
 def _delay_within(
@@ -301,34 +291,26 @@ def _delay_within(
     # The least residual, first among widely spaced delays, then near the best of them.
     best = 0.0
     half_range = reach
-    steps = [DELAY_STEP]
-    if reach > MAX_DELAY:
-        steps = [WIDE_STEP, DELAY_STEP]
+    steps = [WIDE_STEP, DELAY_STEP] if reach > MAX_DELAY else [DELAY_STEP]
     for step in steps:
         delays = best + np.arange(-half_range, half_range + step / 2, step)
         best = delays[int(np.argmin([cost.residual(delay) for delay in delays]))]
         half_range = step
     fine_delays = best + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)
-    # Column 0: of all windows; column 1 + k: without part k.
-    residuals = np.array([cost.residuals_without_parts(delay) for delay in fine_delays])
+    # Row 0: of all windows; row 1 + k: without part k.
+    residuals = np.transpose([cost.residuals_without_parts(delay) for delay in fine_delays])
     total = float(np.sum(windows.change**2))
-    if residuals[:, 0].min() > (1.0 - MIN_EXPLAINED) * total:
+    if residuals[0].min() > (1.0 - MIN_EXPLAINED) * total:
         return None
     # Among many delays one may fit by chance; it does not predict other parts of the recording.
     if reach > MAX_DELAY and cost.prediction_error(best) > (1.0 - MIN_PREDICTED) * total:
         return None
-    delay = _minimum_of_parabola(fine_delays, residuals[:, 0])
+    delay, *delays_without_parts = (_minimum_of_parabola(fine_delays, row) for row in residuals)
     # A minimum at the end of the searched delays may be a slope of one beyond.
     if abs(delay) > reach - steps[0]:
         return None
-
     # Jackknife over parts of the recording, because the residuals are correlated in time.
-    delays_without_parts = np.array(
-        [_minimum_of_parabola(fine_delays, column) for column in residuals[:, 1:].T]
-    )
-    deviation = delays_without_parts - delays_without_parts.mean()
-    variance = (DELAY_PARTS - 1) / DELAY_PARTS * np.sum(deviation**2)
-    return GyroscopeDelay(delay, float(np.sqrt(variance)))
+    return GyroscopeDelay(delay, float(np.sqrt((DELAY_PARTS - 1) * np.var(delays_without_parts))))
 
 
 class _DelayCost:

@@ -89,10 +89,7 @@ class SpikeFilter:
                 and part.stamp_ns[0] - self._buffered.stamp_ns[-1] > BREAK_NS
             ):
                 passed += self.finish()
-            if self._buffered is not None:
-                self._buffered = type(part).concatenate([self._buffered, part])
-            else:
-                self._buffered = part
+            self._buffered = part.after(self._buffered)
             self._readings = np.vstack([self._readings, np.hstack([part.force_s, part.rate_s])])
             # Not before the noise of the first chunk can be estimated.
             if self._first_row + len(self._readings) > NOISE_SAMPLES:

@@ -303,7 +303,7 @@ def _least_period(period: float) -> float:
 
 def _scatter(number_step: np.ndarray, stamp: np.ndarray) -> float:
     """Return the rms of stamps about a line through the numbers of their samples, ns."""
-    number = np.concatenate([[0.0], np.cumsum(number_step)])
+    number = np.append(0.0, np.cumsum(number_step))
     return float(np.std(stamp - np.polyval(np.polyfit(number, stamp, 1), number)))
 
 
@@ -653,9 +653,7 @@ class SampleTimes:
 
     def _without_repeated(self, samples: ImuSamples) -> ImuSamples:
         """Return samples without those that repeat the stamp and the readings of the one before."""
-        joined = samples
-        if self._last_sample is not None:
-            joined = ImuSamples.concatenate([self._last_sample, samples])
+        joined = samples.after(self._last_sample)
         n_before = len(joined) - len(samples)
         self._last_sample = joined.select(slice(len(joined) - 1, None))
         # Sample k + 1 has the stamp of sample k.
@@ -677,7 +675,7 @@ class SampleTimes:
         After a complete block the use of the stamps may be reviewed.
         """
         if self._is_unclassified:
-            self._add_to_buffer(part)
+            self._buffered = part.after(self._buffered)
             stamp_ns = self._buffered.stamp_ns
             is_full = len(stamp_ns) >= STAMP_HISTORY
             line = None
@@ -687,7 +685,12 @@ class SampleTimes:
             if line is None and not is_full:
                 return []
             self._is_unclassified = False
-            return self._set_line(line) + self._with_times(None)
+            self._set_line(line)
+            if self._counted_clock is not None:
+                return self._timed_by_clock()
+            buffered = self._buffered
+            self._buffered = None
+            return [self._ordered(buffered)]
 
         ready = self._with_times(part)
         if not self._n_since_block:
@@ -700,23 +703,14 @@ class SampleTimes:
                 ready += self._set_line(describe_stamps(self._stamps_ns))
         return ready
 
-    def _add_to_buffer(self, part: ImuSamples) -> None:
-        """Keep samples until the class of their stamps is known."""
-        if self._buffered is not None:
-            part = ImuSamples.concatenate([self._buffered, part])
-        self._buffered = part
-
-    def _with_times(self, part: ImuSamples | None) -> list:
-        """Return the buffered samples and `part`, unchanged or with times from the clock."""
+    def _with_times(self, part: ImuSamples) -> list:
+        """Return `part` with its stamps, or the samples whose times the clock determines now."""
         if self._counted_clock is None:
-            buffered = self._buffered
-            self._buffered = None
-            if part is not None and self.line is not None and self.line.word == IRREGULAR:
+            if self.line is not None and self.line.word == IRREGULAR:
                 self.n_irregular += len(part)
-            return [self._ordered(buffered), self._ordered(part)]
-        if part is not None:
-            self._counted_clock.push(part.stamp_ns)
-            self._add_to_buffer(part)
+            return [self._ordered(part)]
+        self._counted_clock.push(part.stamp_ns)
+        self._buffered = part.after(self._buffered)
         return self._timed_by_clock()
 
     def _timed_by_clock(self, final: bool = False) -> list:
@@ -765,25 +759,18 @@ class SampleTimes:
         self.line = line
         self._line_of_use[line.word] = line
         ready = []
-        if self._counted_clock is None:
-            if line.word != COUNTED:
-                return []
-        else:
-            has_same_period = (
-                line_before is None
-                or abs(line.period_ns - line_before.period_ns)
-                <= SAME_PERIOD_SHARE * line_before.period_ns
-            )
+        if self._counted_clock is not None:
+            assert line_before is not None  # the clock was made with it
+            change = abs(line.period_ns - line_before.period_ns)
             # The clock itself follows small changes of the period.
-            if line.word == COUNTED and has_same_period:
+            if line.word == COUNTED and change <= SAME_PERIOD_SHARE * line_before.period_ns:
                 return []
             ready = self._timed_by_clock(final=True)
             self._counted_clock = None
-            if line.word != COUNTED:
-                return ready
-        self._counted_clock = CountedClock(line)
-        if self._buffered is not None:
-            self._counted_clock.push(self._buffered.stamp_ns)
+        if line.word == COUNTED:
+            self._counted_clock = CountedClock(line)
+            if self._buffered is not None:
+                self._counted_clock.push(self._buffered.stamp_ns)
         return ready
 
 

@@ -4,7 +4,6 @@ Alignment of streams, chunk by chunk of a fixed grid in time.
 Position and phase of the joints at the IMU's stamps.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,6 +23,7 @@ from imu_calibration.preprocessing.rest_detection import (
     QuietFloor,
     quiet_beside_joints,
 )
+from imu_calibration.preprocessing.stream_cleaning import NEVER_NS, DropCounts
 from imu_calibration.preprocessing.window import PhasedSamples, WindowSettings
 from imu_calibration.preprocessing.window_cutter import LEAST_READINGS, LOST, STILL, JointRun
 
@@ -89,8 +89,6 @@ The IMU or the joints may be ahead of each other by this much before missing sam
 TEMPERATURE_WAIT = 5.0
 """Largest delay of the temperature relative to the IMU, s."""
 _LEAST_MARGIN = max(window_cutter.PHASE_REACH, QUIETNESS_REACH) + 0.4
-NEVER = 1 << 62
-"""Later than all stamps, ns; with a minus, earlier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +128,7 @@ class MotionChunks:
         noise_rad: float | None,
         floors: tuple[QuietFloor, QuietFloor],
     ):
-        self.counts = Counter()
+        self.counts = DropCounts()
         """Reason -> number of IMU samples dropped here."""
         self.time_origin = 0.0
         """Session time at the first IMU sample of this epoch, s."""
@@ -196,7 +194,7 @@ class MotionChunks:
             if self._start_ns is None:
                 self._start_ns = int(imu.stamp_ns[0])
             n_late = self._n_late(imu, 0)
-            self._count('late IMU sample', n_late)
+            self.counts.add('late IMU sample', n_late)
             self._imu.add(imu.select(slice(n_late, None)))
         if joints is not None and len(joints):
             if self._first_joint_ns is None:
@@ -229,7 +227,7 @@ class MotionChunks:
 
     def remaining_joints(self) -> JointSamples | None:
         """Return the buffered joint samples, or None."""
-        return self._joints.between(-NEVER, NEVER)
+        return self._joints.between(-NEVER_NS, NEVER_NS)
 
     def _next_start_ns(self) -> int:
         """Return the stamp at which the next chunk starts, once an IMU sample has been added."""
@@ -239,7 +237,7 @@ class MotionChunks:
     def _passed_ns(self) -> int:
         """Return the stamp that all streams have passed or will never pass."""
         imu_ns, joints_ns, temperature_ns = (
-            -NEVER if buffer.newest_ns is None else buffer.newest_ns
+            -NEVER_NS if buffer.newest_ns is None else buffer.newest_ns
             for buffer in (self._imu, self._joints, self._temperature)
         )
         # A stream that is behind another one by more than its waiting time is not waited for.
@@ -294,10 +292,6 @@ class MotionChunks:
         self._joints.forget_before(oldest_ns)
         self._temperature.forget_before(oldest_ns, keep_one=True)
 
-    def _count(self, reason: str, number: int | np.integer) -> None:
-        """Add to the number of samples that were dropped for a reason."""
-        self.counts += Counter({reason: int(number)})  # without zeros
-
     def _process_chunk(self, start_ns: int, final: bool) -> PhasedSamples | None:
         """Return the chunk from `start_ns` on, or None when no sample in it can be used."""
         first_ns = start_ns - self._margin_ns
@@ -324,22 +318,21 @@ class MotionChunks:
         # From here on samples of the chunk only.
         core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
         stamp_ns = imu.stamp_ns[core]
-        lost = joints.phase[core] == LOST
-        after_loss = np.concatenate([[self._previous_is_lost], lost[:-1]])
-        self._previous_is_lost = bool(lost[-1])
+        is_lost = joints.phase[core] == LOST
+        # The sample before the first one is the last of the chunk before.
+        after_loss = np.append(self._previous_is_lost, is_lost[:-1])
         after_gap = self._after_gaps(stamp_ns, longest_step) | after_loss
+        self._previous_ns = int(stamp_ns[-1])
+        self._previous_is_lost = bool(is_lost[-1])
+
         derivatives = self._joint_derivatives(
             joints.level[core], time[core], joints.phase[core], runs
         )
         temperature = self._temperature_at(stamp_ns, last_ns)
         vibration = self._vibration.of(period, imu.force_s[core])
-        position, joint_rate, acceleration, jerk = derivatives
         motion = JointMotion(
             time[core] + self.time_origin,
-            position,
-            joint_rate,
-            acceleration,
-            jerk,
+            *derivatives,
             temperature.branch,
             vibration,
             temperature.rate,
@@ -358,12 +351,12 @@ class MotionChunks:
             None if imu.corrected is None else imu.corrected[core],
             imu.absent,
         )
-        if not lost.any():
+        if not is_lost.any():
             return samples
-        edge = self._at_edge(stamp_ns, longest_step, final)
-        self._count('no joint state', np.count_nonzero(lost & ~edge))
-        self._count('edge of joints', np.count_nonzero(lost & edge))
-        return None if lost.all() else samples.select(~lost)
+        is_edge = self._at_edge(stamp_ns, longest_step, final)
+        self.counts.add('no joint state', np.count_nonzero(is_lost & ~is_edge))
+        self.counts.add('edge of joints', np.count_nonzero(is_lost & is_edge))
+        return None if is_lost.all() else samples.select(~is_lost)
 
     def _seconds(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return times since the first IMU sample of this epoch, s."""
@@ -443,8 +436,7 @@ class MotionChunks:
         """Return where the step before a sample is longer than `longest_step` s, shape (n,)."""
         # A gap precedes the first sample of the epoch.
         before_ns = stamp_ns[0] - (1 << 40) if self._previous_ns is None else self._previous_ns
-        self._previous_ns = int(stamp_ns[-1])
-        return np.diff(np.concatenate([[before_ns], stamp_ns])) > _ns(longest_step)
+        return np.diff(stamp_ns, prepend=before_ns) > _ns(longest_step)
 
     def _temperature_at(self, stamp_ns: np.ndarray, last_ns: int) -> TemperatureSamples:
         """
@@ -452,7 +444,7 @@ class MotionChunks:
 
         They are interpolated between the readings up to `last_ns`.
         """
-        readings = self._temperature.between(-NEVER, last_ns)
+        readings = self._temperature.between(-NEVER_NS, last_ns)
         if readings is None or not len(readings):
             unknown = np.full((3, len(stamp_ns)), np.nan)
             return TemperatureSamples(stamp_ns, *unknown)

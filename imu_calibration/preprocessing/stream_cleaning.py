@@ -41,6 +41,15 @@ _NEEDED = {
 """Type of samples -> fields that must be finite."""
 
 
+class DropCounts(Counter):
+    """Reason -> number of samples dropped."""
+
+    def add(self, reason: str, number: int | np.integer) -> None:
+        """Add to the number of a reason; a reason without samples is not listed."""
+        if number:
+            self[reason] += int(number)
+
+
 class StreamCheck:
     """
     Cleans one stream; the result does not depend on its division into pieces.
@@ -62,7 +71,7 @@ class StreamCheck:
     """
 
     def __init__(self, *, one_sensor: bool = False) -> None:
-        self.counts = Counter()
+        self.counts = DropCounts()
         """Reason -> number of samples dropped; 'clock reset' -> number of jumps."""
         self.presence = SensorPresence() if one_sensor else None
         """Which sensors an IMU stream has; None where both are required."""
@@ -124,7 +133,7 @@ class StreamCheck:
         if isinstance(samples, ImuSamples) and len(samples) and not samples.absent:
             n_before = self._zeros.n_dropped
             samples = self._zeros.push(samples)
-            self._count('zero', self._zeros.n_dropped - n_before)
+            self.counts.add('zero', self._zeros.n_dropped - n_before)
         if len(samples):
             samples = replace(samples, stamp_ns=self._overflows.removed(samples.stamp_ns))
         if isinstance(samples, ImuSamples):
@@ -137,7 +146,7 @@ class StreamCheck:
         buffered = None if self.presence is None else self.presence.finish()
         if buffered is not None:
             accepted += self._checked(buffered)
-        self._count('zero', self._zeros.finish())
+        self.counts.add('zero', self._zeros.finish())
         last = []
         if self._possible_stray is not None:
             last += self._accept(self._possible_stray)
@@ -206,10 +215,6 @@ class StreamCheck:
             self.counts['wrapped'] = self._wraps.dropped
         return passed
 
-    def _count(self, reason: str, number: int | np.integer) -> None:
-        """Add to the number of samples that were dropped for a reason."""
-        self.counts += Counter({reason: int(number)})  # without zeros
-
     def _finite(self, samples: Any) -> Any:
         """Return the samples with finite readings."""
         columns = [
@@ -220,7 +225,7 @@ class StreamCheck:
         finite = np.logical_and.reduce([np.isfinite(column).all(axis=1) for column in columns])
         if isinstance(samples, ImuSamples):
             self._never_read.intersection_update(missing_sensors(samples))
-        self._count('not finite', len(finite) - np.count_nonzero(finite))
+        self.counts.add('not finite', len(finite) - np.count_nonzero(finite))
         return samples.select(finite)
 
     def _without_strays(self, samples: Any) -> Any:
@@ -230,39 +235,29 @@ class StreamCheck:
         After a reset of the clock the neighbours are not close to each other. A last sample far
         from the one before is buffered until the next one is received.
         """
-        if self._possible_stray is not None:
-            samples = type(samples).concatenate([self._possible_stray, samples])
-            self._possible_stray = None
+        samples = samples.after(self._possible_stray)
+        self._possible_stray = None
         if not len(samples):
             return samples
-        stamps = samples.stamp_ns
-        if self._stamp_before_ns is not None:
-            stamps = np.concatenate([[self._stamp_before_ns], stamps])
-        step = np.diff(stamps)
-        size = np.abs(step)
-        is_far = size > BACKWARD_RESET_NS
-        step_of_neighbours = np.abs(step[:-1] + step[1:])
-
-        # A stray is far from both neighbours, which are closer to each other.
-        stray = np.zeros(len(stamps), bool)
-        stray[1:-1] = is_far[:-1] & is_far[1:]
-        stray[1:-1] &= step_of_neighbours < np.minimum(size[:-1], size[1:])
-        if self._stamp_before_ns is not None:
-            stray = stray[1:]
-        elif len(step):
+        if self._stamp_before_ns is None:
+            stamps = samples.stamp_ns
+            is_stray = _strays(stamps)
             # The first sample of the stream has one neighbour only.
-            stray[0] = _is_reset(step[0])
+            is_stray[0] = len(stamps) > 1 and _is_reset(stamps[1] - stamps[0])
+        else:
+            stamps = np.append(self._stamp_before_ns, samples.stamp_ns)
+            is_stray = _strays(stamps)[1:]
 
         # The last sample has no later neighbour yet.
-        if not len(step) or is_far[-1]:
+        if len(stamps) == 1 or abs(stamps[-1] - stamps[-2]) > BACKWARD_RESET_NS:
             n_decided = len(samples) - 1
             self._possible_stray = samples.select(slice(n_decided, None))
             samples = samples.select(slice(0, n_decided))
-            stray = stray[:-1]
+            is_stray = is_stray[:-1]
         if len(samples):
             self._stamp_before_ns = samples.stamp_ns[-1]
-        self._count('stray stamp', np.count_nonzero(stray))
-        return samples.select(~stray) if stray.any() else samples
+        self.counts.add('stray stamp', np.count_nonzero(is_stray))
+        return samples.select(~is_stray) if is_stray.any() else samples
 
     def _accept(self, samples: Any) -> list[tuple[int, Any]]:
         """Return the (epoch, samples) in order with their times; a reset begins an epoch."""
@@ -280,7 +275,7 @@ class StreamCheck:
                 accepted += self._in_order(self._timed(samples.select(slice(0, end))))
             if end < len(stamps):
                 accepted += self._end_epoch()
-                self._count('clock reset', 1)
+                self.counts.add('clock reset', 1)
                 self.epoch += 1
                 self._newest_ns = None
                 self._newest_recorded_ns = None
@@ -293,7 +288,7 @@ class StreamCheck:
             return samples
         n_before = self._times.n_repeated
         samples = self._times.push(samples)
-        self._count('repeated stamp', self._times.n_repeated - n_before)
+        self.counts.add('repeated stamp', self._times.n_repeated - n_before)
         return samples
 
     def _end_epoch(self) -> list[tuple[int, Any]]:
@@ -306,8 +301,8 @@ class StreamCheck:
             return []
         stamps = samples.stamp_ns
         newest_before = _newest_before(stamps, self._newest_ns)
-        self._count('repeated stamp', np.count_nonzero(stamps == newest_before))
-        self._count('backward stamp', np.count_nonzero(stamps < newest_before))
+        self.counts.add('repeated stamp', np.count_nonzero(stamps == newest_before))
+        self.counts.add('backward stamp', np.count_nonzero(stamps < newest_before))
         is_later = stamps > newest_before
         samples = samples if is_later.all() else samples.select(is_later)
         if len(samples):
@@ -320,7 +315,7 @@ class StreamCheck:
         self._first_ns = min(self._first_ns, int(stamps[0]))
         self._last_ns = max(self._last_ns, int(stamps[-1]))
         if self._newest_ns is not None:
-            stamps = np.concatenate([[self._newest_ns], stamps])
+            stamps = np.append(self._newest_ns, stamps)
         self._steps.add(np.diff(stamps))
         self._span_ns += int(stamps[-1] - stamps[0])
         self._newest_ns = stamps[-1]
@@ -375,7 +370,21 @@ class EpochFilters:
 def _newest_before(stamps: np.ndarray, newest: int | None) -> np.ndarray:
     """Return the largest stamp before each one, shape (n,); `newest`: of earlier samples."""
     first = stamps[0] - 1 if newest is None else newest
-    return np.maximum.accumulate(np.concatenate([[first], stamps]))[:-1]
+    return np.maximum.accumulate(np.append(first, stamps))[:-1]
+
+
+def _strays(stamps: np.ndarray) -> np.ndarray:
+    """
+    Return which stamps, ns, are far from both neighbours while these are closer to each other.
+
+    Shape (n,); the first and the last one are not.
+    """
+    step = np.diff(stamps)
+    size = np.abs(step)
+    nearer = np.minimum(size[:-1], size[1:])
+    is_stray = np.zeros(len(stamps), bool)
+    is_stray[1:-1] = (nearer > BACKWARD_RESET_NS) & (np.abs(step[:-1] + step[1:]) < nearer)
+    return is_stray
 
 
 def _is_reset(step: np.ndarray) -> np.ndarray:
@@ -523,26 +532,25 @@ NO_RANGES = np.zeros((0, 2), np.int64)
 """Nothing to leave out."""
 CLEANING_BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
-_SAMPLE_TYPES: dict[str, Any] = {
-    'imu': ImuSamples,
-    'joints': JointSamples,
-    'temperature': TemperatureSamples,
-}
 
 
-def outside(ranges: np.ndarray, place: np.ndarray) -> np.ndarray:
+def samples_outside(ranges: np.ndarray, imu: ImuSamples, first: int = 0) -> ImuSamples:
     """
-    Return which places are in none of the half open ranges.
+    Return the samples whose numbers are in none of the half open ranges.
 
     Parameters
     ----------
     ranges : ndarray, shape (k, 2)
         In order, without overlap.
-    place : ndarray, shape (n,)
+    imu : ImuSamples
+    first : int
+        Number of the first sample.
 
     """
-    # An odd number of bounds lies at or below a place within a range.
-    return np.searchsorted(ranges.ravel(), place, side='right') % 2 == 0
+    number = np.arange(first, first + len(imu))
+    # An odd number of bounds lies at or below a number within a range.
+    is_outside = np.searchsorted(ranges.ravel(), number, side='right') % 2 == 0
+    return imu if is_outside.all() else imu.select(is_outside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -754,9 +762,7 @@ class BlockCleaner:
         """Clean the samples that were collected."""
         for name, parts in self._collected.items():
             if parts:
-                samples = parts[0]
-                if len(parts) > 1:
-                    samples = _SAMPLE_TYPES[name].concatenate(parts)
+                samples = parts[0] if len(parts) == 1 else type(parts[0]).concatenate(parts)
                 self._cleaned[name] += self._checks[name].push(samples)
                 self._collected[name] = []
 
@@ -780,14 +786,13 @@ class BlockCleaner:
         self, parts: Sequence[tuple[int, ImuSamples]]
     ) -> list[tuple[int, ImuSamples]]:
         """Return the (epoch, samples) without the ranges to leave out."""
-        kept_parts = []
+        used_parts = []
         for epoch, imu in parts:
-            place = np.arange(self._n_imu, self._n_imu + len(imu))
+            used = samples_outside(self._without, imu, self._n_imu)
             self._n_imu += len(imu)
-            kept = outside(self._without, place)
-            if kept.any():
-                kept_parts.append((epoch, imu if kept.all() else imu.select(kept)))
-        return kept_parts
+            if len(used):
+                used_parts.append((epoch, used))
+        return used_parts
 
     def _in_requested_order(self, joints: JointSamples) -> JointSamples:
         """Return joint samples with their columns in the requested order of names."""

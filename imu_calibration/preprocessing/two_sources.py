@@ -55,8 +55,7 @@ class TwoSourceSearch:
     def push(self, samples: ImuSamples) -> None:
         """Process samples as they were received, with finite readings."""
         self._count_stamps(samples.stamp_ns)
-        if self._incomplete_run is not None:
-            samples = ImuSamples.concatenate([self._incomplete_run, samples])
+        samples = samples.after(self._incomplete_run)
         n_runs = len(samples) // RUN_SAMPLES
         used = n_runs * RUN_SAMPLES
         self._incomplete_run = samples.select(slice(used, None))
@@ -99,7 +98,7 @@ class TwoSourceSearch:
     def _count_stamps(self, stamp_ns: np.ndarray) -> None:
         """Count the steps between stamps, and those of zero."""
         if self._last_stamp is not None:
-            stamp_ns = np.concatenate([[self._last_stamp], stamp_ns])
+            stamp_ns = np.append(self._last_stamp, stamp_ns)
         self.n_steps += max(len(stamp_ns) - 1, 0)
         self.n_equal_stamps += int(np.count_nonzero(np.diff(stamp_ns) == 0))
         if len(stamp_ns):

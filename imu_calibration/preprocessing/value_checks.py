@@ -23,7 +23,7 @@ from imu_calibration.core.units import (
     significant,
     unit_of_rest,
 )
-from imu_calibration.preprocessing.full_scale import FACTORS, nearest_power
+from imu_calibration.preprocessing.full_scale import FACTORS, Turning, nearest_power
 from imu_calibration.preprocessing.on_table import MIN_MATCH, match_axes
 from imu_calibration.preprocessing.recording_evidence import (
     GOOD,
@@ -84,11 +84,16 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     per_second = imu.rate if imu is not None else 0.0
     error = force_error(length, where, evidence.readings.accelerometer, per_second=per_second)
     if error is not None:
-        yield CheckFinding(error.code, REFUSE, str(error), key=error.key, value=error.value)
+        yield _refusal(error)
     else:
         yield CheckFinding(
             'force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}'
         )
+
+
+def _refusal(error: InputError) -> CheckFinding:
+    """Return an error of the readings as a finding."""
+    return CheckFinding(error.code, REFUSE, str(error), key=error.key, value=error.value)
 
 
 def force_error(
@@ -126,10 +131,12 @@ def force_error(
             f' {where} is {raw_length:.4g}: '
         )
         remedy = 'give the recording that the unit belongs to'
+    # Unit in which the readings have the length of gravity; '' for none, and for m/s^2.
     unit = unit_of_rest(raw_length)
-    if not stated.is_si and scale_range(raw_length / STANDARD_GRAVITY) is not IMPOSSIBLE:
+    if not stated.is_si and _is_force(raw_length):
         unit = unit or 'm/s^2'
     is_wrong = not _is_force(length)
+    # Only readings in SI must not look like another unit: a stated one explains their length.
     if unit and (is_wrong or stated.is_si):
         return InputError(
             f'{requirement}it is probably {unit}; {remedy}',
@@ -170,7 +177,7 @@ def increments(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         return
     error = increments_error(imu.rate, evidence.readings)
     if error is not None:
-        yield CheckFinding(error.code, REFUSE, str(error), key=error.key, value=error.value)
+        yield _refusal(error)
 
 
 def increments_error(per_second: float, readings: RawReadings) -> InputError | None:
@@ -227,42 +234,13 @@ def wrong_rate_unit(text: str, unit: str = 'counts:NUMBER/(deg/s)') -> CheckFind
 def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Angular rate is in rad/s: gravity turns by the integral of the rates."""
     # Turns are compared with the rotation of gravity; without turns the largest rate decides.
-    turning = evidence.turning
+    if evidence.turning is not None:
+        yield from _unit_by_turns(evidence, evidence.turning)
+        return
     stated = evidence.readings.gyroscope
     ends_of_rates = chain.from_iterable(evidence.ends[3:])
     largest = max((end.level for end in ends_of_rates), default=0.0)
-    if turning is not None:
-        ratio = 1.0 / turning.factor
-        raw_ratio = ratio * float(np.mean(stated.scale))
-        wanted = 'in rad/s'
-        convert = 'convert them in the driver'
-        if not stated.is_si:
-            wanted = f'in the stated unit {stated.unit}'
-            convert = 'give the recording that the unit belongs to'
-        observed = (
-            f'angular rates must be {wanted}, they are {significant(ratio)} times the rotation of'
-            ' the measured gravity: '
-        )
-        unit = _unit_of_ratio(raw_ratio)
-        if unit and scale_range(ratio) is IMPOSSIBLE:
-            yield wrong_rate_unit(f'{observed}probably {unit}; {convert}', unit)
-        elif 0.6 < ratio / DEG < 1.6:
-            yield wrong_rate_unit(
-                f'{observed}probably converted from deg/s twice; convert them once',
-                f'counts:{DEG:.7g}/(rad/s)',
-            )
-        elif _full_scale_factor(evidence) is not None:
-            return
-        elif scale_range(ratio) is IMPOSSIBLE:
-            yield wrong_rate_unit(f'{observed}counts or volts?; {convert}')
-        else:
-            yield CheckFinding(
-                'rate_unit',
-                GOOD,
-                'angular rate in rad/s: gravity rotates according to the'
-                f' rates{_about(turning.axes)}',
-            )
-    elif largest > MAX_GYRO_RATE:
+    if largest > MAX_GYRO_RATE:
         unit = 'counts or volts'
         proposed = 'counts:NUMBER/(deg/s)'
         if largest < FASTEST_DEG and stated.is_si:
@@ -271,6 +249,39 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             f'angular rates must be in {stated.unit}, the largest is {largest:.4g} rad/s, faster'
             f' than gyroscopes measure: {unit}?; convert them in the driver',
             proposed,
+        )
+
+
+def _unit_by_turns(evidence: RecordingEvidence, turning: Turning) -> Iterator[CheckFinding]:
+    """Yield the finding of the unit of the rates by the turns of gravity."""
+    stated = evidence.readings.gyroscope
+    ratio = 1.0 / turning.factor
+    wanted = 'in rad/s'
+    convert = 'convert them in the driver'
+    if not stated.is_si:
+        wanted = f'in the stated unit {stated.unit}'
+        convert = 'give the recording that the unit belongs to'
+    observed = (
+        f'angular rates must be {wanted}, they are {significant(ratio)} times the rotation of'
+        ' the measured gravity: '
+    )
+    unit = _unit_of_ratio(ratio * float(np.mean(stated.scale)))
+    if unit and scale_range(ratio) is IMPOSSIBLE:
+        yield wrong_rate_unit(f'{observed}probably {unit}; {convert}', unit)
+    elif 0.6 < ratio / DEG < 1.6:
+        yield wrong_rate_unit(
+            f'{observed}probably converted from deg/s twice; convert them once',
+            f'counts:{DEG:.7g}/(rad/s)',
+        )
+    elif _full_scale_factor(evidence) is not None:
+        return  # `full_scale` reports it
+    elif scale_range(ratio) is IMPOSSIBLE:
+        yield wrong_rate_unit(f'{observed}counts or volts?; {convert}')
+    else:
+        yield CheckFinding(
+            'rate_unit',
+            GOOD,
+            f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}',
         )
 
 
@@ -373,12 +384,11 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     for sensor, part, unit in CHANNELS:
         has_noise = evidence.quiet_range[part] > VISIBLE_NOISE_STEPS * evidence.resolution[part]
         least_end = _least_end(evidence, sensor, has_noise)
-        frozen_readings = _frozen_readings(evidence, sensor)
-        axis_counts = []
-        n_of_sensor = 0
+        # The reading that the sensor repeats in each frozen chunk, shape (n_frozen_chunks, 3).
+        frozen_readings = evidence.chunks.mean[evidence.frozen[sensor], part]
+        n_of_axes = np.zeros(3, int)
         range_end = 0.0
         for axis, ends in enumerate(evidence.ends[part]):
-            n_of_axis = 0
             # The largest readings upwards, and those downwards with the other sign.
             for sign, end in zip((1, -1), ends):
                 # Without visible noise the largest reading must have been reached by large steps.
@@ -386,22 +396,20 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                     continue
                 n_clipped = _n_clipped(end, sign * frozen_readings[:, axis], evidence.chunks.size)
                 if n_clipped:
-                    n_of_axis += n_clipped
+                    n_of_axes[axis] += n_clipped
                     range_end = max(range_end, end.level)
-            if n_of_axis:
-                axis_counts.append(f'{"xyz"[axis]} {n_of_axis}')
-                n_of_sensor += n_of_axis
-        if axis_counts:
+        if n_of_axes.any():
+            listed = ', '.join(f'{axis} {n}' for axis, n in zip('xyz', n_of_axes, strict=True) if n)
             customary = f' ({range_end / STANDARD_GRAVITY:.1f} g)'
             if unit == 'rad/s':
                 customary = f' ({range_end / DEG:.0f} deg/s)'
             yield CheckFinding(
                 'clipping',
                 WARNING,
-                f'the {sensor} clips at {range_end:.4g} {unit}{customary}: {", ".join(axis_counts)}'
+                f'the {sensor} clips at {range_end:.4g} {unit}{customary}: {listed}'
                 ' readings at the end of the range; larger values are lost, move less or choose a'
                 ' wider range',
-                samples=n_of_sensor,
+                samples=int(n_of_axes.sum()),
             )
 
 
@@ -416,15 +424,6 @@ def _least_end(evidence, sensor, has_noise):
         return np.maximum(least_end, LEAST_RANGE)
     rest_force = evidence.force_length or 0.0
     return np.where(has_noise, least_end, LEAST_END_PER_GRAVITY * rest_force)
-
-
-def _frozen_readings(evidence, sensor):
-    """
-    Return the reading that a sensor repeats in each chunk of samples in which it is frozen.
-
-    The readings of the three axes have the shape (n_frozen_chunks, 3).
-    """
-    return evidence.chunks.mean[evidence.frozen[sensor]][:, SENSOR_COLUMNS[sensor]]
 
 
 def _n_clipped(end, frozen_readings, chunk_size):
@@ -513,11 +512,10 @@ def dead_band(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Small rates are measured."""
     bands = evidence.dead_band
     if bands.any():
-        letters = ', '.join(letter for letter, band in zip('xyz', bands, strict=True) if band > 0)
         yield CheckFinding(
             'dead_band',
             WARNING,
-            f'the gyroscope has a dead band on {letters}, rates below'
+            f'the gyroscope has a dead band on {_axes(bands > 0)}, rates below'
             f' {significant(float(bands.max()) / DEG)} deg/s are given as 0: its bias and noise at'
             ' rest are not measured; switch it off in the driver or in the sensor',
         )

@@ -167,6 +167,29 @@ def make_window(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class MotionReadings(AlignedArrays):
+    """Readings and the motion of the joints at the same times."""
+
+    time: np.ndarray
+    """Session time, s, shape (n,)."""
+    force_s: np.ndarray
+    """Measured specific force, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Measured angular rate, rad/s, shape (n, 3)."""
+    motion: JointMotion
+    """Motion of the joints as read."""
+
+
+def motion_readings(windows: Sequence[Window], most: int) -> MotionReadings:
+    """Return every k-th reading of moving windows: about `most`, or all if they are fewer."""
+    readings = MotionReadings.concatenate(
+        MotionReadings(window.time, window.force_s, window.rate_s, window.motion)
+        for window in windows
+    )
+    return readings.select(slice(None, None, max(1, len(readings) // most)))
+
+
 STORED_IN_MEMORY = 64 << 20
 """Bytes of `StoredWindows` in memory; more are moved to a temporary file."""
 

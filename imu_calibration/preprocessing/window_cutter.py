@@ -479,12 +479,11 @@ class WindowCutter:
         With `final` all remaining ones.
         """
         windows = []
-        if self._undecided is not None:
-            if samples is None:
-                samples = self._undecided
-            else:
-                samples = PhasedSamples.concatenate([self._undecided, samples])
-            self._undecided = None
+        if samples is None:
+            samples = self._undecided
+        else:
+            samples = samples.after(self._undecided)
+        self._undecided = None
         if samples is not None and len(samples):
             phase = self._final_phases(samples, final)
             n_final = len(phase)
@@ -509,7 +508,7 @@ class WindowCutter:
         settings = self._settings
         run_phase = samples.phase[starts]
         first_before = _NO_PHASE if self._phase_before is None else self._phase_before
-        phase_before = np.concatenate([[first_before], run_phase[:-1]])
+        phase_before = np.append(first_before, run_phase[:-1])
         phase_before[samples.after_gap[starts]] = _NO_PHASE
 
         phase = samples.phase.copy()
@@ -543,7 +542,7 @@ class WindowCutter:
         use = self._uses(samples, phase)
         if self._open_run is not None:
             open_samples, open_use = self._open_run
-            samples = PhasedSamples.concatenate([open_samples, samples])
+            samples = samples.after(open_samples)
             use = np.append(np.full(len(open_samples), open_use), use)
         windows = []
         for start, stop in _runs(use, samples.after_gap):

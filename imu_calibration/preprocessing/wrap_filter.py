@@ -74,8 +74,7 @@ class WrapFilter:
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return the samples with a decision; those after a step are buffered until it returns."""
-        if self._newest is not None:
-            samples = type(samples).concatenate([self._newest, samples])
+        samples = samples.after(self._newest)
         self._newest = samples
         spans, open_ns = self._spans(samples)
         stop = max(len(samples) - WRAP_REACH, 0)

@@ -29,9 +29,8 @@ class ZeroFilter:
 
     def push(self, samples: ImuSamples) -> ImuSamples:
         """Return the samples that pass; a run at the end waits until its length is known."""
-        if self._open_run is not None:
-            samples = ImuSamples.concatenate([self._open_run, samples])
-            self._open_run = None
+        samples = samples.after(self._open_run)
+        self._open_run = None
         has_force = np.asarray(samples.force_s.any(axis=1))
         zero = np.asarray(~has_force & ~samples.rate_s.any(axis=1))
         if not self._has_measured:

@@ -66,7 +66,7 @@ def test_dead_reckoning_of_constant_and_circular_motion():
     velocity, position = strapdown.dead_reckon(time, np.tile([0.2, 0, G], (len(time), 1)), G)
     np.testing.assert_allclose(velocity[:, 0], 0.2 * time, atol=1e-12)
     np.testing.assert_allclose(position[-1], [10.0, 0, 0], atol=1e-9)
-    assert strapdown.constant_error_growth(0.2, 10.0) == pytest.approx((2.0, 10.0))
+    assert zhang.constant_error_growth(0.2, 10.0) == pytest.approx((2.0, 10.0))
     swing = np.column_stack([np.sin(2 * time), 0 * time, np.full(len(time), G)])
     velocity, position = strapdown.dead_reckon(time, swing, G)
     np.testing.assert_allclose(velocity[:, 0], (1 - np.cos(2 * time)) / 2, atol=1e-5)
@@ -118,14 +118,14 @@ def test_n1_static_navigation_with_the_sensors_own_drift():
 
 def test_n1_table_2_explains_the_printed_curve():
     """The printed 4 m/s and 100 m are the z channel before compensation after 47.4 s."""
-    velocity, position = strapdown.constant_error_growth(abs(zhang.TABLE_2_G[2, 0]) * G, 47.4)
+    velocity, position = zhang.constant_error_growth(abs(zhang.TABLE_2_G[2, 0]) * G, 47.4)
     show('N1', 'Table 2 z before, 47.4 s: m/s, m', [velocity, position], '4.23 100.4')
     assert (velocity, position) == (pytest.approx(4.23, abs=0.01), pytest.approx(100.4, abs=0.1))
 
 
 def test_n2_a_spin_about_a_body_axis_does_not_drift():
     growth = zhang.spin_growth(COSINES, ARMS, (1, 0, 0))
-    level, body = strapdown.largest(growth['level'][0]), strapdown.largest(growth['body'][0])
+    level, body = zhang.largest(growth['level'][0]), zhang.largest(growth['body'][0])
     show(
         'N2',
         'x spin 100 deg/s, 100 s: level frame, body sum, m/s',
@@ -135,7 +135,7 @@ def test_n2_a_spin_about_a_body_axis_does_not_drift():
     show(
         'N2',
         'positions, m',
-        [strapdown.largest(growth['level'][1]), strapdown.largest(growth['body'][1])],
+        [zhang.largest(growth['level'][1]), zhang.largest(growth['body'][1])],
         '2.4 185',
     )
     assert (level, body) == (pytest.approx(0.048, rel=0.02), pytest.approx(3.69, rel=0.02))
