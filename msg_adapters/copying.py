@@ -198,11 +198,7 @@ class _Patch:
         A zero stamp counts as the time of arrival. `received_ns`: shape (n,).
         """
         nothing = np.zeros(0, dtype=int), packed.select(np.zeros(0, dtype=int))
-        # Messages of one layout are decoded together; messages of other IMUs are not changed.
-        groups, n_broken = group_by_layout(packed, find_imu_layout)
-        if n_broken:
-            self.dropped['Imu message that cannot be decoded'] += n_broken
-        groups = [group for group in groups if self.choice.wants(group[0].names[0], len(group[1]))]
+        groups = self._wanted_groups(packed)
         if not groups:
             return nothing
         # Message of each sample, ascending.
@@ -213,17 +209,12 @@ class _Patch:
 
         # Without excluded times.
         if self.keep is not None:
-            kept = self.keep(stamp_ns)
-            if not kept.any():
+            is_used = self.keep(stamp_ns)
+            if not is_used.any():
                 return nothing
-            kept_groups = []
-            for layout, index, group in groups:
-                kept_of_group = kept[np.searchsorted(message_of_sample, index)]
-                kept_messages = group.select(np.flatnonzero(kept_of_group))
-                kept_groups.append((layout, index[kept_of_group], kept_messages))
-            groups = kept_groups
-            message_of_sample = message_of_sample[kept]
-            samples = samples.select(kept)
+            message_of_sample = message_of_sample[is_used]
+            samples = samples.select(is_used)
+            groups = _groups_of(groups, message_of_sample)
 
         # Correct all samples in order of time, then patch the bytes of each layout.
         if self.other is not None:
@@ -243,6 +234,13 @@ class _Patch:
         # From the order of the groups to that of the messages.
         order = np.argsort(np.concatenate([index for _, index, _ in groups]))
         return message_of_sample, Packed.chain(tables).select(order)
+
+    def _wanted_groups(self, packed: Packed) -> list[LayoutGroup]:
+        """Return the messages that are corrected, by layout; those of other IMUs are unchanged."""
+        groups, n_broken = group_by_layout(packed, find_imu_layout)
+        if n_broken:
+            self.dropped['Imu message that cannot be decoded'] += n_broken
+        return [group for group in groups if self.choice.wants(group[0].names[0], len(group[1]))]
 
     def _fields(
         self,
@@ -279,16 +277,35 @@ class _Patch:
                     absent[quantity], measured_cov[quantity], after
                 )
         if self.mat_ts is not None:
-            mat_ts = np.asarray(self.mat_ts)
-            orientation_cov = layout.column(packed, 'orientation_cov')
-            fields['orientation'] = _orientation_of_target(
-                layout.column(packed, 'orientation'), orientation_cov[:, 0], mat_ts.T
-            )
-            turned = (mat_ts @ orientation_cov.reshape(-1, 3, 3) @ mat_ts.T).reshape(-1, 9)
-            fields['orientation_cov'] = np.where(
-                orientation_cov[:, :1] == -1.0, orientation_cov, turned
-            )
+            fields |= _orientation_fields(layout, packed, np.asarray(self.mat_ts))
         return fields
+
+
+LayoutGroup = tuple[MessageLayout, np.ndarray, Packed]
+"""A layout, the index of its messages, ascending, and these messages."""
+
+
+def _groups_of(groups: list[LayoutGroup], used: np.ndarray) -> list[LayoutGroup]:
+    """Return the groups without the messages whose index is not in `used`."""
+    used_groups = []
+    for layout, index, group in groups:
+        is_used = np.isin(index, used)
+        if is_used.any():
+            used_groups.append((layout, index[is_used], group.select(np.flatnonzero(is_used))))
+    return used_groups
+
+
+def _orientation_fields(
+    layout: MessageLayout, packed: Packed, mat_ts: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the orientation and its covariance in the target frame; absent ones unchanged."""
+    covariance = layout.column(packed, 'orientation_cov')
+    quaternion = layout.column(packed, 'orientation')
+    turned = (mat_ts @ covariance.reshape(-1, 3, 3) @ mat_ts.T).reshape(-1, 9)
+    return {
+        'orientation': _orientation_of_target(quaternion, covariance[:, 0], mat_ts.T),
+        'orientation_cov': np.where(covariance[:, :1] == -1.0, covariance, turned),
+    }
 
 
 def _bytes_of(values: np.ndarray, dtype: str) -> np.ndarray:

@@ -10,7 +10,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import SI_UNITS
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.files import write_whole
-from msg_adapters.csv_log import CORRECTED, SENSOR_OF, CsvLog, name_with_unit, split_cells
+from msg_adapters.csv_log import CORRECTED, SENSOR_OF, CsvLog, LogText, name_with_unit, split_cells
 
 
 def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSamples) -> None:
@@ -43,27 +43,16 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
             ' for a bag',
             code='csv_rows',
         )
-    # White space is no delimiter of names that contain it.
-    delimiter = '\t' if text.delimiter is None else text.delimiter
     readings = {}
     for quantity, values in (('force', corrected.force_s), ('rate', corrected.rate_s)):
         if quantity in text.places:
             readings[quantity] = values
 
-    # The header states the unit of each column that was read.
-    names = list(text.names)
-    for columns in text.columns:
-        if columns.quantity == 'time' and len(columns.names) == 2:
-            continue  # seconds and nanoseconds
-        for place in text.places.get(columns.quantity, ()):
-            unit = columns.unit
-            if columns.quantity in SENSOR_OF:
-                unit = f'{SI_UNITS[SENSOR_OF[columns.quantity]]} {CORRECTED}'
-            # A date or a time of day has no unit.
-            if unit is not None and (columns.quantity != 'time' or _is_number(text, place)):
-                names[place] = name_with_unit(names[place], columns.quantity, unit)
     out = io.StringIO()
+    # White space is no delimiter of names that contain it.
+    delimiter = '\t' if text.delimiter is None else text.delimiter
     writer = csv.writer(out, delimiter=delimiter, lineterminator='\n')
+    names = _corrected_header(text)
     writer.writerow(names)
 
     # Rows as they were read, with new cells of force and rate.
@@ -75,6 +64,22 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
                 cells[place] = _number(value, text.decimal_comma)
         writer.writerow(cells)
     write_whole(path, out.getvalue().encode())
+
+
+def _corrected_header(text: LogText) -> list[str]:
+    """Return the names of all columns, with the unit of each column that was read."""
+    names = list(text.names)
+    for columns in text.columns:
+        if columns.quantity == 'time' and len(columns.names) == 2:
+            continue  # seconds and nanoseconds
+        for place in text.places.get(columns.quantity, ()):
+            unit = columns.unit
+            if columns.quantity in SENSOR_OF:
+                unit = f'{SI_UNITS[SENSOR_OF[columns.quantity]]} {CORRECTED}'
+            # A date or a time of day has no unit.
+            if unit is not None and (columns.quantity != 'time' or _is_number(text, place)):
+                names[place] = name_with_unit(names[place], columns.quantity, unit)
+    return names
 
 
 def _is_number(text, place):

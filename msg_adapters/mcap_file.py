@@ -9,7 +9,6 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,16 +17,45 @@ from imu_calibration.core.documents import open_regular
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from msg_adapters.compression import decompress_chunk, largest_content
 from msg_adapters.layout import Packed, clean_name, overlapping
-from msg_adapters.storage import StorageFile, Stretch, read_ahead
+from msg_adapters.storage import StorageFile, Stretch, read_ahead, type_with_encoding
 
 MAGIC = b'\x89MCAP0\r\n'
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
-STATISTICS, DATA_END = 0x0B, 0x0F
-LAST_OPCODE = 0x0F
+STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(0x0B, 0x10)
+LAST_OPCODE = DATA_END
+# Fixed parts at the beginning of records; times are in ns.
 PREFIX = struct.Struct('<BQ')
 """Opcode and length of the content, in front of every record."""
-MESSAGE_PREFIX = PREFIX.size + 22
-"""Bytes of a Message record in front of its data: prefix, channel, sequence, two times."""
+LENGTH_AT = 1
+"""Offset of the length in the prefix."""
+SCHEMA_HEAD = struct.Struct('<H')
+"""Id, before the strings."""
+CHANNEL_HEAD = struct.Struct('<HH')
+"""Id and id of the schema, before the strings."""
+TIMES = struct.Struct('<QQ')
+"""Receive and publish time of a message, before its data; first and last time of a chunk."""
+MESSAGE_HEAD_SIZE = struct.calcsize('<HI') + TIMES.size
+"""Bytes of channel, sequence and `TIMES`, before the data."""
+MESSAGE_PREFIX = PREFIX.size + MESSAGE_HEAD_SIZE
+"""Bytes of a Message record before its data."""
+CHUNK_SIZES = struct.Struct('<QI')
+"""Size and checksum of the decompressed records of a chunk, after `TIMES`."""
+SIZE = struct.Struct('<Q')
+STRING_HEAD = struct.Struct('<I')
+"""Length of a string, before its bytes."""
+INDEX_HEAD = struct.Struct('<HI')
+"""Of a MessageIndex: channel, bytes of the pairs (time, offset) that follow."""
+CHUNK_INDEX_HEAD = struct.Struct('<QQQ')
+"""First and last time, and position of the chunk."""
+STATISTICS_HEAD = struct.Struct('<QHIIIIQQI')
+"""
+Numbers of messages, schemas, channels, attachments, metadata and chunks; first and last time; bytes
+of the `OF_CHANNEL` pairs that follow.
+"""
+OF_CHANNEL = struct.Struct('<HQ')
+"""Channel and a number: its messages, or the position of its index."""
+FOOTER_CONTENT = struct.Struct('<QQI')
+"""Positions of the summary and of its offsets, and its checksum."""
 MOST_OTHERS = 1 << 17
 """
 Records that are not messages in one buffer; there are at most 65,536 schemas and as many channels.
@@ -105,15 +133,15 @@ class McapDamage(Exception):
 
 def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
     """Return (id, Schema) from the content of a Schema record."""
-    (number,) = struct.unpack_from('<H', content)
-    name, encoding, text = _strings(content, 2, 3)
+    (number,) = SCHEMA_HEAD.unpack_from(content)
+    name, encoding, text = _strings(content, SCHEMA_HEAD.size, 3)
     return number, Schema(clean_name(name), clean_name(encoding), text.decode(errors='replace'))
 
 
 def parse_channel(content: bytes | memoryview) -> tuple[int, Channel]:
     """Return (id, Channel) from the content of a Channel record."""
-    number, schema_id = struct.unpack_from('<HH', content)
-    topic, encoding = map(clean_name, _strings(content, 4, 2))
+    number, schema_id = CHANNEL_HEAD.unpack_from(content)
+    topic, encoding = map(clean_name, _strings(content, CHANNEL_HEAD.size, 2))
     return number, Channel(schema_id, topic, encoding)
 
 
@@ -121,17 +149,18 @@ def parse_message_index(content: bytes) -> tuple[int, np.ndarray]:
     """
     Return (channel id, offsets of its Message records in the chunk) from a MessageIndex record.
     """
-    channel, length = struct.unpack_from('<HI', content)
-    entries = np.frombuffer(content, dtype='<u8', count=length // 8, offset=6)
+    channel, length = INDEX_HEAD.unpack_from(content)
+    entries = np.frombuffer(content, dtype='<u8', count=length // 8, offset=INDEX_HEAD.size)
     return channel, entries[1::2].astype(np.int64)
 
 
 def parse_statistics(content: bytes) -> Statistics:
     """Return the Statistics from the content of a Statistics record."""
-    first_ns, last_ns = struct.unpack_from('<QQ', content, 26)
-    (n_bytes,) = struct.unpack_from('<I', content, 42)
-    counts = dict(struct.iter_unpack('<HQ', content[46 : 46 + n_bytes]))
-    return Statistics(first_ns, last_ns, counts)
+    *_, first_ns, last_ns, n_bytes = STATISTICS_HEAD.unpack_from(content)
+    start = STATISTICS_HEAD.size
+    return Statistics(
+        first_ns, last_ns, dict(OF_CHANNEL.iter_unpack(content[start : start + n_bytes]))
+    )
 
 
 def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
@@ -152,12 +181,14 @@ def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
 
     """
     try:
-        size, crc, name_length = struct.unpack_from('<QII', content, 16)
-        compression = bytes(content[32 : 32 + name_length]).decode()
-        (packed_size,) = struct.unpack_from('<Q', content, 32 + name_length)
+        size, crc = CHUNK_SIZES.unpack_from(content, TIMES.size)
+        (name,) = _strings(content, TIMES.size + CHUNK_SIZES.size, 1)
+        compression = name.decode()
+        start = TIMES.size + CHUNK_SIZES.size + STRING_HEAD.size + len(name)
+        (packed_size,) = SIZE.unpack_from(content, start)
     except (struct.error, UnicodeDecodeError):
         raise McapDamage('a chunk without its header') from None
-    start = 40 + name_length
+    start += SIZE.size
     packed = content[start : start + packed_size]
     try:
         records = packed if compression == '' else decompress_chunk(compression, packed, size)
@@ -199,7 +230,7 @@ def indexed_messages(buffer: np.ndarray, indexes: MessageIndexes) -> ChannelMess
     if not len(offset) or offset[0] < 0 or offset[-1] + MESSAGE_PREFIX > len(buffer):
         return None
     # The records follow each other without a gap, from the first byte to the last one.
-    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
+    length = _record_lengths(buffer, offset)
     next_offset = np.append(offset[1:], len(buffer))
     if offset[0] != 0 or not np.array_equal(offset + PREFIX.size + length, next_offset):
         return None
@@ -207,7 +238,17 @@ def indexed_messages(buffer: np.ndarray, indexes: MessageIndexes) -> ChannelMess
         return None
     if (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any():
         return None
-    return channel, Packed(buffer, offset + MESSAGE_PREFIX, length - 22)
+    return channel, _packed_messages(buffer, offset, length)
+
+
+def _record_lengths(buffer: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return the lengths of the contents of the records at offsets in a buffer, int64."""
+    return overlapping(buffer, '<u8')[offset + LENGTH_AT].astype(np.int64)
+
+
+def _packed_messages(buffer: np.ndarray, offset: np.ndarray, length: np.ndarray) -> Packed:
+    """Return the messages of Message records at offsets in a buffer, with these lengths."""
+    return Packed(buffer, offset + MESSAGE_PREFIX, length - MESSAGE_HEAD_SIZE)
 
 
 def walk(buffer: np.ndarray) -> Walk:
@@ -217,7 +258,7 @@ def walk(buffer: np.ndarray) -> Walk:
     Runs of one size are parsed at once. `buffer`: uint8, shape (n_bytes,).
     """
     view = buffer.data
-    offsets = []
+    offsets = [np.zeros(0, np.int64)]
     others = []
     position = 0
     last_length = -1
@@ -226,9 +267,8 @@ def walk(buffer: np.ndarray) -> Walk:
     while position + PREFIX.size <= end:
         opcode, length = PREFIX.unpack_from(view, position)
         record_end = position + PREFIX.size + length
-        if not is_record(opcode) or opcode in (CHUNK, DATA_END, FOOTER):
-            break
-        if record_end > end:
+        is_last = opcode in (CHUNK, DATA_END, FOOTER)
+        if is_last or not is_record(opcode) or record_end > end:
             break
         if opcode != MESSAGE:
             if len(others) == MOST_OTHERS:
@@ -236,8 +276,7 @@ def walk(buffer: np.ndarray) -> Walk:
             others.append((opcode, bytes(view[position + PREFIX.size : record_end])))
             position = record_end
             continue
-        # Channel, sequence and two times have 22 bytes.
-        if length < 22:
+        if length < MESSAGE_HEAD_SIZE:
             break
         n_of_length = n_of_length + 1 if length == last_length else 0
         last_length = length
@@ -251,20 +290,16 @@ def walk(buffer: np.ndarray) -> Walk:
         n_of_length += len(run_offsets) - 1
         position = int(run_offsets[-1]) + stride
 
-    if not offsets:
-        nothing = np.zeros(0, np.int64)
-        return Walk(nothing, Packed(buffer[:position], nothing, nothing), others, position)
-    # Length and channel of each message.
     offset = np.concatenate(offsets)
-    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
     channel = overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64)
-    messages = Packed(buffer[:position], offset + MESSAGE_PREFIX, length - 22)
+    length = _record_lengths(buffer, offset)
+    messages = _packed_messages(buffer[:position], offset, length)
     return Walk(channel, messages, others, position)
 
 
 def log_times(messages: Packed, index: np.ndarray) -> np.ndarray:
     """Return the receive times of some messages in their records, int64."""
-    return overlapping(messages.buffer, '<i8')[messages.start[index] - 16]
+    return overlapping(messages.buffer, '<i8')[messages.start[index] - TIMES.size]
 
 
 def is_record(opcode: int) -> bool:
@@ -280,7 +315,7 @@ def _run_offsets(buffer: np.ndarray, position: int, stride: int, most: int) -> n
     """
     n_fitting = (len(buffer) - position) // stride
     offset = position + stride * np.arange(min(n_fitting, most))
-    same_length = overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size
+    same_length = overlapping(buffer, '<u8')[offset + LENGTH_AT] == stride - PREFIX.size
     same = (buffer[offset] == MESSAGE) & same_length
     if same.all():
         return offset
@@ -291,9 +326,10 @@ def _strings(content: bytes | memoryview, position: int, count: int) -> list[byt
     """Return `count` consecutive strings with their lengths in front, from `position` on."""
     texts = []
     for _ in range(count):
-        (length,) = struct.unpack_from('<I', content, position)
-        texts.append(bytes(content[position + 4 : position + 4 + length]))
-        position += 4 + length
+        (length,) = STRING_HEAD.unpack_from(content, position)
+        start = position + STRING_HEAD.size
+        position = start + length
+        texts.append(bytes(content[start:position]))
     return texts
 
 
@@ -304,32 +340,21 @@ other record is between them, otherwise reduced, so that few bytes are read twic
 """
 CHUNK_STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
-FOOTER_SIZE = PREFIX.size + 20
+FOOTER_SIZE = PREFIX.size + FOOTER_CONTENT.size + len(MAGIC)
+"""Bytes of the Footer record and of the end of the file."""
 
 
 class McapFile(StorageFile):
-    """
-    One .mcap file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    unpack : callable, optional
-        Bytes -> bytes for each message (compression by message).
-
-    """
+    """One .mcap file."""
 
     def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
-        self.path = Path(path)
-        self.unpack = unpack
+        super().__init__(path, unpack)
         self.file = open_regular(path)
         self.size = os.fstat(self.file.fileno()).st_size
         self.schemas: dict[int, Schema] = {}
         """Schema id -> Schema."""
         self.channels: dict[int, Channel] = {}
         """Channel id -> Channel."""
-        self.lost = {}
         self.chunk_starts: list[int] = []
         """Positions of the chunks by the summary, ascending."""
         self.n_unpacked = 0
@@ -348,14 +373,12 @@ class McapFile(StorageFile):
 
     @property
     def types(self) -> dict[str, str]:
-        """Topic -> message type; serializations other than CDR are named after the type."""
+        """Topic -> message type (`type_with_encoding`)."""
         types = {}
         for channel in self.channels.values():
             schema = self.schemas.get(channel.schema_id)
             name = 'unknown' if schema is None else schema.name
-            if channel.encoding != 'cdr':
-                name = f'{name} ({channel.encoding})'
-            types[channel.topic] = name
+            types[channel.topic] = type_with_encoding(name, channel.encoding)
         return types
 
     @property
@@ -394,11 +417,7 @@ class McapFile(StorageFile):
         wanted = {number for topic in topics for number in channels_of_topic.get(topic, ())}
         with closing(read_ahead(self._joined_pieces(wanted))) as pieces:
             for channel, packed in pieces:
-                yield Stretch(
-                    channel,
-                    lambda index, packed=packed: (index, packed.select(index)),
-                    partial(log_times, packed),
-                )
+                yield Stretch(channel, packed, partial(log_times, packed))
 
     def _joined_pieces(self, wanted: set[int]) -> Generator[ChannelMessages, None, None]:
         """Yield the pairs of `_pieces`, joined to at least `CHUNK_STRETCH_BYTES`."""
@@ -422,7 +441,7 @@ class McapFile(StorageFile):
         """
         for record in self._records():
             if record.opcode == CHUNK:
-                indexes = self._indexes_at(record.position + record.length)
+                indexes = self._indexes_of(record)
                 if not indexes or any(number in wanted for number, _ in indexes):
                     yield from self._chunk(record, indexes)
             elif record.run is not None:
@@ -515,12 +534,13 @@ class McapFile(StorageFile):
         place = bisect_right(self.chunk_starts, position)
         return self.chunk_starts[place] if place < len(self.chunk_starts) else None
 
-    def _indexes_at(self, position: int) -> MessageIndexes:
+    def _indexes_of(self, chunk: McapRecord) -> MessageIndexes:
         """
-        Return (channel id, offsets) from the MessageIndex records that start at `position`.
+        Return (channel id, offsets) from the MessageIndex records that follow a chunk.
 
         Empty where one of them is damaged.
         """
+        position = chunk.position + chunk.length
         indexes = []
         while True:
             opcode, length = self._prefix(position)
@@ -534,14 +554,10 @@ class McapFile(StorageFile):
 
     def _read_summary(self):
         """Read channels, counts and positions of chunks from the summary, when the file has one."""
-        footer = self._read(max(self.size - FOOTER_SIZE - len(MAGIC), 0), FOOTER_SIZE + len(MAGIC))
-        if (
-            len(footer) < FOOTER_SIZE + len(MAGIC)
-            or footer[FOOTER_SIZE:] != MAGIC
-            or footer[0] != FOOTER
-        ):
+        footer = self._read(max(self.size - FOOTER_SIZE, 0), FOOTER_SIZE)
+        if len(footer) < FOOTER_SIZE or not footer.endswith(MAGIC) or footer[0] != FOOTER:
             return
-        (start,) = struct.unpack_from('<Q', footer, PREFIX.size)
+        start, *_ = FOOTER_CONTENT.unpack_from(footer, PREFIX.size)
         if not len(MAGIC) <= start < self.size:
             return
         summary = walk(np.frombuffer(self._read(start, self.size - start), np.uint8))
@@ -549,7 +565,8 @@ class McapFile(StorageFile):
             if opcode == STATISTICS:
                 self.statistics = parse_statistics(content)
             elif opcode == CHUNK_INDEX:
-                self.chunk_starts.append(struct.unpack_from('<Q', content, 16)[0])
+                _, _, chunk_start = CHUNK_INDEX_HEAD.unpack_from(content)
+                self.chunk_starts.append(chunk_start)
         self._register(summary.others)
         self.chunk_starts.sort()
 
@@ -560,7 +577,7 @@ class McapFile(StorageFile):
         counts = Counter()
         for record in self._records():
             if record.opcode == CHUNK:
-                indexes = self._indexes_at(record.position + record.length)
+                indexes = self._indexes_of(record)
                 # A channel that is still unknown may be defined in the chunk.
                 if indexes and all(number in self.channels for number, _ in indexes):
                     counts.update({number: len(offsets) for number, offsets in indexes})

@@ -10,9 +10,38 @@ import numpy as np
 from msg_adapters.compression import compressor
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed, overlapping
-from msg_adapters.mcap_file import MAGIC
+from msg_adapters.mcap_file import (
+    CHANNEL,
+    CHANNEL_HEAD,
+    CHUNK,
+    CHUNK_INDEX,
+    CHUNK_INDEX_HEAD,
+    CHUNK_SIZES,
+    DATA_END,
+    FOOTER,
+    FOOTER_CONTENT,
+    HEADER,
+    INDEX_HEAD,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD_SIZE,
+    MESSAGE_INDEX,
+    METADATA,
+    METADATA_INDEX,
+    OF_CHANNEL,
+    PREFIX,
+    SCHEMA,
+    SCHEMA_HEAD,
+    SIZE,
+    STATISTICS,
+    STATISTICS_HEAD,
+    STRING_HEAD,
+    SUMMARY_OFFSET,
+    TIMES,
+)
 
 CHUNK_SIZE = 1 << 20
+NO_CHECKSUM = bytes(4)
 MESSAGE_HEADER = np.dtype(
     [
         ('opcode', 'u1'),
@@ -29,13 +58,13 @@ MESSAGE_HEADER = np.dtype(
 def prefixed_string(value: bytes | str) -> bytes:
     """A string with its length in front."""
     data = value if isinstance(value, bytes) else value.encode()
-    return struct.pack('<I', len(data)) + data
+    return STRING_HEAD.pack(len(data)) + data
 
 
 def record(opcode: int, *parts: bytes) -> bytes:
     """One record: opcode, length, content."""
     content = b''.join(parts)
-    return struct.pack('<BQ', opcode, len(content)) + content
+    return PREFIX.pack(opcode, len(content)) + content
 
 
 class McapWriter:
@@ -46,7 +75,7 @@ class McapWriter:
         self.compression = compression
         self.compress = compressor(compression)
         self.file.write(
-            MAGIC + record(0x01, prefixed_string('ros2'), prefixed_string('imu_calibration'))
+            MAGIC + record(HEADER, prefixed_string('ros2'), prefixed_string('imu_calibration'))
         )
         self.schemas: dict[str, tuple[int, bytes]] = {}
         """Message type -> (id, Schema record)."""
@@ -61,8 +90,8 @@ class McapWriter:
         """Declare a topic; `definition` is a TypeDefinition."""
         if definition.type not in self.schemas:
             schema = record(
-                0x03,
-                struct.pack('<H', len(self.schemas) + 1),
+                SCHEMA,
+                SCHEMA_HEAD.pack(len(self.schemas) + 1),
                 prefixed_string(definition.type),
                 prefixed_string(definition.encoding),
                 prefixed_string(definition.text),
@@ -76,8 +105,8 @@ class McapWriter:
             + prefixed_string(definition.digest)
         )
         channel = record(
-            0x04,
-            struct.pack('<HH', topic_id, self.schemas[definition.type][0]),
+            CHANNEL,
+            CHANNEL_HEAD.pack(topic_id, self.schemas[definition.type][0]),
             prefixed_string(name),
             prefixed_string('cdr'),
             prefixed_string(metadata),
@@ -88,8 +117,8 @@ class McapWriter:
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
         headers = np.zeros(len(messages), dtype=MESSAGE_HEADER)
-        headers['opcode'] = 0x05
-        headers['length'] = messages.size + 22
+        headers['opcode'] = MESSAGE
+        headers['length'] = messages.size + MESSAGE_HEAD_SIZE
         headers['channel'] = topic_ids
         headers['log_ns'] = received_ns
         headers['publish_ns'] = received_ns
@@ -119,12 +148,16 @@ class McapWriter:
         offset += len(self.new_records)
         self.new_records = b''
         packed = self.compress(content)
-        times = struct.pack('<QQ', int(headers['log_ns'].min()), int(headers['log_ns'].max()))
-        sizes = prefixed_string(self.compression) + struct.pack('<Q', len(packed))
+        times = int(headers['log_ns'].min()), int(headers['log_ns'].max())
+        sizes = prefixed_string(self.compression) + SIZE.pack(len(packed))
         start = self.file.tell()
         self.file.write(
             record(
-                0x06, times, struct.pack('<QI', len(content), zlib.crc32(content)), sizes, packed
+                CHUNK,
+                TIMES.pack(*times),
+                CHUNK_SIZES.pack(len(content), zlib.crc32(content)),
+                sizes,
+                packed,
             )
         )
         chunk_length = self.file.tell() - start
@@ -132,13 +165,13 @@ class McapWriter:
         indexes_length = self.file.tell() - start - chunk_length
         self.chunk_indexes.append(
             record(
-                0x08,
-                times,
-                struct.pack('<QQ', start, chunk_length),
+                CHUNK_INDEX,
+                CHUNK_INDEX_HEAD.pack(*times, start),
+                SIZE.pack(chunk_length),
                 prefixed_string(places),
-                struct.pack('<Q', indexes_length),
+                SIZE.pack(indexes_length),
                 sizes,
-                struct.pack('<Q', len(content)),
+                SIZE.pack(len(content)),
             )
         )
 
@@ -153,9 +186,9 @@ class McapWriter:
             of_channel = headers['channel'] == channel
             log_ns = headers['log_ns'][of_channel]
             entries = np.stack([log_ns, offset[of_channel].astype('<u8')], axis=1)
-            places += struct.pack('<HQ', channel, self.file.tell())
+            places += OF_CHANNEL.pack(channel, self.file.tell())
             self.file.write(
-                record(0x07, struct.pack('<H', channel), prefixed_string(entries.tobytes()))
+                record(MESSAGE_INDEX, INDEX_HEAD.pack(channel, entries.nbytes), entries.tobytes())
             )
         return places
 
@@ -165,20 +198,19 @@ class McapWriter:
             self.file.write(self.new_records)
         metadata_start = self.file.tell()
         content = record(
-            0x0C,
+            METADATA,
             prefixed_string('rosbag2'),
             prefixed_string(prefixed_string('serialized_metadata') + prefixed_string(metadata)),
         )
-        self.file.write(content + record(0x0F, struct.pack('<I', 0)))
+        self.file.write(content + record(DATA_END, NO_CHECKSUM))
         counts = b''.join(
-            struct.pack('<HQ', channel, entry['message_count'])
+            OF_CHANNEL.pack(channel, entry['message_count'])
             for channel, entry in zip(
                 self.channels, information['topics_with_message_count'], strict=True
             )
         )
         first_ns = information['starting_time']['nanoseconds_since_epoch']
-        statistics = struct.pack(
-            '<QHIIIIQQ',
+        statistics = STATISTICS_HEAD.pack(
             information['message_count'],
             len(self.schemas),
             len(self.channels),
@@ -187,26 +219,27 @@ class McapWriter:
             len(self.chunk_indexes),
             first_ns,
             first_ns + information['duration']['nanoseconds'],
+            len(counts),
         )
         groups = {
-            0x03: [schema for _, schema in self.schemas.values()],
-            0x04: list(self.channels.values()),
-            0x08: self.chunk_indexes,
-            0x0D: [
+            SCHEMA: [schema for _, schema in self.schemas.values()],
+            CHANNEL: list(self.channels.values()),
+            CHUNK_INDEX: self.chunk_indexes,
+            METADATA_INDEX: [
                 record(
-                    0x0D,
+                    METADATA_INDEX,
                     struct.pack('<QQ', metadata_start, len(content)),
                     prefixed_string('rosbag2'),
                 )
             ],
-            0x0B: [record(0x0B, statistics, prefixed_string(counts))],
+            STATISTICS: [record(STATISTICS, statistics, counts)],
         }
         summary_start = self.file.tell()
         offsets = self._write_groups(groups)
         offset_start = self.file.tell()
         self.file.write(
             b''.join(offsets)
-            + record(0x02, struct.pack('<QQI', summary_start, offset_start, 0))
+            + record(FOOTER, FOOTER_CONTENT.pack(summary_start, offset_start, 0))
             + MAGIC
         )
         self.file.close()
@@ -219,7 +252,9 @@ class McapWriter:
             self.file.write(b''.join(records))
             if records:
                 offsets.append(
-                    record(0x0E, struct.pack('<BQQ', opcode, start, self.file.tell() - start))
+                    record(
+                        SUMMARY_OFFSET, struct.pack('<BQQ', opcode, start, self.file.tell() - start)
+                    )
                 )
         return offsets
 

@@ -26,7 +26,7 @@ from imu_calibration.core.documents import open_regular
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed, clean_name
-from msg_adapters.storage import StorageFile, Stretch
+from msg_adapters.storage import StorageFile, Stretch, type_with_encoding
 
 BATCH_ROWS = 256
 """Rows per ``fetchmany``; the objects of more rows do not fit into the cache of the processor."""
@@ -66,22 +66,10 @@ MOST_TOPICS = 100_000
 
 
 class SqliteFile(StorageFile):
-    """
-    One .db3 file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    unpack : callable, optional
-        Bytes -> bytes for each message (compression by message).
-
-    """
+    """One .db3 file."""
 
     def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
-        self.path = Path(path)
-        self.unpack = unpack
-        self.lost = {}
+        super().__init__(path, unpack)
         log = Path(f'{path}-wal')
         self.logged = log.exists() and log.stat().st_size > 0
         """Whether rows of a write-ahead log are read too."""
@@ -138,7 +126,7 @@ class SqliteFile(StorageFile):
         self._require_tables()
         self.topic_ids = defaultdict(list)
         self.types: dict[str, str] = {}
-        """Topic -> message type; serializations other than CDR are named after the type."""
+        """Topic -> message type (`type_with_encoding`)."""
         self.definitions: dict[str, tuple[str, str]] = {}
         """Message type -> (language, text)."""
         rows = self.connection.execute(
@@ -151,9 +139,7 @@ class SqliteFile(StorageFile):
                 continue
             topic = clean_name(name)
             self.topic_ids[topic].append(topic_id)
-            if encoding != 'cdr':
-                message_type = f'{message_type} ({encoding})'
-            self.types[topic] = clean_name(message_type)
+            self.types[topic] = clean_name(type_with_encoding(message_type, encoding))
         with suppress(sqlite3.Error):  # before schema version 4 there are no definitions
             rows = self.connection.execute(
                 'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
@@ -224,21 +210,21 @@ class SqliteFile(StorageFile):
         self._n_steps = 0
         """Steps behind damage in the present scan."""
         rows_of_stretch = RANGE_IDS // 2 if len(wanted) == 1 else STRETCH_ROWS
-        # Bytes of the messages of the scan.
-        n_scanned = 0
+        n_scanned = 0  # bytes of the messages of the scan
         # Parts of the present stretch, their rows and bytes.
         parts: list[Part] = []
         n_rows = 0
         n_bytes = 0
         for part in self._parts(wanted):
-            n_scanned += len(part.messages)
+            part_bytes = len(part.packed.buffer)
+            n_scanned += part_bytes
             # More messages than the file can hold: damaged rows refer to the same pages.
             if n_scanned > self.size:
                 self._lose(f'rest {UNKNOWN_EXTENT} after rows that share their pages', 1)
                 break
             parts.append(part)
-            n_rows += len(part.sizes)
-            n_bytes += len(part.messages)
+            n_rows += len(part.packed)
+            n_bytes += part_bytes
             if n_rows >= rows_of_stretch or n_bytes >= STRETCH_BYTES:
                 yield _stretch(parts)
                 parts = []
@@ -305,8 +291,9 @@ class SqliteFile(StorageFile):
                 count, longest, messages = self.connection.execute(statement, ids).fetchone()
                 if longest is None or len(messages) != count * longest:
                     return after
+                packed = Packed.of_sizes(messages, np.full(count, longest))
                 times = partial(self._times, f'SELECT timestamp {rows_of_range}', ids)
-                yield Part(messages, np.full(count, longest), np.full(count, topic_id), times)
+                yield Part(packed, np.full(count, topic_id), times)
             return until
         except sqlite3.Error:
             return after
@@ -364,12 +351,12 @@ class SqliteFile(StorageFile):
         """
         _, topic_ids, times, messages = zip(*rows, strict=True)
         # Usual rows at once, without a test of each.
-        joined = None
+        packed = None
         if self._cut_page is None:
             with suppress(TypeError):  # of a message that is None, text or a number
-                joined = b''.join(messages)
-        if joined is not None:
-            yield Part(joined, _sizes(messages), np.array(topic_ids), lambda: times)
+                packed = Packed.join(messages)
+        if packed is not None:
+            yield Part(packed, np.array(topic_ids), lambda: times)
             return
         usable_rows = []
         usable_messages = []
@@ -429,10 +416,8 @@ class SqliteFile(StorageFile):
 class Part:
     """Usable messages of consecutive rows."""
 
-    messages: bytes
-    """All messages, one after the other."""
-    sizes: np.ndarray
-    """Bytes of each message, int64, shape (n,)."""
+    packed: Packed
+    """The messages, one after the other."""
     topic_ids: np.ndarray
     """The file's number of the topic of each message, shape (n,)."""
     times: Callable[[], Sequence[Any]]
@@ -463,19 +448,12 @@ def _listed(numbers: set[int]) -> str:
 def _part(rows: list[tuple[int, Any]], messages: list[bytes]) -> Part:
     """Return the Part of a list of (topic id, receive time) and their messages."""
     topic_ids, times = zip(*rows, strict=True)
-    return Part(b''.join(messages), _sizes(messages), np.array(topic_ids), lambda: times)
-
-
-def _sizes(messages: Sequence[bytes]) -> np.ndarray:
-    """Return the bytes of each message, int64, shape (n,)."""
-    return np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
+    return Part(Packed.join(messages), np.array(topic_ids), lambda: times)
 
 
 def _stretch(parts: list[Part]) -> Stretch:
     """Return the Stretch of consecutive Parts."""
-    packed = Packed.of_sizes(
-        b''.join([part.messages for part in parts]), np.concatenate([part.sizes for part in parts])
-    )
+    packed = Packed.chain([part.packed for part in parts])
     topic_ids = np.concatenate([part.topic_ids for part in parts])
 
     def received_ns(index: np.ndarray) -> np.ndarray:
@@ -483,7 +461,7 @@ def _stretch(parts: list[Part]) -> Stretch:
         values = chain.from_iterable(part.times() for part in parts)
         return np.array(list(map(_integer, values)), dtype=np.int64)[index]
 
-    return Stretch(topic_ids, lambda index: (index, packed.select(index)), received_ns)
+    return Stretch(topic_ids, packed, received_ns)
 
 
 def _integer(value: Any) -> int:

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -20,8 +21,8 @@ class Stretch(NamedTuple):
 
     topic_ids: np.ndarray
     """The file's own numbers of topics, shape (n,)."""
-    pack: Callable
-    """Index array -> (index array, Packed): rows that turn out unreadable are left out."""
+    packed: Packed
+    """The messages."""
     received_ns: Callable
     """Index array -> receive times, int64."""
 
@@ -73,19 +74,27 @@ class StorageFile:
     """
     Base of the readers of one file.
 
-    They provide `topic_ids` (topic -> numbers), `_stretches` and `unpack`, count in `lost`, and
-    have `types`, `definitions`, `count`, `time_range` and `close`. Writers have `add_topic`,
-    `write`, `close` (finishes the file) and `abort`.
+    They provide `topic_ids` (topic -> numbers) and `_stretches`, count in `lost`, and have `types`,
+    `definitions`, `count`, `time_range` and `close`. Writers have `add_topic`, `write`, `close`
+    (finishes the file) and `abort`.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    unpack : callable, optional
+        Bytes -> bytes for each message (compression by message).
+
     """
 
     topic_ids: dict[str, list[int]]
     """Topic -> the file's own numbers of it."""
-    path: Path
-    """The file."""
-    lost: dict[str, int]
-    """Reason -> messages that could not be read."""
-    unpack: Callable[[bytes], bytes] | None = None
-    """Bytes -> bytes for each message, when the bag is compressed by message."""
+
+    def __init__(self, path: str | PathLike[str], unpack: Callable[[bytes], bytes] | None = None):
+        self.path = Path(path)
+        self.unpack = unpack
+        self.lost: dict[str, int] = {}
+        """Reason -> messages that could not be read."""
 
     def _stretches(self, topics: Sequence[str]) -> Iterator[Stretch]:
         """Yield the Stretches of the file that may hold messages of the topics."""
@@ -125,23 +134,23 @@ class StorageFile:
 
     def _messages_at(self, stretch: Stretch, index: np.ndarray) -> tuple[np.ndarray, Packed]:
         """
-        Return (index, messages) of a stretch without unreadable ones, decompressed.
+        Return (index, messages) of a stretch without those that cannot be decompressed.
 
         `index`: messages of the stretch, shape (n,).
         """
-        index, packed = stretch.pack(index)
+        packed = stretch.packed.select(index)
         if self.unpack is None:
             return index, packed
-        kept = []
+        readable = []
         messages = []
         n_bytes = 0
         for k in range(len(packed)):
             message = self._unpacked(packed.message(k), n_bytes)
             if message is not None:
-                kept.append(k)
+                readable.append(k)
                 messages.append(message)
                 n_bytes += len(message)
-        return index[kept], Packed.join(messages)
+        return index[readable], Packed.join(messages)
 
     def _unpacked(self, data: bytes, n_before: int) -> bytes | None:
         """
@@ -164,6 +173,11 @@ class StorageFile:
         """Count lost data in `lost`; `kind` describes it without the name of the file."""
         reason = f'{kind} of {self.path.name}'
         self.lost[reason] = self.lost.get(reason, 0) + count
+
+
+def type_with_encoding(message_type: str, encoding: str) -> str:
+    """Return a message type; serializations other than CDR are named after it."""
+    return message_type if encoding == 'cdr' else f'{message_type} ({encoding})'
 
 
 Piece = TypeVar('Piece')

@@ -314,7 +314,7 @@ def _n_lost(step: np.ndarray) -> np.ndarray:
     return lost
 
 
-def spread(values: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def on_grid(values: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (values, present) with a row for every period: missing samples are zero and not present.
 
@@ -410,11 +410,11 @@ class RestReader:
     nominal: RawReadings | None = None
     """Nominal sensor, for recordings in volts or counts."""
 
-    def read(self, *bare: Sink, raw: Sequence[Sink] = ()) -> RestOutliers:
+    def read(self, *detrended: Sink, raw: Sequence[Sink] = ()) -> RestOutliers:
         """
         Push the samples of each part into sinks, and return the search that replaced outliers.
 
-        The sinks `bare` receive the samples without trends, `raw` the samples with trends.
+        The sinks `detrended` receive the samples without trends, `raw` the samples with trends.
         """
         outliers = RestOutliers()
         for (epoch, _), pieces in groupby(self._pieces(outliers), key=itemgetter(0, 1)):
@@ -423,12 +423,12 @@ class RestReader:
                 values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
                 steps = grid.steps(imu.stamp_ns)
                 trend = self.detrending.at(self.time_of(epoch, imu.stamp_ns))
-                flat = spread(values if trend is None else values - trend, steps)
-                for sink in bare:
-                    sink.push(*flat)
+                without_trend = on_grid(values if trend is None else values - trend, steps)
+                for sink in detrended:
+                    sink.push(*without_trend)
                 for sink in raw:
-                    sink.push(*spread(values, steps))
-            for sink in (*bare, *raw):
+                    sink.push(*on_grid(values, steps))
+            for sink in (*detrended, *raw):
                 sink.end_stretch()
         return outliers
 
@@ -450,21 +450,21 @@ class RestReader:
         """Return the Allan variances of the parts, at averaging times with at least one term."""
         longest = max(part.seconds for part in chain.from_iterable(self.parts))
         factors = averaging_factors(round(longest / self.period))
-        bare = AllanSums(factors, 6)
+        detrended = AllanSums(factors, 6)
         faults = FaultSearch()
         raw = AllanSums(factors, 6) if any(self.detrending.trends) else None
-        outliers = self.read(bare, raw=(faults,) if raw is None else (raw, faults))
-        usable = bare.terms > 0
-        variance, terms = bare.by_stretch()
+        outliers = self.read(detrended, raw=(faults,) if raw is None else (raw, faults))
+        usable = detrended.terms > 0
+        variance, terms = detrended.by_stretch()
         variance = variance[:, usable]
         terms = terms[:, usable]
         parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
         return AllanCurve(
             self.period,
-            bare.factors[usable],
-            bare.variance()[usable],
-            (raw or bare).variance()[usable],
-            tuple(bare.lengths),
+            detrended.factors[usable],
+            detrended.variance()[usable],
+            (raw or detrended).variance()[usable],
+            tuple(detrended.lengths),
             parts,
             faults.result(outliers.share),
         )

@@ -495,13 +495,13 @@ class FigureRow:
 
 def rows(figures: NoiseFigures) -> list[FigureRow]:
     """Return the figures of all axes, sensor by sensor, figure by figure."""
-    found = []
+    figure_rows = []
     for sensor in figures.sensors:
         for name in TERMS:
             for letter, axis in zip(AXES, figures.sensor(sensor)):
                 if name in axis.terms:
-                    found.append(_row(sensor, letter, axis, axis.terms[name]))
-    return found
+                    figure_rows.append(_row(sensor, letter, axis, axis.terms[name]))
+    return figure_rows
 
 
 def _row(sensor: str, letter: str, axis: AxisFigures, term: Term) -> FigureRow:
@@ -591,11 +591,11 @@ def noise_exit_code(figures: NoiseFigures) -> int:
 
 def noise_shortcomings(figures: NoiseFigures) -> list[str]:
     """Return why the exit code is 3, a line each; empty for 0."""
-    found = counts(figures)
+    n_of_status = counts(figures)
     lines = []
-    lacking = found[WEAK] + found[HELD]
+    lacking = n_of_status[WEAK] + n_of_status[HELD]
     if lacking:
-        lines.append(f'{lacking} of {sum(found.values())} noise figures are not determined')
+        lines.append(f'{lacking} of {sum(n_of_status.values())} noise figures are not determined')
     for sensor, why in (figures.recording.get('unusable') or {}).items():
         lines.append(f'the noise of the {sensor} is not identified: {why}')
     kept = round(figures.recording.get('seconds_at_rest', 0.0) * figures.rate)
@@ -611,30 +611,30 @@ def lines(figures: NoiseFigures) -> list[str]:
 
     Excluded parts, subtracted trends, other forms that fit, required recording time.
     """
-    found = [_rest_line(figures.recording), *_fault_lines(figures.recording)]
+    notes = [_rest_line(figures.recording), *_fault_lines(figures.recording)]
     for sensor in SENSORS:
         if sensor not in figures.sensors:
             why = (figures.recording.get('unusable') or {}).get(sensor, 'it has no readings')
-            found.append(f'no figures of the {sensor}: {why}')
+            notes.append(f'no figures of the {sensor}: {why}')
     for sensor in figures.sensors:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
-            found += _axis_lines(f'{sensor} {letter}', sensor, axis)
+            notes += _axis_lines(f'{sensor} {letter}', sensor, axis)
     if any(set(axis.form) & set(SLOW_PROCESSES) for axis in _all_axes(figures)):
-        found.append(
+        notes.append(
             'slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for'
             ' this recording; values of a second recording can lie outside'
         )
     recording_time = _recording_time(figures)
     if recording_time:
-        found.append(recording_time)
+        notes.append(recording_time)
 
     # The error of dead reckoning: the sensors are independent.
     runs = []
     for seconds, shares in position_budget(figures):
         sd = float(np.linalg.norm(list(shares.values())))
         runs.append(f'{significant(sd, 2)} m after {duration(seconds)}')
-    found.append(f'error of dead reckoning from rest by noise only: {", ".join(runs)}')
-    return found
+    notes.append(f'error of dead reckoning from rest by noise only: {", ".join(runs)}')
+    return notes
 
 
 def _rest_line(recording: Mapping[str, Any]) -> str:
@@ -654,41 +654,41 @@ def _rest_line(recording: Mapping[str, Any]) -> str:
 
 def _fault_lines(recording: Mapping[str, Any]) -> list[str]:
     """Return a line for each sensor or axis with readings that are not noise of the sensor."""
-    found = []
+    notes = []
     for name, entry in (recording.get('faults') or {}).items():
         share = entry['white_noise_too_high_by'] - 1.0
         cause = 'outliers (heavy tails, torn register reads)'
         if 'repeated' in entry:
             cause = f'{entry["repeated"]:.0%} repeated readings'
-        found.append(
+        notes.append(
             f'{name}: white noise may be up to {share:.1%} too high because of {cause}; its'
             ' interval is wider by that'
         )
-    return found
+    return notes
 
 
 def _axis_lines(name: str, sensor: str, axis: AxisFigures) -> list[str]:
     """Return the notes on one axis: trends, other forms, misfit of the curve, scatter of rests."""
-    found = []
+    notes = []
     for trend in axis.trends:
         factor, unit = for_people(NOISE_UNITS[sensor][trend.name], NOISE_QUANTITY)
         constant = f' within {duration(trend.time)}' if trend.name == 'turn_on' else ''
         size = f'{significant(trend.value * factor)} ± {significant(trend.sd * factor, 2)} {unit}'
-        found.append(f'{name} {TITLES[trend.name]}: {size}{constant}; removed')
+        notes.append(f'{name} {TITLES[trend.name]}: {size}{constant}; removed')
     if axis.others:
         others = ' or '.join(said(form) for form in axis.others)
-        found.append(f'{name}: {others} explains the curve as well as {said(axis.form)}')
+        notes.append(f'{name}: {others} explains the curve as well as {said(axis.form)}')
     if axis.excess > 1:
-        found.append(
+        notes.append(
             f'{name}: the curve deviates from every model by {np.sqrt(axis.excess):.2g} times the'
             f' chance limit{_hump(sensor, axis)}; intervals are wider by that'
         )
     if axis.scatter > WORTH_SAYING:
-        found.append(
+        notes.append(
             f'{name}: from rest to rest the noise differs by {axis.scatter / 2:.0%} beyond chance;'
             ' intervals are wider by that'
         )
-    return found
+    return notes
 
 
 def _hump(sensor: str, axis: AxisFigures) -> str:
@@ -729,21 +729,21 @@ def filter_lines(
     figures: NoiseFigures, rates: Sequence[float], horizon: float = HORIZON
 ) -> list[str]:
     """Return the lines with the parameters of filters, continuous and at each rate, Hz."""
-    found = []
+    parameter_lines = []
     for sensor in figures.sensors:
         densities = figures.densities(sensor, horizon)
         units = NOISE_UNITS[sensor]
-        found.append(
+        parameter_lines.append(
             f'for filters, {sensor}: white noise {significant(densities.white)}'
             f' {units[WHITE.name]},'
         )
-        found.append(
+        parameter_lines.append(
             f'    random walk {_bounded(densities.walk)} {units[RANDOM_WALK.name]}'
             f' ({BASIS[densities.basis]})'
         )
-        found += [
+        parameter_lines += [
             f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))}'
             f' {UNITS[sensor]}, bias step sd {_bounded(densities.step_sd(rate))} {UNITS[sensor]}'
             for rate in rates
         ]
-    return found
+    return parameter_lines

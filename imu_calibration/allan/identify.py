@@ -327,28 +327,7 @@ def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> Restin
     """
     # First pass: parts of the recording without motion, of each epoch of the clock.
     surveyed = survey(source, nominal)
-    if surveyed.period > LARGEST_STEP:
-        raise InputError(
-            f'the IMU must be read at least once in {LARGEST_STEP:g} s, the median step is'
-            f' {surveyed.period:g} s; record at its full rate',
-            code='rate_too_low',
-        )
-    parts = []
-    left_out = dict.fromkeys(LEFT_OUT, 0.0)
-    for chunks in surveyed.epochs:
-        parts_of_epoch, seconds_left_out = still_parts(chunks, surveyed.period, surveyed.resolution)
-        parts.append(parts_of_epoch)
-        for reason in LEFT_OUT:
-            left_out[reason] += seconds_left_out[reason]
-    all_parts = tuple(chain.from_iterable(parts))
-    seconds = sum(part.seconds for part in all_parts)
-    if seconds < MIN_CURVE_SAMPLES * surveyed.period or not surveyed.period:
-        raise InputError(
-            f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for'
-            f' {seconds:.1f} s; record with the IMU lying still on something heavy, for an hour if'
-            ' you can',
-            code='rest_too_short',
-        )
+    parts, left_out = _parts_at_rest(surveyed)
     _require_no_tilt(surveyed, parts)
 
     # Trends, which are no noise, are subtracted in the second pass.
@@ -376,13 +355,43 @@ def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> Restin
         curve=curve,
         moments=tuple(moments),
         trends=trends,
-        parts=all_parts,
+        parts=tuple(chain.from_iterable(parts)),
         left_out=left_out,
         sample_sd=_sample_sd(surveyed, parts),
         survey=surveyed,
         reader=reader,
         unusable=unusable,
     )
+
+
+def _parts_at_rest(surveyed: Survey) -> tuple[list[list[StillPart]], dict[str, float]]:
+    """
+    Return (parts at rest of each epoch of the clock, reason -> seconds that are not used).
+
+    Raises InputError for a low sampling rate or a short rest.
+    """
+    if surveyed.period > LARGEST_STEP:
+        raise InputError(
+            f'the IMU must be read at least once in {LARGEST_STEP:g} s, the median step is'
+            f' {surveyed.period:g} s; record at its full rate',
+            code='rate_too_low',
+        )
+    parts = []
+    left_out = dict.fromkeys(LEFT_OUT, 0.0)
+    for chunks in surveyed.epochs:
+        parts_of_epoch, seconds_left_out = still_parts(chunks, surveyed.period, surveyed.resolution)
+        parts.append(parts_of_epoch)
+        for reason in LEFT_OUT:
+            left_out[reason] += seconds_left_out[reason]
+    seconds = sum(part.seconds for part in chain.from_iterable(parts))
+    if seconds < MIN_CURVE_SAMPLES * surveyed.period or not surveyed.period:
+        raise InputError(
+            f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for'
+            f' {seconds:.1f} s; record with the IMU lying still on something heavy, for an hour if'
+            ' you can',
+            code='rest_too_short',
+        )
+    return parts, left_out
 
 
 def _require_no_tilt(surveyed: Survey, parts: list[list[StillPart]]) -> None:
@@ -393,8 +402,8 @@ def _require_no_tilt(surveyed: Survey, parts: list[list[StillPart]]) -> None:
     """
     if surveyed.absent or surveyed.unusable:
         return
-    for chunks, of_epoch in zip(surveyed.epochs, parts, strict=True):
-        for part in of_epoch:
+    for chunks, parts_of_epoch in zip(surveyed.epochs, parts, strict=True):
+        for part in parts_of_epoch:
             tilt = tilt_at_rest(chunks.time[part.chunks], chunks.mean[part.chunks])
             if tilt:
                 raise InputError(
@@ -539,7 +548,7 @@ class _Clock:
         # First stamp of each epoch, ns, and its time since the beginning, s.
         self._first = [chunks.first_ns for chunks in epochs]
         lengths = [float(chunks.time[-1]) + EPOCH_GAP if len(chunks) else 0.0 for chunks in epochs]
-        self._offset = np.concatenate([[0.0], np.cumsum(lengths)])
+        self._offset = np.append(0.0, np.cumsum(lengths))
 
     def time(self, epoch: int, stamp_ns: np.ndarray) -> np.ndarray:
         """Return seconds since the beginning for stamps of an epoch."""
@@ -566,8 +575,8 @@ def _blocks(surveyed: Survey, parts: list[list[StillPart]], clock: _Clock) -> Bl
     means = []
     numbers = []  # of the part of each block
     seconds = 0.0
-    for epoch, (chunks, of_epoch) in enumerate(zip(surveyed.epochs, parts)):
-        for part in of_epoch:
+    for epoch, (chunks, parts_of_epoch) in enumerate(zip(surveyed.epochs, parts)):
+        for part in parts_of_epoch:
             first = part.chunks.start
             n_blocks = (part.chunks.stop - first) // size
             used = slice(first, first + n_blocks * size)
@@ -590,7 +599,7 @@ def _blocks(surveyed: Survey, parts: list[list[StillPart]], clock: _Clock) -> Bl
 def _sample_sd(surveyed: Survey, parts: list[list[StillPart]]) -> np.ndarray:
     """Return the standard deviation of samples within chunks, without bias, shape (6,)."""
     variances = []
-    for chunks, of_epoch in zip(surveyed.epochs, parts):
-        variances += [chunks.sd[part.chunks] ** 2 for part in of_epoch]
+    for chunks, parts_of_epoch in zip(surveyed.epochs, parts):
+        variances += [chunks.sd[part.chunks] ** 2 for part in parts_of_epoch]
     size = surveyed.epochs[0].size
     return np.sqrt(np.concatenate(variances).mean(axis=0) * size / (size - 1))

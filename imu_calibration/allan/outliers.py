@@ -56,8 +56,8 @@ class RestOutliers:
         self._n_readings = np.zeros(6)
         # Random signs of the reflection.
         self._signs = np.random.default_rng(0)
-        # Buffered samples: `_n_before` samples with a decision, as context, then undecided ones.
-        self._held: ImuSamples | None = None
+        # `_n_before` samples with a decision, as context, then undecided ones.
+        self._buffered: ImuSamples | None = None
         self._n_before = 0
 
     @property
@@ -67,41 +67,40 @@ class RestOutliers:
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return the samples with a decision; at most `PIECE` + `CONTEXT_SAMPLES` are buffered."""
-        held = samples if self._held is None else type(samples).concatenate([self._held, samples])
-        self._held = held
+        self._buffered = samples.after(self._buffered)
         passed = []
-        while len(self._held) >= self._n_before + PIECE + CONTEXT_SAMPLES:
+        while len(self._buffered) >= self._n_before + PIECE + CONTEXT_SAMPLES:
             passed.append(self._decide(self._n_before + PIECE))
         return passed
 
     def finish(self) -> list[ImuSamples]:
         """Return the buffered samples, and begin a new stream."""
         passed = []
-        if self._held is not None and len(self._held) > self._n_before:
-            passed.append(self._decide(len(self._held)))
-        self._held = None
+        if self._buffered is not None and len(self._buffered) > self._n_before:
+            passed.append(self._decide(len(self._buffered)))
+        self._buffered = None
         self._n_before = 0
         return passed
 
     def _decide(self, stop: int) -> ImuSamples:
         """Return the samples up to row `stop` without outliers; their last rows become context."""
-        assert self._held is not None
-        context = self._held.select(slice(0, min(stop + CONTEXT_SAMPLES, len(self._held))))
+        assert self._buffered is not None
+        context = self._buffered.select(slice(0, min(stop + CONTEXT_SAMPLES, len(self._buffered))))
         values = np.hstack([context.force_s, context.rate_s])
         decided = slice(self._n_before, stop)
         outlying = outliers(values)
-        kept = self._held.select(decided)
-        self._n_samples += len(kept)
+        samples = self._buffered.select(decided)
+        self._n_samples += len(samples)
         self._n_readings += np.count_nonzero(outlying[decided], axis=0)
         n_samples = int(np.count_nonzero(outlying[decided].any(axis=1)))
         if n_samples:
             self.replaced += n_samples
             values = self._without(values, outlying)[decided]
-            kept = replace(kept, force_s=values[:, :3], rate_s=values[:, 3:])
+            samples = replace(samples, force_s=values[:, :3], rate_s=values[:, 3:])
         first = max(stop - CONTEXT_SAMPLES, 0)
         self._n_before = stop - first
-        self._held = self._held.select(slice(first, None))
-        return kept
+        self._buffered = self._buffered.select(slice(first, None))
+        return samples
 
     def _without(self, values: np.ndarray, outlying: np.ndarray) -> np.ndarray:
         """
@@ -170,9 +169,7 @@ def outliers(values: np.ndarray) -> np.ndarray:
     for column in np.flatnonzero(middle == 0):
         changes = np.abs(np.diff(values[:, column]))
         changes = changes[changes > 0]
-        typical_change = np.inf
-        if len(changes):
-            typical_change = np.median(changes)
+        typical_change = np.median(changes) if len(changes) else np.inf
         scatter[column] = max(scatter[column], typical_change)
     far = deviation > FAR * scatter
     around = uniform_filter1d(far.astype(float), 2 * CONTEXT_SAMPLES + 1, axis=0, mode='constant')

@@ -117,21 +117,21 @@ class FaultSearch:
         steps = np.where(same, np.inf, np.abs(difference))
         self._smallest_step = np.minimum(self._smallest_step, steps.min(axis=0))
         for k, sensor in enumerate(SENSORS):
-            held = same[:, SENSOR_COLUMNS[sensor]].all(axis=1)
-            self._n_same_sensor[k] += held.sum()
-            self._add_runs(k, np.flatnonzero(~held), len(held))
+            repeats = same[:, SENSOR_COLUMNS[sensor]].all(axis=1)
+            self._n_same_sensor[k] += repeats.sum()
+            self._add_runs(k, np.flatnonzero(~repeats), len(repeats))
             # A repeated reading is no reading of the noise.
-            self._add_blocks(sensor, rows[1:][~held][:, SENSOR_COLUMNS[sensor]])
+            self._add_blocks(sensor, rows[1:][~repeats, SENSOR_COLUMNS[sensor]])
 
     def _add_blocks(self, sensor: str, readings: np.ndarray) -> None:
         """Add the complete blocks of a sensor; the last one is continued."""
         if self._n_kept[sensor] >= MOST_KEPT_READINGS:
             return
         readings = np.vstack([self._next_block[sensor], readings])
-        n_complete = len(readings) // READINGS_PER_MEAN
-        self._next_block[sensor] = readings[n_complete * READINGS_PER_MEAN :].copy()
-        self._readings[sensor].append(readings[: n_complete * READINGS_PER_MEAN].copy())
-        self._n_kept[sensor] += n_complete * READINGS_PER_MEAN
+        n_complete = len(readings) // READINGS_PER_MEAN * READINGS_PER_MEAN
+        self._next_block[sensor] = readings[n_complete:].copy()
+        self._readings[sensor].append(readings[:n_complete].copy())
+        self._n_kept[sensor] += n_complete
 
     def _add_runs(self, k: int, changes: np.ndarray, n_pairs: int) -> None:
         """
@@ -192,22 +192,21 @@ class FaultSearch:
 
     def _excesses(self) -> list[list[Excess]]:
         """Return the list of `Excess` of each axis, by tails and by torn reads."""
-        of_axes: list[list[Excess]] = []
+        excesses: list[list[Excess]] = []
         for sensor, columns in SENSOR_COLUMNS.items():
             if self._n_kept[sensor] < LEAST_EXAMINED:
-                of_axes += [[], [], []]
+                excesses += [[], [], []]
                 continue
-            of_sensor = np.concatenate(self._readings[sensor]).T
-            for readings, step in zip(of_sensor, self._smallest_step[columns], strict=True):
+            readings_of_axes = np.concatenate(self._readings[sensor]).T
+            for readings, step in zip(readings_of_axes, self._smallest_step[columns], strict=True):
                 if not np.isfinite(step):  # constant readings
-                    of_axes.append([])
+                    excesses.append([])
                     continue
-                excesses = [excess_of_torn_reads(readings, step)]
                 tails = _excess_of_tails(readings, step)
+                excesses.append([excess_of_torn_reads(readings, step)])
                 if tails is not None:
-                    excesses.append(tails)
-                of_axes.append(excesses)
-        return of_axes
+                    excesses[-1].append(tails)
+        return excesses
 
 
 def _excess_of_tails(readings: np.ndarray, smallest_step: float) -> Excess | None:

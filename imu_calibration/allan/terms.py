@@ -238,8 +238,8 @@ def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
         return np.inf
     freedom = 2 * expected**2 / np.diag(covariance)
     # Standard deviation of a logarithm over the relative one of its variance.
-    spread = np.sqrt(polygamma(1, freedom / 2) * freedom / 2)
-    whiten = Whitener(covariance / np.outer(expected, expected) * np.outer(spread, spread))
+    log_factor = np.sqrt(polygamma(1, freedom / 2) * freedom / 2)
+    whiten = Whitener(covariance / np.outer(expected, expected) * np.outer(log_factor, log_factor))
     log_ratio = np.log(moments.target[compared] / expected)
     residual = whiten(log_ratio - digamma(freedom / 2) + np.log(freedom / 2))
     cost = float(residual @ residual) / excess + whiten.log_determinant
@@ -415,14 +415,15 @@ def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray
     `moments` are those of any recording. The level of its noise is assumed to differ from part to
     part as in the recording from which the noise of the axis was identified.
     """
-    every = replace(moments, used=np.ones_like(moments.used))
+    all_scales = replace(moments, used=np.ones_like(moments.used))
     fit = axis.fit
-    expected = every.design(fit.processes) @ fit.coefficients
-    spread = np.einsum(
-        'p,q,pqii->i', fit.coefficients, fit.coefficients, every.tensor(fit.processes)
+    expected = all_scales.design(fit.processes) @ fit.coefficients
+    sampling = np.einsum(
+        'p,q,pqii->i', fit.coefficients, fit.coefficients, all_scales.tensor(fit.processes)
     )
+    # Relative variance of the level of the noise from part to part.
     level = axis.scatter**2 * moments.parts.share() if axis.scatter else 0.0
-    return expected, 2.0 / (spread * axis.excess / expected**2 + level)
+    return expected, 2.0 / (sampling * axis.excess / expected**2 + level)
 
 
 def _fit_range(moments: Moments) -> tuple[Moments, float]:

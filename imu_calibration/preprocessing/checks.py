@@ -248,56 +248,62 @@ def one_stamp_text(name: str, n_repeated: int, total: int) -> str:
 
 def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sample has a stamp of its own, later than the one before, and finite readings."""
-    faultless = []
     for name, stream in evidence.streams.items():
-        # Spikes and wrapped readings have accepted stamps, and a clock reset drops no sample.
-        total = stream.count
-        for reason, count in stream.dropped.items():
-            if reason not in ('clock reset', 'spike', 'wrapped'):
-                total += count
-        if is_one_stamp(stream.dropped.get('repeated stamp', 0), total):
-            n_repeated = stream.dropped['repeated stamp']
-            text = one_stamp_text(MESSAGES[name], n_repeated, total)
-            yield CheckFinding('stamps_equal', REFUSE, text)
-            continue
-        if stream.count < 0.1 * total:
-            reasons = ', '.join(f'{count} {reason}' for reason, count in stream.dropped.items())
-            yield CheckFinding(
-                'stamps',
-                REFUSE,
-                f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total}'
-                f' only {stream.count} do ({reasons}); correct the driver and record again',
-            )
-            continue
-        if stream.unstamped:
-            yield CheckFinding(
-                'stamps',
-                WARNING,
-                f'{MESSAGES[name]}: {stream.unstamped} of {total} stamps are zero: the time of'
-                ' arrival is used; the driver should stamp each sample at its measurement',
-            )
-        if stream.overflows:
-            yield CheckFinding(
-                'stamps',
-                NOTE,
-                f'{MESSAGES[name]}: the counter of the stamps overflows'
-                f' {"once" if stream.overflows == 1 else f"{stream.overflows} times"}: undone'
-                f'{longer_gaps(stream.counter_size_ns, stream.n_gaps)}',
-            )
-        for reason, count in stream.dropped.items():
-            severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
-            if reason == 'clock reset':
-                text = (
-                    f'the stamps jump {"once" if count == 1 else f"{count} times"}: the clock was'
-                    ' set while recording; the parts are processed separately'
-                )
-            else:
-                text = f'{count} of {total} samples {STAMP_FAULTS[reason]}'
-            yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {text}')
-        if not stream.dropped:
-            faultless.append(MESSAGES[name])
+        yield from _stamps_of(MESSAGES[name], stream)
+    faultless = [MESSAGES[name] for name, stream in evidence.streams.items() if not stream.dropped]
     if faultless:
         yield CheckFinding('stamps', GOOD, f'{" and ".join(faultless)}: all stamps advance')
+
+
+def _stamps_of(message: str, stream: StreamStatistics) -> Iterator[CheckFinding]:
+    """Yield the findings of the stamps of one stream; `message`: type of its messages."""
+    # Spikes and wrapped readings have accepted stamps, and a clock reset drops no sample.
+    total = stream.count
+    for reason, count in stream.dropped.items():
+        if reason not in ('clock reset', 'spike', 'wrapped'):
+            total += count
+    n_repeated = stream.dropped.get('repeated stamp', 0)
+    if is_one_stamp(n_repeated, total):
+        yield CheckFinding('stamps_equal', REFUSE, one_stamp_text(message, n_repeated, total))
+        return
+    if stream.count < 0.1 * total:
+        reasons = ', '.join(f'{count} {reason}' for reason, count in stream.dropped.items())
+        yield CheckFinding(
+            'stamps',
+            REFUSE,
+            f'{message} must hold finite samples whose header stamps advance, of {total}'
+            f' only {stream.count} do ({reasons}); correct the driver and record again',
+        )
+        return
+    if stream.unstamped:
+        yield CheckFinding(
+            'stamps',
+            WARNING,
+            f'{message}: {stream.unstamped} of {total} stamps are zero: the time of'
+            ' arrival is used; the driver should stamp each sample at its measurement',
+        )
+    if stream.overflows:
+        yield CheckFinding(
+            'stamps',
+            NOTE,
+            f'{message}: the counter of the stamps overflows {_times(stream.overflows)}: undone'
+            f'{longer_gaps(stream.counter_size_ns, stream.n_gaps)}',
+        )
+    for reason, count in stream.dropped.items():
+        severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
+        if reason == 'clock reset':
+            text = (
+                f'the stamps jump {_times(count)}: the clock was'
+                ' set while recording; the parts are processed separately'
+            )
+        else:
+            text = f'{count} of {total} samples {STAMP_FAULTS[reason]}'
+        yield CheckFinding('stamps', severity, f'{message}: {text}')
+
+
+def _times(count: int) -> str:
+    """Return a number of events in words."""
+    return 'once' if count == 1 else f'{count} times'
 
 
 def _fast_streams(evidence):

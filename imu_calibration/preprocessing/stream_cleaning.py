@@ -164,17 +164,11 @@ class StreamCheck:
             Steps longer than this, and than five median periods, are counted as gaps, s.
 
         """
-        steps = self._steps.summary(gap)
         return StreamStatistics(
+            **vars(self._steps.statistics(gap)),
             count=self._n_accepted,
             dropped=dict(self.counts),
             duration=self._span_ns / 1e9,
-            period=steps.period,
-            stamp_step_ns=steps.common_step_ns,
-            n_gaps=steps.n_gaps,
-            gap_total=steps.gap_total,
-            longest_step=steps.longest,
-            irregular=steps.irregular,
             first_ns=self._first_ns,
             last_ns=self._last_ns,
             stamping=None if self._times is None else self._times.odd_line(self._n_accepted),
@@ -393,7 +387,25 @@ def _is_reset(step: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class StreamStatistics:
+class StepStatistics:
+    """Statistics of the steps between stamps."""
+
+    period: float
+    """Median step, s; 0 with fewer than two samples."""
+    stamp_step_ns: int
+    """Greatest common divisor of the steps, ns (1000000: milliseconds); 0 when unknown."""
+    n_gaps: int
+    """Number of gaps."""
+    gap_total: float
+    """Their total length, s."""
+    longest_step: float
+    """Longest step, a gap or not, s."""
+    irregular: float
+    """Share of the steps that are off the median by more than a tenth."""
+
+
+@dataclass(frozen=True, eq=False)
+class StreamStatistics(StepStatistics):
     """Statistics of the stamps of one stream."""
 
     count: int
@@ -402,20 +414,6 @@ class StreamStatistics:
     """Reason -> number of samples dropped ('clock reset': number of jumps, which drop nothing)."""
     duration: float
     """From the first to the last accepted sample, epochs added, s."""
-    period: float
-    """Median step between stamps, s; 0 with fewer than two samples."""
-    stamp_step_ns: int
-    """
-    Greatest common divisor of the steps between stamps, ns (1000000: milliseconds); 0 when unknown.
-    """
-    n_gaps: int
-    """Number of gaps."""
-    gap_total: float
-    """Their total length, s."""
-    longest_step: float
-    """Longest step between stamps, a gap or not, s."""
-    irregular: float
-    """Share of the steps that are off the median by more than a tenth."""
     first_ns: int
     """Smallest stamp; larger than `last_ns` without samples."""
     last_ns: int
@@ -457,24 +455,6 @@ MAX_STEP_DEVIATION = 0.1
 """Steps farther than this share from the median count as irregular."""
 
 
-@dataclass(frozen=True)
-class StepSummary:
-    """Statistics of the steps between stamps; fields as in `StreamStatistics`."""
-
-    period: float
-    """Median step, s."""
-    common_step_ns: int
-    """Greatest common divisor, ns; 0 when unknown."""
-    n_gaps: int
-    """Number of gaps."""
-    gap_total: float
-    """Their total length, s."""
-    longest: float
-    """Longest step, s."""
-    irregular: float
-    """Share of the steps that are off the median by more than a tenth."""
-
-
 class StepHistogram:
     """
     Numbers and sums of steps in bins of equal ratio.
@@ -483,8 +463,8 @@ class StepHistogram:
     """
 
     def __init__(self) -> None:
-        self.common_step_ns = 0
-        """Greatest common divisor of the steps, while it is not fine, ns; 0 before the first."""
+        # Greatest common divisor of the steps, while it is not fine, ns; 0 before the first.
+        self._common_step_ns = 0
         # Of each bin: number of steps, and their sum.
         self._number = np.zeros(_N_BINS, np.int64)
         self._sum_ns = np.zeros(_N_BINS, np.int64)
@@ -498,10 +478,10 @@ class StepHistogram:
         np.add.at(self._number, index, 1)
         np.add.at(self._sum_ns, index, step_ns)
         self._longest_ns = max(self._longest_ns, int(step_ns.max()))
-        if self.common_step_ns == 0 or self.common_step_ns > _FINE_STEP_NS:
-            self.common_step_ns = int(np.gcd(self.common_step_ns, np.gcd.reduce(step_ns)))
+        if self._common_step_ns == 0 or self._common_step_ns > _FINE_STEP_NS:
+            self._common_step_ns = int(np.gcd(self._common_step_ns, np.gcd.reduce(step_ns)))
 
-    def summary(self, gap: float) -> StepSummary:
+    def statistics(self, gap: float) -> StepStatistics:
         """
         Return the statistics; gaps are longer than `gap` s and than five median steps.
 
@@ -513,12 +493,12 @@ class StepHistogram:
         median_ns = mean_ns[np.searchsorted(np.cumsum(self._number), (total + 1) // 2)]
         is_gap = mean_ns > max(gap * 1e9, 5 * median_ns)
         is_irregular = np.abs(mean_ns - median_ns) > MAX_STEP_DEVIATION * median_ns
-        return StepSummary(
+        return StepStatistics(
             period=float(median_ns / 1e9),
-            common_step_ns=self.common_step_ns,
+            stamp_step_ns=self._common_step_ns,
             n_gaps=int(self._number[is_gap].sum()),
             gap_total=float(self._sum_ns[is_gap].sum() / 1e9),
-            longest=self._longest_ns / 1e9,
+            longest_step=self._longest_ns / 1e9,
             irregular=float(self._number[is_irregular].sum() / max(total, 1)),
         )
 

@@ -276,15 +276,12 @@ def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | 
     """
     temperatures: list[Any] = []
     for window in windows:
-        if window.temperature_c is None:
-            continue
-        if window.kind == WindowKind.STATIC:
-            temperatures.append([window.temperature_c.mean()])
-        else:
-            temperatures.append(window.temperature_c)
-    temperature = None
-    if len(temperatures) == len(windows):
-        temperature = np.concatenate(temperatures)
+        if window.temperature_c is not None:
+            is_static = window.kind == WindowKind.STATIC
+            temperatures.append(
+                [window.temperature_c.mean()] if is_static else window.temperature_c
+            )
+    temperature = np.concatenate(temperatures) if len(temperatures) == len(windows) else None
     if len(windows) == 1:
         return windows[0].motion, temperature
     return JointMotion.concatenate(window.motion for window in windows), temperature

@@ -598,13 +598,12 @@ class WindowCutter:
 
     def _shortest(self, use: int) -> float:
         """Return the shortest length of a window with this `use`, an index of `_USES`, s."""
-        if use == _STATIC:
-            return self._settings.static_minimum
-        if use == _SPIN:
-            return self._settings.spin_minimum
-        if use == _DYNAMIC:
-            return self._settings.dynamic_minimum
-        return 0.0
+        shortest = {
+            _STATIC: self._settings.static_minimum,
+            _SPIN: self._settings.spin_minimum,
+            _DYNAMIC: self._settings.dynamic_minimum,
+        }
+        return shortest.get(use, 0.0)
 
     def _longest(self, use: int) -> float:
         """Return the longest length of a window with this `use`, an index of `_USES`, s."""

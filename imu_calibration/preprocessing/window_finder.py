@@ -7,6 +7,7 @@ Static, spinning and dynamic windows with the joints' motion, and samples with t
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -90,10 +91,9 @@ class MotionGatherer:
     @property
     def n_buffered(self) -> int:
         """Number of buffered samples; bounded for a session of any length."""
+        n_queued = sum(len(part) for _, part in chain.from_iterable(self._queue.values()))
         n_buffered = self.cleaner.n_buffered + self._chunks.n_buffered + self._cutter.n_buffered
-        for queue in self._queue.values():
-            n_buffered += sum(len(part) for _, part in queue)
-        return n_buffered
+        return n_queued + n_buffered
 
     @property
     def counts(self) -> dict[str | UnusedReason | WindowKind, int]:
@@ -135,10 +135,8 @@ class MotionGatherer:
 
     def _has_later_epoch(self):
         """Return whether samples of a later epoch are in a queue."""
-        for queue in self._queue.values():
-            if any(epoch > self._epoch for epoch, _ in queue):
-                return True
-        return False
+        queued = chain.from_iterable(self._queue.values())
+        return any(epoch > self._epoch for epoch, _ in queued)
 
     def change(self, settings: WindowSettings) -> None:
         """

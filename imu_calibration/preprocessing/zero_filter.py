@@ -38,25 +38,25 @@ class ZeroFilter:
             first = int(np.argmax(has_force)) if has_force.any() else len(samples)
             zero[:first] = False
             self._has_measured = first < len(samples)
-        if not zero.any():
-            self._in_long_run = False
-            return samples
-        kept = np.ones(len(samples), bool)
-        continues = self._in_long_run and bool(zero[0])
+        # A run at the beginning continues a long one, which has passed.
+        continues_long_run = self._in_long_run
         self._in_long_run = False
+        if not zero.any():
+            return samples
+        passes = np.ones(len(samples), bool)
         for start, stop in runs_of(zero):
             is_open = stop == len(samples)
             length_ns = samples.stamp_ns[stop - 1] - samples.stamp_ns[start]
             is_long = length_ns >= LONGEST_HELD_RUN_NS or stop - start >= MOST_HELD
-            if is_long or (start == 0 and continues):
+            if is_long or (start == 0 and continues_long_run):
                 self._in_long_run = is_open
                 continue
-            kept[start:stop] = False
+            passes[start:stop] = False
             if is_open:
                 self._open_run = samples.select(slice(start, stop))
             else:
                 self.n_dropped += stop - start
-        return samples.select(kept)
+        return samples.select(passes)
 
     def finish(self) -> int:
         """Drop the run at the end of the stream; return its number of samples."""

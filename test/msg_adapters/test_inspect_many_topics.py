@@ -24,7 +24,8 @@ class CountedFile(StorageFile):
     """A file of many topics, with two messages of each, that counts the looks at its topics."""
 
     def __init__(self, n_topics):
-        self.lost, self.n_looks = {}, 0
+        super().__init__('many')
+        self.n_looks = 0
         self._ids = {f'/topic{k}': [3 * k + 1] for k in range(n_topics)}
 
     @property
@@ -38,7 +39,7 @@ class CountedFile(StorageFile):
         packed = Packed.join([b'x'] * len(topic_ids))
         yield Stretch(
             topic_ids,
-            lambda index: (index, packed.select(index)),
+            packed,
             lambda index: index,
         )
 

@@ -8,7 +8,6 @@ there are.
 import json
 from base64 import b64decode, b64encode
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,7 +62,7 @@ class LinesFile(StorageFile):
     """Reads all at once."""
 
     def __init__(self, path, unpack=None):
-        self.path, self.unpack, self.lost = Path(path), unpack, {}
+        super().__init__(path, unpack)
         lines = [json.loads(line) for line in self.path.read_text().splitlines()]
         topics = [line[1:] for line in lines if line[0] == 'topic']
         self.topic_ids = {name: [topic_id] for topic_id, name, *_ in topics}
@@ -89,7 +88,7 @@ class LinesFile(StorageFile):
         packed = Packed.join([b64decode(text) for text in data])
         yield Stretch(
             np.array(topic_ids),
-            lambda index: (index, packed.select(index)),
+            packed,
             lambda index: np.array(received)[index],
         )
 
