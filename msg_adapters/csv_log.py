@@ -482,15 +482,10 @@ def _sensors(
         rate_s = table.values(rate.names) * _size_of(rate)
         return _Readings((rate,), ImuSamples(stamp_ns, absent, rate_s, 'imu_link'))
     raw_force = table.values(by_quantity['force'].names)
-
-    def find_unit() -> str | None:
-        """Return the unit of force, or raise for increments; None for an unknown unit."""
-        unit = _force_unit(raw_force)
-        if unit is None:
-            _refuse_increments(raw_force, stamp_ns)
-        return unit
-
-    force = _with_unit(by_quantity['force'], find_unit, table.path)
+    # Increments have their own error, the other readings of an unknown unit that of `_with_unit`.
+    if by_quantity['force'].unit is None and _force_unit(raw_force) is None:
+        _refuse_increments(raw_force, stamp_ns)
+    force = _with_unit(by_quantity['force'], lambda: _force_unit(raw_force), table.path)
     force_s = raw_force * _size_of(force)
     if 'rate' not in by_quantity:
         return _Readings((force,), ImuSamples(stamp_ns, force_s, absent, 'imu_link'))
@@ -615,10 +610,10 @@ def _with_gravity_only(logs: list[_SensorLog]) -> list[_SensorLog]:
 def _log_of_two(force: _SensorLog, rate: _SensorLog) -> CsvLog:
     """Return the CsvLog of a log of each sensor."""
     readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.table.path)
-    of_force, of_rate = readings.columns
+    force_columns, rate_columns = readings.columns
     assert readings.joined is not None
     return CsvLog(
-        columns=(force.time, of_force, rate.time, of_rate),
+        columns=(force.time, force_columns, rate.time, rate_columns),
         imu=readings.imu,
         joints=None,
         temperature=None,
@@ -1567,19 +1562,19 @@ def _reading_of(words: str) -> _Reading | None:
     bare = re.sub(r'^([xyz]) (.*)$', r'\2 \1', bare)
 
     # The number of one of several IMUs: imu1 ax, ax 1, or acc1 x.
-    of_imu = ''
+    device_name = ''
     device = re.fullmatch(r'((?:imu|sensor|mpu|device) ?\d+) (.*)', bare)
     if device:
-        of_imu = device[1]
+        device_name = device[1]
         bare = device[2]
     numbered = re.fullmatch(r'(\D+?) ?(\d+) ?([xyz]?)', bare)
     if numbered:
         bare = f'{numbered[1]} {numbered[3]}'.strip()
-        of_imu += numbered[2]
+        device_name += numbered[2]
     axis = re.fullmatch(r'(.*?) ?([xyz])', bare)
     if axis is None:
         return None
-    group = re.sub(r'[^a-z0-9]', '', of_imu + axis[1] + decoration)
+    group = re.sub(r'[^a-z0-9]', '', device_name + axis[1] + decoration)
     return _Reading(axis[1], axis[2], group)
 
 

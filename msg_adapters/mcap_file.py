@@ -17,7 +17,7 @@ from imu_calibration.core.documents import open_regular
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from msg_adapters.compression import decompress_chunk, largest_content
 from msg_adapters.layout import Packed, clean_name, overlapping
-from msg_adapters.storage import StorageFile, Stretch, read_ahead, type_with_encoding
+from msg_adapters.storage import StorageFile, Stretch, batches, read_ahead, type_with_encoding
 
 MAGIC = b'\x89MCAP0\r\n'
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
@@ -421,17 +421,10 @@ class McapFile(StorageFile):
 
     def _joined_pieces(self, wanted: set[int]) -> Generator[ChannelMessages, None, None]:
         """Yield the pairs of `_pieces`, joined to at least `CHUNK_STRETCH_BYTES`."""
-        pending = []
-        n_bytes = 0
-        for channels, messages in self._pieces(wanted):
-            pending.append((channels, messages))
-            n_bytes += len(messages.buffer)
-            if n_bytes >= CHUNK_STRETCH_BYTES:
-                yield _join(pending)
-                pending = []
-                n_bytes = 0
-        if pending:
-            yield _join(pending)
+        pieces = self._pieces(wanted)
+        for batch in batches(pieces, lambda piece: len(piece[1].buffer), CHUNK_STRETCH_BYTES):
+            channels, messages = zip(*batch, strict=True)
+            yield np.concatenate(channels), Packed.chain(messages)
 
     def _pieces(self, wanted: set[int]) -> Iterator[ChannelMessages]:
         """
@@ -502,6 +495,7 @@ class McapFile(StorageFile):
                 content = self._read(position, max(n_ahead, record_end - position))
                 buffer = np.frombuffer(content, np.uint8)
                 run = walk(buffer)
+                # More bytes next time if most of these are of the run, else twice its length.
                 if 2 * run.end > len(buffer):
                     n_ahead = min(2 * n_ahead, CHUNK_STRETCH_BYTES)
                 else:
@@ -610,9 +604,3 @@ class McapFile(StorageFile):
     def _read(self, position: int, size: int) -> bytes:
         """Return up to `size` bytes from `position` on, fewer at the end of the file."""
         return os.pread(self.file.fileno(), size, position)
-
-
-def _join(pieces: Sequence[ChannelMessages]) -> ChannelMessages:
-    """Return the (channel ids, messages) of consecutive pieces in one pair."""
-    channels, messages = zip(*pieces, strict=True)
-    return np.concatenate(channels), Packed.chain(messages)

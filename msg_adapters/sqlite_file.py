@@ -26,7 +26,7 @@ from imu_calibration.core.documents import open_regular
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed, clean_name
-from msg_adapters.storage import StorageFile, Stretch, type_with_encoding
+from msg_adapters.storage import StorageFile, Stretch, batches, type_with_encoding
 
 BATCH_ROWS = 256
 """Rows per ``fetchmany``; the objects of more rows do not fit into the cache of the processor."""
@@ -358,9 +358,13 @@ class SqliteFile(StorageFile):
         if packed is not None:
             yield Part(packed, np.array(topic_ids), lambda: times)
             return
-        usable_rows = []
-        usable_messages = []
-        n_bytes = 0
+        usable = self._usable_rows(rows, wanted)
+        for batch in batches(usable, lambda row: len(row[-1]), STRETCH_BYTES):
+            topic_ids, times, messages = zip(*batch, strict=True)
+            yield Part(Packed.join(messages), np.array(topic_ids), partial(list, times))
+
+    def _usable_rows(self, rows: list[tuple], wanted: set[int]) -> Iterator[tuple[int, Any, bytes]]:
+        """Yield (topic id, receive time, message) of the rows that can be used."""
         for row_id, topic_id, received_ns, message in rows:
             # The statement gives no large messages.
             if message is None and topic_id in wanted:
@@ -371,16 +375,7 @@ class SqliteFile(StorageFile):
             if self._is_cut(message):
                 self._lose('rows of the incomplete last page', 1)
                 continue
-            usable_rows.append((topic_id, received_ns))
-            usable_messages.append(message)
-            n_bytes += len(message)
-            if n_bytes >= STRETCH_BYTES:
-                yield _part(usable_rows, usable_messages)
-                usable_rows = []
-                usable_messages = []
-                n_bytes = 0
-        if usable_rows:
-            yield _part(usable_rows, usable_messages)
+            yield topic_id, received_ns, message
 
     def _large(self, row_id: int) -> Any:
         """Return a message above `SMALL_BYTES`, None where it cannot be read."""
@@ -443,12 +438,6 @@ def _statement(wanted: set[int], unwanted: set[int]) -> str:
 def _listed(numbers: set[int]) -> str:
     """Return numbers as a list in SQL."""
     return ', '.join(map(str, sorted(numbers)))
-
-
-def _part(rows: list[tuple[int, Any]], messages: list[bytes]) -> Part:
-    """Return the Part of a list of (topic id, receive time) and their messages."""
-    topic_ids, times = zip(*rows, strict=True)
-    return Part(Packed.join(messages), np.array(topic_ids), lambda: times)
 
 
 def _stretch(parts: list[Part]) -> Stretch:

@@ -43,31 +43,38 @@ class RawMessages(NamedTuple):
         return self.packed.select(index), lambda: self.received_ns()[index]
 
 
+Piece = TypeVar('Piece')
+
 STRETCH_MESSAGES = 8192
 """Messages per stretch where they arrive one by one."""
 
 
 def grouped(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[RawMessages]:
     """Yield RawMessages of (index of the topic, receive time, message) that arrive one by one."""
-    pending = []
+    for batch in batches(messages, lambda message: len(message[-1]), LARGEST_STRETCH):
+        numbers, times, data = zip(*batch, strict=True)
+        yield RawMessages(
+            np.array(numbers), partial(np.array, times, dtype=np.int64), Packed.join(data)
+        )
+
+
+def batches(
+    items: Iterable[Piece], n_bytes_of: Callable[[Piece], int], most_bytes: int
+) -> Iterator[list[Piece]]:
+    """
+    Yield consecutive items in lists that end at a number of bytes, or at `STRETCH_MESSAGES` items.
+    """
+    batch = []
     n_bytes = 0
-    for number, received_ns, data in messages:
-        pending.append((number, received_ns, data))
-        n_bytes += len(data)
-        if len(pending) == STRETCH_MESSAGES or n_bytes >= LARGEST_STRETCH:
-            yield _raw(pending)
-            pending = []
+    for item in items:
+        batch.append(item)
+        n_bytes += n_bytes_of(item)
+        if len(batch) == STRETCH_MESSAGES or n_bytes >= most_bytes:
+            yield batch
+            batch = []
             n_bytes = 0
-    if pending:
-        yield _raw(pending)
-
-
-def _raw(pending: list[tuple[int, int, bytes]]) -> RawMessages:
-    """Return the RawMessages of a list of (index of the topic, receive time, message)."""
-    numbers, times, messages = zip(*pending, strict=True)
-    return RawMessages(
-        np.array(numbers), partial(np.array, times, dtype=np.int64), Packed.join(messages)
-    )
+    if batch:
+        yield batch
 
 
 class StorageFile:
@@ -179,8 +186,6 @@ def type_with_encoding(message_type: str, encoding: str) -> str:
     """Return a message type; serializations other than CDR are named after it."""
     return message_type if encoding == 'cdr' else f'{message_type} ({encoding})'
 
-
-Piece = TypeVar('Piece')
 
 PIECES_AHEAD = 3
 """Pieces that are read or wait at most; bounds the memory."""

@@ -294,11 +294,7 @@ def noise_from_mapping(document: Mapping[str, Any]) -> NoiseFigures:
 
 def _axis(section: Mapping[str, Any], k: int, deviation: Sequence[float]) -> AxisFigures:
     """Return the figures of axis k in the section of a sensor, with its Allan deviations."""
-    # A term without an interval does not exist on this axis.
-    terms = {}
-    for name in TERMS:
-        if name in section and section[name]['interval95'][k] is not None:
-            terms[name] = _term(name, section[name], k)
+    terms = _terms({name: section[name] for name in TERMS if name in section}, k)
     form = section['slow_part'][k]
     time_constant = [TIME_KEY] if GAUSS_MARKOV in form else []
     for needed in (WHITE.name, RANDOM_WALK.name, *form, *time_constant):
@@ -307,11 +303,6 @@ def _axis(section: Mapping[str, Any], k: int, deviation: Sequence[float]) -> Axi
                 f"every axis must have '{needed}', it is missing; write the noise document again",
                 code='part_missing',
             )
-    alternatives = {}
-    for name, entry in (section.get('alternatives') or {}).items():
-        if entry['interval95'][k] is not None:
-            alternatives[name] = _term(name, entry, k)
-
     trends = []
     for name, entry in (section.get('taken_out') or {}).items():
         if entry['value'][k] is not None:
@@ -331,7 +322,7 @@ def _axis(section: Mapping[str, Any], k: int, deviation: Sequence[float]) -> Axi
         terms,
         tuple(form),
         tuple(tuple(other) for other in section['also_possible'][k]),
-        alternatives,
+        _terms(section.get('alternatives') or {}, k),
         float(section['shortest_averaging_time'][k]),
         float(section['excess'][k]),
         None if oscillation is None else (float(oscillation[0]), float(oscillation[1])),
@@ -341,6 +332,15 @@ def _axis(section: Mapping[str, Any], k: int, deviation: Sequence[float]) -> Axi
         sample_sd=float(section['sample_sd'][k]),
         deviation=tuple(map(float, deviation)),
     )
+
+
+def _terms(entries: Mapping[str, Any], k: int) -> dict[str, Term]:
+    """Return the figures of axis k; an entry without an interval does not exist on this axis."""
+    terms = {}
+    for name, entry in entries.items():
+        if entry['interval95'][k] is not None:
+            terms[name] = _term(name, entry, k)
+    return terms
 
 
 def _term(name: str, entry: Mapping[str, Any], k: int) -> Term:
@@ -598,8 +598,8 @@ def noise_shortcomings(figures: NoiseFigures) -> list[str]:
         lines.append(f'{lacking} of {sum(n_of_status.values())} noise figures are not determined')
     for sensor, why in (figures.recording.get('unusable') or {}).items():
         lines.append(f'the noise of the {sensor} is not identified: {why}')
-    kept = round(figures.recording.get('seconds_at_rest', 0.0) * figures.rate)
-    dropped = dropped_text(figures.recording.get('dropped') or {}, kept)
+    n_samples = round(figures.recording.get('seconds_at_rest', 0.0) * figures.rate)
+    dropped = dropped_text(figures.recording.get('dropped') or {}, n_samples)
     if dropped:
         lines.append(dropped)
     return lines

@@ -349,8 +349,8 @@ def read_rest(source: BlockSource, nominal: RawReadings | None = None) -> Restin
         if axis in skipped:
             moments.append(None)
             continue
-        kept = search.kept(axis, trends[axis])
-        moments.append(Moments(scales, variance, variance > 0, kept, curve.parts[axis]))
+        kept_share = search.kept(axis, trends[axis])
+        moments.append(Moments(scales, variance, variance > 0, kept_share, curve.parts[axis]))
     return RestingRecord(
         curve=curve,
         moments=tuple(moments),

@@ -102,7 +102,7 @@ def _densities() -> tuple[np.ndarray, np.ndarray]:
     below = ndtr((edges - sizes) / widths) - ndtr((-edges - sizes) / widths)
     probability = np.maximum(np.diff(below, axis=-1), LEAST_PROBABILITY)
     # Errors of all sizes up to one.
-    of_sizes = probability[:, 1 : 1 + len(SIZES)]
-    uniform = np.cumsum(of_sizes, axis=1) / np.arange(1, len(SIZES) + 1)[:, None]
+    of_each_size = probability[:, 1 : 1 + len(SIZES)]
+    uniform = np.cumsum(of_each_size, axis=1) / np.arange(1, len(SIZES) + 1)[:, None]
     no_error = probability[:, :1]
     return no_error[:, 0], np.concatenate([probability[:, 1:], uniform], axis=1) - no_error

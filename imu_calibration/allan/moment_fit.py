@@ -302,10 +302,10 @@ def _best_time(
     squares = np.full(len(moments.times), np.inf)
     for n_chosen in range(len(free) + 1):
         for chosen in combinations(free, n_chosen):
-            of_subset = _squares_of_times(
+            squares_of_subset = _squares_of_times(
                 columns[:, list(chosen)], wander, targets, wander_is_fixed
             )
-            squares = np.minimum(squares, of_subset)
+            squares = np.minimum(squares, squares_of_subset)
     return int(np.argmin(squares))
 
 
@@ -510,6 +510,7 @@ class _ScoreOfCoefficient(_Score):
     def at(self, value: float) -> _Fixed:
         """Return the fit with the coefficient fixed at a value."""
         processes = self.fit.processes
+        # The correlation time is fitted too, unless its process is absent: then it has no effect.
         if processes[-1].time and (value > 0 or self.index != len(processes) - 1):
             fit = fit_with_time(self.moments, processes[:-1], {self.index: value})
         else:

@@ -190,16 +190,18 @@ class ScaleCovariance:
 
         # Spikes on the sampling instants are summed without interpolation.
         if one.lattice:
-            of_pairs = self._sum_at_spikes(other)
+            product_of_pairs = self._sum_at_spikes(other)
         elif other.lattice:
-            of_pairs = self._sum_at_spikes(one)
+            product_of_pairs = self._sum_at_spikes(one)
         else:
-            of_pairs = self._sum_of_products(self._correlation(one), self._correlation(other))
+            product_of_pairs = self._sum_of_products(
+                self._correlation(one), self._correlation(other)
+            )
 
         # Symmetric in the scales, and in the processes.
         matrix = np.zeros((len(self.factors), len(self.factors)))
-        matrix[self._first, self._second] = of_pairs
-        matrix[self._second, self._first] = of_pairs
+        matrix[self._first, self._second] = product_of_pairs
+        matrix[self._second, self._first] = product_of_pairs
         self._products[one, other] = matrix
         self._products[other, one] = matrix
         return matrix

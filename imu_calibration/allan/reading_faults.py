@@ -65,8 +65,8 @@ class ReadingFaults:
 
     def factor(self, column: int) -> float:
         """Return by how much the white noise of a column may be too high, at least 1."""
-        of_number = 1.0 / np.sqrt(1.0 - self.missing[column])
-        return float(self.tails[column] * self.repetition[column // 3] * of_number)
+        number_factor = 1.0 / np.sqrt(1.0 - self.missing[column])
+        return float(self.tails[column] * self.repetition[column // 3] * number_factor)
 
 
 NO_FAULTS = ReadingFaults(np.ones(6), np.zeros(6, bool), np.zeros(2), np.ones(2), NONE_REPLACED)

@@ -377,10 +377,11 @@ class Parts:
         freedom = (terms > 0).sum(axis=0) - 1
         level = (terms * variance).sum(axis=0) / total
         squares = (terms * (variance / level - 1.0) ** 2).sum(axis=0)
-        spread = total - (terms**2).sum(axis=0) / total
+        # Expectation of `squares` per variance of the levels.
+        squares_per_level = total - (terms**2).sum(axis=0) / total
         known = freedom > 0
         if not known.any():
             return 0.0
-        between = (squares - freedom * chance * total)[known] / spread[known]
-        precision = (spread / (chance * total))[known] ** 2 / freedom[known]
+        between = (squares - freedom * chance * total)[known] / squares_per_level[known]
+        precision = (squares_per_level / (chance * total))[known] ** 2 / freedom[known]
         return float(np.sqrt(max(np.sum(precision * between) / precision.sum(), 0.0)))

@@ -125,11 +125,11 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
         One for each turning joint that is read, except the first, rad.
 
     """
-    of_joint = dict(zip(table.joint_names.turning[1:], angles, strict=True))
+    sag_of_joint = dict(zip(table.joint_names.turning[1:], angles, strict=True))
     joints = []
     for joint in table.joints:
-        if joint.turns and of_joint.get(joint.source):
-            joint = replace(joint, sag=of_joint[joint.source])
+        if joint.turns and sag_of_joint.get(joint.source):
+            joint = replace(joint, sag=sag_of_joint[joint.source])
         joints.append(joint)
     return replace(table, joints=tuple(joints))
 
@@ -149,17 +149,17 @@ def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
 
     """
     parts = np.reshape(amplitudes, (len(table.joint_names.turning), len(WOBBLES), 2))
-    of_joint = {}
+    wobble_of_joint = {}
     for name, amplitudes_of_joint in zip(table.joint_names.turning, parts, strict=True):
         wobble = []
         for order, (cosine, sine) in zip(WOBBLES, amplitudes_of_joint, strict=True):
             if cosine or sine:
                 wobble.append((order, complex(cosine, sine)))
-        of_joint[name] = tuple(wobble)
+        wobble_of_joint[name] = tuple(wobble)
     joints = []
     for joint in table.joints:
         if joint.turns:
-            joint = replace(joint, wobble=of_joint[joint.source])
+            joint = replace(joint, wobble=wobble_of_joint[joint.source])
         joints.append(joint)
     return replace(table, joints=tuple(joints))
 
@@ -195,7 +195,7 @@ UP, RATE, ALPHA, FORCE = -4, -3, -2, -1
 
 
 class _Link(NamedTuple):
-    """A joint with its constants as arrays: its position is ``multiplier * reading + offset``."""
+    """A joint with its constants as arrays."""
 
     joint: Joint
     """The joint."""
@@ -207,10 +207,6 @@ class _Link(NamedTuple):
     """From the frame of the link before to the joint's frame, shape (3, 3)."""
     column: int
     """Column of the readings in the motion."""
-    multiplier: float
-    """1 unless the joint follows another one."""
-    offset: float
-    """rad or m; 0 unless the joint follows another one."""
     across: np.ndarray
     """`axis_error_directions`, shape (2, 3)."""
 
@@ -339,9 +335,9 @@ def _path_to_sensor(constants: _Constants, motion: JointMotion) -> _Path:
 
         # A joint at rest is a constant rotation or offset.
         if not link.joint.leans and not _moves(motion, link.column):
-            position = link.offset
+            position = link.joint.offset
             if len(motion.time):
-                position = link.offset + link.multiplier * motion.position[0, link.column]
+                position += link.joint.multiplier * motion.position[0, link.column]
             if link.joint.turns:
                 matrix = rotation(-position * link.axis) @ matrix
             else:
@@ -408,7 +404,6 @@ def _constants(table: Table) -> _Constants:
     columns = {name: column for column, name in enumerate(table.joint_names)}
     links = []
     for joint in table.joints:
-        mimic = joint.mimic
         links.append(
             _Link(
                 joint,
@@ -416,8 +411,6 @@ def _constants(table: Table) -> _Constants:
                 xyz=np.array(joint.xyz),
                 mat_in=joint.mat_before.T,
                 column=columns[joint.source],
-                multiplier=1.0 if mimic is None else mimic.multiplier,
-                offset=0.0 if mimic is None else mimic.offset,
                 across=axis_error_directions(np.array(joint.axis)),
             )
         )
@@ -486,9 +479,9 @@ def _move(columns: np.ndarray, step: _Step, motion: JointMotion, part: slice) ->
     """Return `columns` in the frame of the link after a moving joint, with its motion added."""
     # The motion about the coordinate axis of the step is `sense` times that of the joint.
     link = step.link
-    factor = step.sense * link.multiplier
+    factor = step.sense * link.joint.multiplier
     position = factor * motion.position[part, link.column]
-    position += step.sense * link.offset
+    position += step.sense * link.joint.offset
     rate = factor * motion.rate[part, link.column]
     acceleration = factor * motion.acceleration[part, link.column]
     if not link.joint.turns:

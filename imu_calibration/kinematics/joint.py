@@ -190,6 +190,16 @@ class Joint:
         return self.name if self.mimic is None else self.mimic.joint
 
     @property
+    def multiplier(self) -> float:
+        """Its motion per unit of the joint `source`."""
+        return 1.0 if self.mimic is None else self.mimic.multiplier
+
+    @property
+    def offset(self) -> float:
+        """Its position where the joint `source` is at zero, rad or m."""
+        return 0.0 if self.mimic is None else self.mimic.offset
+
+    @property
     def mat_before(self) -> np.ndarray:
         """Joint's frame at joint zero to the frame of the link before, shape (3, 3)."""
         return rotation_from_rpy(np.radians(self.rpy_deg))

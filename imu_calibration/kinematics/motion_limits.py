@@ -259,17 +259,12 @@ def limits_of(table: Table) -> MotionLimits:
         limits = joint.limits
         turns[column] = joint.turns
 
-        # A follower is at factor * position + offset of the joint that is read.
-        factor = 1.0
-        offset = 0.0
-        if joint.mimic is not None:
-            factor = joint.mimic.multiplier
-            offset = joint.mimic.offset
-
         # The smallest common range. A follower with the factor 0 does not move.
+        factor = joint.multiplier
         if factor and limits.lower is not None and limits.upper is not None:
             # A negative factor exchanges the ends.
-            low, high = sorted(((limits.lower - offset) / factor, (limits.upper - offset) / factor))
+            ends = ((end - joint.offset) / factor for end in (limits.lower, limits.upper))
+            low, high = sorted(ends)
             if low > lower[column] or high < upper[column]:
                 origins[column][0] = _origin(joint, 'lower')
             lower[column] = max(lower[column], low)

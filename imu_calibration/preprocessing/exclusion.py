@@ -78,10 +78,10 @@ def exclusions_by_recording(
                 key='exclude',
                 code='exclude_recording',
             )
-    of_recordings = []
+    times_of_recordings = []
     for name in names:
-        of_recordings.append([each for each in exclusions if each.recording in ('', name)])
-    return of_recordings
+        times_of_recordings.append([each for each in exclusions if each.recording in ('', name)])
+    return times_of_recordings
 
 
 def exclusions_of_units(
@@ -111,13 +111,13 @@ def exclusions_of_units(
                 key='exclude',
                 code='exclude_recording',
             )
-    of_units: dict[str, list[list[Exclusion]]] = {}
+    times_of_units: dict[str, list[list[Exclusion]]] = {}
     for unit, recordings in recordings_of.items():
-        of_units[unit] = []
+        times_of_units[unit] = []
         for recording in recordings:
             names = ('', unit, recording)
-            of_units[unit].append([each for each in exclusions if each.recording in names])
-    return of_units
+            times_of_units[unit].append([each for each in exclusions if each.recording in names])
+    return times_of_units
 
 
 class ExclusionMask:

@@ -159,6 +159,7 @@ class Extremes:
         value_before_all = self._last_value
         self._last_value = values[-1]
         largest = values.max()
+        # Smaller values decide nothing: only a pile at the largest one may be the end of a range.
         if largest <= 0 or largest < NEAR_LARGEST_SHARE * self.level:
             return
         # A new largest value: the previous one becomes one of those below it.

@@ -540,7 +540,8 @@ def _not_turning(rate: np.ndarray, rests: list[slice]) -> list[slice]:
     median = np.median(means, axis=0)
     limit = np.maximum(_TURNING_SD * noise, 0.01 * _farthest(rate, median))
     keep = np.all(np.abs(means - median) <= limit, axis=1)
-    # An isolated deviation from both neighbours; the drift of warming biases is smooth.
+    # An isolated deviation from both neighbours, which lie on one side; the drift of warming biases
+    # is smooth. Of a steady drift both steps are equal, and half their difference is zero.
     if len(rests) >= _ENOUGH:
         step = np.diff(means, axis=0)
         smaller_step = np.minimum(np.abs(step[:-1]), np.abs(step[1:]))

@@ -319,10 +319,10 @@ def long_runs(flags: np.ndarray) -> np.ndarray:
 
 def in_long_runs(flags: np.ndarray) -> np.ndarray:
     """Return the flags without runs of fewer than `LONG_RUN_CHUNKS`."""
-    kept = np.zeros(len(flags), bool)
+    is_in_long_run = np.zeros(len(flags), bool)
     for start, stop in long_runs(flags):
-        kept[start:stop] = True
-    return kept
+        is_in_long_run[start:stop] = True
+    return is_in_long_run
 
 
 def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarray]:

@@ -161,15 +161,16 @@ def join_sensors(
         slower, stamp_ns = 'accelerometer', accelerometer.stamp_ns
     force, has_force = interpolated(accelerometer, stamp_ns)
     rate, has_rate = interpolated(gyroscope, stamp_ns)
-    kept = has_force & has_rate
-    if np.count_nonzero(kept) < MIN_OVERLAP_SAMPLES:
+    has_both = has_force & has_rate
+    n_common = np.count_nonzero(has_both)
+    if n_common < MIN_OVERLAP_SAMPLES:
         raise InputError(
             'accelerometer and gyroscope must be recorded at the same time, by one clock, for at'
-            f' least {MIN_OVERLAP_SAMPLES} samples, {np.count_nonzero(kept)} are common; give two'
+            f' least {MIN_OVERLAP_SAMPLES} samples, {n_common} are common; give two'
             ' recordings of one session',
             code='no_overlap',
         )
-    imu = ImuSamples(stamp_ns[kept], force[kept], rate[kept], frame_id)
+    imu = ImuSamples(stamp_ns[has_both], force[has_both], rate[has_both], frame_id)
     return JoinedSensors(imu, slower, gyroscope_delay(accelerometer, gyroscope))
 
 

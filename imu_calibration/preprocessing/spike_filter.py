@@ -138,9 +138,9 @@ class SpikeFilter:
         chunk = np.maximum((self._first_row + rows) // NOISE_SAMPLES - 1, 0)
         n_noise = len(self._noise_sds)
         noise_row = np.clip(chunk - self._n_chunks + n_noise, 0, n_noise - 1)
-        limit = LARGE_SDS * self._noise_sds[noise_row]
+        limits = LARGE_SDS * self._noise_sds[noise_row]  # of all readings, shape (n, 6)
         # Each candidate is one reading: an index into `rows`, and a column.
-        candidate, column = np.nonzero(second[rows] > _CANDIDATE / LARGE_SDS * limit)
+        candidate, column = np.nonzero(second[rows] > _CANDIDATE / LARGE_SDS * limits)
         is_spike = np.zeros(len(rows), bool)
         if not len(candidate):
             return is_spike
@@ -148,7 +148,7 @@ class SpikeFilter:
 
         # A knock affects two neighbours on either side, and several columns.
         inner = np.clip(row, 2, len(values) - 3)
-        is_knock = _is_knock(values[inner[:, None] + [-2, -1, 1, 2]], limit[candidate])
+        is_knock = _is_knock(values[inner[:, None] + [-2, -1, 1, 2]], limits[candidate])
         is_knock &= inner == row
 
         # During vibration, as at the first touch of a hand, the previous noise does not apply; a
@@ -156,7 +156,7 @@ class SpikeFilter:
         first = np.clip(row - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
         window = first[:, None] + np.arange(2 * SPIKE_REACH + 1)
         shaking = LARGE_SDS * _NORMAL * np.median(second[window[:, 1:-1], column[:, None]], axis=1)
-        limit = np.maximum(limit[candidate, column], shaking)
+        limit = np.maximum(limits[candidate, column], shaking)
 
         # The nine readings around each candidate, and its place among them.
         first = np.clip(row - SPIKE_NEIGHBOURS, 0, len(values) - 2 * SPIKE_NEIGHBOURS - 1)
@@ -263,7 +263,7 @@ def _off_the_median(around, place, limit):
     """
     Return where readings deviate from the median of nine, which two further outliers do not move.
 
-    By far more than their spread, and without a smaller deviation of a neighbour, which
+    By far more than their inner_range, and without a smaller deviation of a neighbour, which
     indicates a knock. Arguments as for `_contradicted`.
     """
     ordered = np.sort(around, axis=1)
@@ -271,9 +271,9 @@ def _off_the_median(around, place, limit):
     rows = np.arange(len(around))
     deviation = deviations[rows, place]
     neighbours = np.clip(place[:, None] + [-2, -1, 1, 2], 0, 2 * SPIKE_NEIGHBOURS)
-    of_neighbours = deviations[rows[:, None], neighbours]
-    is_visible = of_neighbours > np.maximum(BETWEEN[0] * deviation, 0.5 * limit)[:, None]
-    is_smaller = of_neighbours < BETWEEN[1] * deviation[:, None]
+    neighbour_deviations = deviations[rows[:, None], neighbours]
+    is_visible = neighbour_deviations > np.maximum(BETWEEN[0] * deviation, 0.5 * limit)[:, None]
+    is_smaller = neighbour_deviations < BETWEEN[1] * deviation[:, None]
     is_knock = (is_visible & is_smaller).any(axis=1)
-    spread = ordered[:, -3] - ordered[:, 2]
-    return (deviation > np.maximum(limit, SPIKE_SPREADS * spread)) & ~is_knock
+    inner_range = ordered[:, -3] - ordered[:, 2]
+    return (deviation > np.maximum(limit, SPIKE_SPREADS * inner_range)) & ~is_knock

@@ -177,9 +177,9 @@ def regular_share(step: np.ndarray, period: float) -> float:
     """
     n_periods = np.rint(step / period)
     is_multiple = np.abs(step / period - n_periods) <= WHOLE_STEP_SHARE
-    good = is_regular(step, period) | ((n_periods >= 2) & is_multiple)
-    n_lost = float(np.sum(n_periods[good] - 1, where=n_periods[good] > 1))
-    return 0.0 if n_lost > MOST_LOST * len(step) else float(good.mean())
+    is_explained = is_regular(step, period) | ((n_periods >= 2) & is_multiple)
+    n_lost = float(np.sum(n_periods[is_explained] - 1, where=n_periods[is_explained] > 1))
+    return 0.0 if n_lost > MOST_LOST * len(step) else float(is_explained.mean())
 
 
 def _without_losses(lagged: np.ndarray, resolution: float) -> np.ndarray:
@@ -664,9 +664,9 @@ class SampleTimes:
         if not len(repeated):
             return samples
         self.n_repeated += len(repeated)
-        kept = np.arange(len(joined)) >= n_before
-        kept[repeated] = False
-        return joined.select(kept)
+        is_kept = np.arange(len(joined)) >= n_before
+        is_kept[repeated] = False
+        return joined.select(is_kept)
 
     def _add_part(self, part: ImuSamples) -> list:
         """

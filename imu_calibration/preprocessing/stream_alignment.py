@@ -333,9 +333,9 @@ class MotionChunks:
         motion = JointMotion(
             time[core] + self.time_origin,
             *derivatives,
-            temperature.branch,
-            vibration,
-            temperature.rate,
+            thermal_branch=temperature.branch,
+            vibration=vibration,
+            temperature_rate=temperature.rate,
         )
         samples = PhasedSamples(
             stamp_ns,

@@ -183,8 +183,8 @@ class _LineFits:
         sum_t, sum_tt = _window_sums(np.stack([t, t * t]), n_side)
         sum_p = _window_sums(p, n_side)
         sum_tp = _window_sums(p * t, n_side)
-        spread = np.maximum(sum_tt - sum_t**2 / count, 1e-18)
-        slope = (sum_tp - sum_t * sum_p / count) / spread
+        time_squares = np.maximum(sum_tt - sum_t**2 / count, 1e-18)
+        slope = (sum_tp - sum_t * sum_p / count) / time_squares
         residual = p - sum_p / count - slope * (t - sum_t / count)
         return cls(half, slope, sum_p / count + origin, residual)
 

@@ -123,16 +123,14 @@ class WrapFilter:
         Return the list of `WrappedSpan`, and the stamp of the first step that may still return, ns.
         """
         row, column, up = wrap_steps(samples, self._largest)
-        new = samples.stamp_ns[row] > self._returned_ns[column]
-        row = row[new]
-        column = column[new]
-        up = up[new]
+        is_new = samples.stamp_ns[row] > self._returned_ns[column]
+        row, column, up = row[is_new], column[is_new], up[is_new]
         spans = []
         open_steps = []
         for number in np.unique(column):
-            of_column = column == number
-            stamp_ns = samples.stamp_ns[row[of_column]]
-            returns_ns, open_ns = _returns(stamp_ns, up[of_column])
+            is_in_column = column == number
+            stamp_ns = samples.stamp_ns[row[is_in_column]]
+            returns_ns, open_ns = _returns(stamp_ns, up[is_in_column])
             for first_ns, return_ns in returns_ns:
                 spans.append(WrappedSpan(int(number), int(first_ns), int(return_ns)))
             # A step at the end may still return.
@@ -162,9 +160,7 @@ def _returns(stamp_ns, up):
             k += 2
         else:
             k += 1
-    if k < len(stamp_ns):
-        return pairs, stamp_ns[k]
-    return pairs, None
+    return pairs, stamp_ns[k] if k < len(stamp_ns) else None
 
 
 def largest_so_far(samples: ImuSamples, before: np.ndarray) -> np.ndarray:
@@ -209,16 +205,13 @@ def wrap_steps(
 
     """
     values = np.hstack([samples.force_s, samples.rate_s])
-    none = np.zeros(0, int)
-    if len(values) < 6:
-        return none, none, none.astype(bool)
     step = np.diff(values, axis=0)
     row, column = np.nonzero(np.abs(step) > LEAST_WRAP)
-    inside = (row >= 2) & (row + 2 < len(step))
-    row = row[inside]
-    column = column[inside]
+    # With two steps before and after, which are compared.
+    is_inside = (row >= 2) & (row + 2 < len(step))
+    row, column = row[is_inside], column[is_inside]
     if not len(row):
-        return none, none, none.astype(bool)
+        return row, column, np.zeros(0, bool)
     size = step[row, column]
     before = values[row, column]
     after = values[row + 1, column]
