@@ -183,9 +183,9 @@ class TrendSearch:
             chosen.append(trend)
         if not chosen:
             return ()
-        values, sds, _ = self.regress(axis, chosen)
+        fit = self.regress(axis, chosen)
         trends = []
-        for (name, time_constant), value, sd in zip(chosen, values, sds):
+        for (name, time_constant), value, sd in zip(chosen, fit.values, fit.sds):
             trends.append(AxisTrend(name, float(value), float(sd), time_constant))
         return tuple(trends)
 
@@ -210,8 +210,8 @@ class TrendSearch:
 
         scores = []
         for trial in trials:
-            values, sd, _ = self.regress(axis, [*chosen, trial])
-            scores.append(abs(values[-1]) / sd[-1])
+            fit = self.regress(axis, [*chosen, trial])
+            scores.append(abs(fit.values[-1]) / fit.sds[-1])
         best = int(np.argmax(scores))
         name, _ = trials[best]
         return None if scores[best] < MIN_TREND_SDS[name] else trials[best]
@@ -226,11 +226,9 @@ class TrendSearch:
             )
         return regressors
 
-    def regress(
-        self, axis: int, trends: list[tuple[str, float]]
-    ) -> tuple[np.ndarray, np.ndarray, int]:
+    def regress(self, axis: int, trends: list[tuple[str, float]]) -> '_TrendFit':
         """
-        Return (coefficients of the trends, their sds, index of the likeliest variance ratio).
+        Return the fit of trends with the likeliest variance ratio.
 
         By generalised least squares for each ratio. With the covariance C, the design X of p
         columns and the weighted sum r of squared residuals, the likeliest ratio has the least::
@@ -255,7 +253,7 @@ class TrendSearch:
         root = np.linalg.inv(triangle[best])
         values = root @ projected[best] / norms
         sd = np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / norms
-        return values[-len(trends) :], sd[-len(trends) :], best
+        return _TrendFit(values[-len(trends) :], sd[-len(trends) :], self._whitenings[best])
 
     def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
         """
@@ -267,8 +265,7 @@ class TrendSearch:
         if not trends:
             return KeptShare()
         pairs = [(trend.name, trend.time) for trend in trends]
-        _, _, ratio = self.regress(axis, pairs)
-        whitening = self._whitenings[ratio]
+        whitening = self.regress(axis, pairs).whitening
         design = np.column_stack([self._constants, self.columns(pairs)])
         remaining = np.eye(len(design)) - design @ np.linalg.pinv(whitening @ design) @ whitening
         # Blocks per mean, two per octave.
@@ -317,6 +314,18 @@ class TrendSearch:
             row[k : k + count] = -1.0 / count
             row[k + count : k + 2 * count] = 1.0 / count
         return rows
+
+
+@dataclass(frozen=True, eq=False)
+class _TrendFit:
+    """Generalised least squares of n_trends trends in n blocks."""
+
+    values: np.ndarray
+    """Coefficients of the trends, shape (n_trends,)."""
+    sds: np.ndarray
+    """Their standard deviations."""
+    whitening: np.ndarray
+    """Inverse Cholesky factor of the covariance of the blocks, shape (n, n)."""
 
 
 @dataclass(frozen=True, eq=False)

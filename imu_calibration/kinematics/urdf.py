@@ -36,15 +36,34 @@ NAMED = 6
 """Largest number of frames in one line."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Placement:
+    """A frame relative to an outer frame."""
+
+    xyz: np.ndarray
+    """Origin in the outer frame, m, shape (3,)."""
+    matrix: np.ndarray
+    """Turns vectors into the outer frame, shape (3, 3)."""
+
+    def then(self, xyz: np.ndarray, matrix: np.ndarray) -> '_Placement':
+        """Return the placement, in the outer frame, of a frame that is placed in this one."""
+        return _Placement(self.xyz + self.matrix @ xyz, self.matrix @ matrix)
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The fields `xyz` and `rpy_deg` of a `Joint`."""
+        return {
+            'xyz': tuple(self.xyz.tolist()),
+            'rpy_deg': tuple(np.degrees(rpy_from_rotation(self.matrix)).tolist()),
+        }
+
+
 class StaticTransforms:
     """Transforms from parent to child frames; the newest of each child counts, as in tf2."""
 
     def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}
-        """
-        Child -> (parent, origin of the child in the parent, m, matrix from the child to the
-        parent).
-        """
+        self._parents: dict[str, tuple[str, _Placement]] = {}
+        """Child -> (parent, placement of the child in it)."""
 
     def add(
         self,
@@ -71,7 +90,7 @@ class StaticTransforms:
             return False
         if np.linalg.norm(quaternion) <= 0.5:
             return False
-        self._parents[child] = (parent, xyz, rotations_from_quaternions(quaternion))
+        self._parents[child] = parent, _Placement(xyz, rotations_from_quaternions(quaternion))
         return True
 
     def pose(self, target: str, source: str) -> tuple[np.ndarray, np.ndarray] | None:
@@ -86,15 +105,16 @@ class StaticTransforms:
             Turns source vectors into target vectors, shape (3, 3).
 
         """
-        source_root, xyz_s, mat_rs = self._in_root(source)
-        target_root, xyz_t, mat_rt = self._in_root(target)
+        source_root, source_frame = self._in_root(source)
+        target_root, target_frame = self._in_root(target)
         if source_root != target_root:
             return None
-        return mat_rt.T @ (xyz_s - xyz_t), mat_rt.T @ mat_rs
+        mat_tr = target_frame.matrix.T
+        return mat_tr @ (source_frame.xyz - target_frame.xyz), mat_tr @ source_frame.matrix
 
     def why_not(self, target: str, source: str) -> str:
         """Return the missing connection of two frames as text."""
-        known = {*self._parents, *(parent for parent, _, _ in self._parents.values())}
+        known = {*self._parents, *(parent for parent, _ in self._parents.values())}
         if not known:
             return 'no static transform has come'
         absent = [f"'{name}'" for name in (target, source) if name not in known]
@@ -109,25 +129,23 @@ class StaticTransforms:
             f' {self._in_root(target)[0]}, {self._in_root(source)[0]})'
         )
 
-    def _in_root(self, frame: str) -> tuple[str, np.ndarray, np.ndarray]:
+    def _in_root(self, frame: str) -> tuple[str, _Placement]:
         """
-        Return (root, origin of `frame` in it, m, matrix from `frame` to it).
+        Return (root, placement of `frame` in it).
 
         In a circle of frames the root is the last one before the circle closes.
         """
         ancestor = frame
-        xyz = np.zeros(3)
-        matrix = np.eye(3)
+        placement = _Placement(np.zeros(3), np.eye(3))
         seen = {frame}
         while ancestor in self._parents:
-            parent, xyz_in_parent, matrix_to_parent = self._parents[ancestor]
+            parent, ancestor_in_parent = self._parents[ancestor]
             if parent in seen:
                 break
             ancestor = parent
-            xyz = xyz_in_parent + matrix_to_parent @ xyz
-            matrix = matrix_to_parent @ matrix
+            placement = ancestor_in_parent.then(placement.xyz, placement.matrix)
             seen.add(parent)
-        return ancestor, xyz, matrix
+        return ancestor, placement
 
 
 def up_of(
@@ -154,7 +172,7 @@ def up_of(
     tree = StaticTransforms()
     for parent, child, quaternion in transforms:
         tree.add(parent, child, xyz=(0.0, 0.0, 0.0), quaternion=quaternion)
-    frame, _, mat = tree._in_root(root)
+    frame, placement = tree._in_root(root)
     if frame in tree._parents:
         raise InputError(
             f"static transforms must form a tree, those around '{frame}' form a circle; correct"
@@ -162,7 +180,7 @@ def up_of(
             key='up',
             code='frame_circle',
         )
-    return tuple(mat[2].tolist())
+    return tuple(placement.matrix[2].tolist())
 
 
 JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}
@@ -237,28 +255,6 @@ def root_of(text: str | bytes) -> str:
             ' correct it'
         )
     return roots[0]
-
-
-@dataclass(frozen=True, eq=False)
-class _Placement:
-    """A frame relative to an outer frame."""
-
-    xyz: np.ndarray
-    """Origin in the outer frame, m, shape (3,)."""
-    matrix: np.ndarray
-    """Turns vectors into the outer frame, shape (3, 3)."""
-
-    def then(self, xyz: np.ndarray, matrix: np.ndarray) -> '_Placement':
-        """Return the placement, in the outer frame, of a frame that is placed in this one."""
-        return _Placement(self.xyz + self.matrix @ xyz, self.matrix @ matrix)
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """The fields `xyz` and `rpy_deg` of a `Joint`."""
-        return {
-            'xyz': tuple(self.xyz.tolist()),
-            'rpy_deg': tuple(np.degrees(rpy_from_rotation(self.matrix)).tolist()),
-        }
 
 
 def _read(text: str | bytes) -> Any:

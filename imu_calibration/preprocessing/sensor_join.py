@@ -346,28 +346,35 @@ class _DelayCost:
 
     def residual(self, delay: float) -> float:
         """Return the least sum of squares of all windows."""
-        normal, applied, observed = (of_parts.sum(axis=0) for of_parts in self._equations(delay))
-        return float(_least_squares_residual(normal, applied, observed))
+        parts = self._equations(delay)
+        return float(
+            _least_squares_residual(
+                parts.normal.sum(axis=0), parts.applied.sum(axis=0), parts.observed.sum()
+            )
+        )
 
     def residuals_without_parts(self, delay: float) -> np.ndarray:
         """Return the least sums of squares of all windows, then without each part, (k + 1,)."""
-        normal, applied, observed = self._equations(delay)
+        parts = self._equations(delay)
         return _least_squares_residual(
-            _all_and_without_each(normal),
-            _all_and_without_each(applied),
-            _all_and_without_each(observed),
+            _all_and_without_each(parts.normal),
+            _all_and_without_each(parts.applied),
+            _all_and_without_each(parts.observed),
         )
 
     def prediction_error(self, delay: float) -> float:
         """Return the sum of squares of each part with A and b of the other parts."""
-        normal, applied, observed = self._equations(delay)
-        fit = _least_squares(_all_and_without_each(normal)[1:], _all_and_without_each(applied)[1:])
+        parts = self._equations(delay)
+        fit = _least_squares(
+            _all_and_without_each(parts.normal)[1:], _all_and_without_each(parts.applied)[1:]
+        )
         # |y - X x|^2 = y'y - 2 b'x + x'N x
-        crossed = np.einsum('ki,ki->', fit, applied)
-        return float(observed.sum() - 2.0 * crossed + np.einsum('ki,kij,kj->', fit, normal, fit))
+        crossed = np.einsum('ki,ki->', fit, parts.applied)
+        squares = np.einsum('ki,kij,kj->', fit, parts.normal, fit)
+        return float(parts.observed.sum() - 2.0 * crossed + squares)
 
-    def _equations(self, delay: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (N, b, y'y) of the normal equations of each part, (k, 12, 12), (k, 12), (k,)."""
+    def _equations(self, delay: float) -> '_PartEquations':
+        """Return the normal equations of each part."""
         start, stop = self._windows.start, self._windows.stop
         turned = np.empty((len(start), 4))
         for axis in range(3):
@@ -382,13 +389,25 @@ class _DelayCost:
             blocks = (self._cross_squares[number] @ products[part]).reshape(3, 3, 4, 4)
             normal[number] = blocks.transpose(0, 2, 1, 3).reshape(12, 12)
             applied[number] = (self._cross_changes[number] @ turned[part]).reshape(12)
-        return normal, applied, self._change_squares
+        return _PartEquations(normal, applied, self._change_squares)
 
 
-def _all_and_without_each(of_parts: np.ndarray) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class _PartEquations:
+    """Normal equations ``N x = b`` of each of k parts."""
+
+    normal: np.ndarray
+    """N, shape (k, 12, 12)."""
+    applied: np.ndarray
+    """b, shape (k, 12)."""
+    observed: np.ndarray
+    """Squares ``y.T y`` of the changes of direction, shape (k,)."""
+
+
+def _all_and_without_each(parts: np.ndarray) -> np.ndarray:
     """Return the sum over the parts, then without each part in turn, shape (k + 1, ...)."""
-    total = of_parts.sum(axis=0)
-    return np.concatenate([total[None], total - of_parts])
+    total = parts.sum(axis=0)
+    return np.concatenate([total[None], total - parts])
 
 
 @dataclass(frozen=True, eq=False)
