@@ -19,7 +19,14 @@ from msg_adapters.csv_log import LogOptions
 from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
-from msg_adapters.layout import NS_PER_S, MessageLayout, Packed, group_by_layout
+from msg_adapters.layout import (
+    ENCAPSULATION_SIZE,
+    FRAME_OFFSET,
+    NS_PER_S,
+    MessageLayout,
+    Packed,
+    group_by_layout,
+)
 from msg_adapters.storage import RawMessages
 
 
@@ -228,8 +235,12 @@ class _Patch:
             table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
             if self.late_ns:
                 seconds, nanoseconds = np.divmod(layout.stamp_ns(group) - self.late_ns, NS_PER_S)
-                table[:, 4:8] = _bytes_of(seconds, layout.order + 'i4')
-                table[:, 8:12] = _bytes_of(nanoseconds, layout.order + 'u4')
+                table[:, ENCAPSULATION_SIZE:FRAME_OFFSET] = np.hstack(
+                    [
+                        _bytes_of(seconds, layout.order + 'i4'),
+                        _bytes_of(nanoseconds, layout.order + 'u4'),
+                    ]
+                )
             tables.append(Packed.of_rows(table))
         # From the order of the groups to that of the messages.
         order = np.argsort(np.concatenate([index for _, index, _ in groups]))

@@ -313,10 +313,11 @@ def read_csv(
     readings = _sensors(table, by_quantity, stamp_ns, time)
     used = [time, *readings.columns]
     temperature = None
-    if 'temperature' in by_quantity:
-        column = _with_unit(by_quantity['temperature'], lambda: 'C', path)
-        temperature = TemperatureSamples(stamp_ns, table.values(column.names)[:, 0])
-        used.append(column)
+    for each in chosen:
+        if each.quantity == 'temperature':
+            column = _with_unit(each, lambda: 'C', path)
+            temperature = TemperatureSamples(stamp_ns, table.values(column.names)[:, 0])
+            used.append(column)
     angles = {}
     for each in chosen:
         if each.quantity == 'joint':

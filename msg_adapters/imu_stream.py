@@ -12,13 +12,18 @@ import numpy as np
 
 from imu_calibration.preprocessing.recording_evidence import MESSAGE_QUANTITIES, MessageEvidence
 from msg_adapters.imu import find_imu_layout
-from msg_adapters.layout import MessageError, frame_head
+from msg_adapters.layout import (
+    ENCAPSULATION_SIZE,
+    FRAME_OFFSET,
+    NS_PER_S,
+    MessageError,
+    frame_head,
+)
 
-STAMP_AT = 4
-"""Bytes before the stamp: encapsulation."""
-HEAD_AT = 12
-"""Bytes before the frame_id's length: encapsulation and stamp."""
-NS = 1_000_000_000
+VECTOR_SIZE = 24
+"""Bytes of a rate or a force, which its covariance follows."""
+COVARIANCE_SIZE = 72
+"""Bytes of a covariance."""
 
 
 class ImuStream:
@@ -43,16 +48,19 @@ class ImuStream:
         self._order = b''
         """First two bytes, which state the byte order."""
         self._head = b''
-        """Length and text of the frame_id, up to the byte `_head_end`."""
-        self._head_end = HEAD_AT
+        """Length and text of the frame_id."""
+        self._head_part = slice(FRAME_OFFSET, FRAME_OFFSET)
+        """Its bytes."""
         self._head_out = b''
         """Frame of the written messages, with its padding."""
         self._body = 0
         """Offset of the orientation."""
         self._rate_at = 0
-        """Offset of the angular velocity, which its covariance follows."""
-        self._force_at = 0
-        """Offset of the acceleration, which its covariance follows."""
+        """Offset of the angular velocity."""
+        self._rate_cov_part = slice(0)
+        """Bytes of its covariance."""
+        self._force_cov_part = slice(0)
+        """Bytes of the covariance of the acceleration, to the end of the message."""
         self._rate_cov = b''
         """Bytes of the covariance of the rate that `covariances` returned last."""
         self._force_cov = b''
@@ -83,10 +91,13 @@ class ImuStream:
         self._order = data[:2]
         self._body = layout.offsets['orientation'][0]
         # The padding after it is arbitrary.
-        self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]
-        self._head = data[HEAD_AT : self._head_end]
+        head_end = FRAME_OFFSET + 4 + struct.unpack_from(layout.order + 'I', data, FRAME_OFFSET)[0]
+        self._head_part = slice(FRAME_OFFSET, head_end)
+        self._head = data[self._head_part]
         self._rate_at = layout.offsets['rate_s'][0]
-        self._force_at = layout.offsets['force_s'][0]
+        rate_end = self._rate_at + VECTOR_SIZE
+        self._rate_cov_part = slice(rate_end, rate_end + COVARIANCE_SIZE)
+        self._force_cov_part = slice(layout.offsets['force_s'][0] + VECTOR_SIZE, None)
         frame_id = layout.names[0]
         frame_out = frame_id if self._frame_out is None else self._frame_out
         self._head_out = frame_head(frame_out, layout.order)
@@ -102,18 +113,18 @@ class ImuStream:
         """
         if (
             len(data) != self._size
-            or data[HEAD_AT : self._head_end] != self._head
+            or data[self._head_part] != self._head
             or data[:2] != self._order
-            or data[self._rate_at + 24 : self._rate_at + 96] != self._rate_cov
-            or data[self._force_at + 24 :] != self._force_cov
+            or data[self._rate_cov_part] != self._rate_cov
+            or data[self._force_cov_part] != self._force_cov
         ):
             return None
         return self.read(data)
 
     def read(self, data: bytes) -> tuple[int, tuple[float, ...]]:
         """Return (stamp in ns, readings) of a message of known layout."""
-        seconds, nanoseconds = self._stamp.unpack_from(data, STAMP_AT)
-        return seconds * NS + nanoseconds, self._readings.unpack_from(data, self._rate_at)
+        seconds, nanoseconds = self._stamp.unpack_from(data, ENCAPSULATION_SIZE)
+        return seconds * NS_PER_S + nanoseconds, self._readings.unpack_from(data, self._rate_at)
 
     def heads(self, data: bytes) -> bool:
         """
@@ -121,7 +132,7 @@ class ImuStream:
         """
         return (
             len(data) == self._size
-            and data[HEAD_AT : self._head_end] == self._head
+            and data[self._head_part] == self._head
             and data[:2] == self._order
         )
 
@@ -131,15 +142,16 @@ class ImuStream:
 
     def covariances(self, data: bytes) -> tuple[np.ndarray, ...]:
         """Return the covariances of (force, rate), each (3, 3), and keep their bytes for `take`."""
-        self._rate_cov = data[self._rate_at + 24 : self._rate_at + 96]
-        self._force_cov = data[self._force_at + 24 :]
+        self._rate_cov = data[self._rate_cov_part]
+        self._force_cov = data[self._force_cov_part]
         force_cov = np.array(self._nine.unpack_from(self._force_cov)).reshape(3, 3)
         rate_cov = np.array(self._nine.unpack_from(self._rate_cov)).reshape(3, 3)
         return force_cov, rate_cov
 
     def orientation(self, data: bytes) -> tuple[tuple[float, ...], bytes]:
         """Return (quaternion x, y, z, w; its covariance as bytes)."""
-        return self._four.unpack_from(data, self._body), data[self._body + 32 : self._rate_at]
+        covariance_start = self._body + self._four.size
+        return self._four.unpack_from(data, self._body), data[covariance_start : self._rate_at]
 
     def unpacked(self, covariance: bytes) -> np.ndarray:
         """Return the matrix in the bytes of a covariance, shape (3, 3)."""
@@ -177,9 +189,10 @@ class ImuStream:
         tail = self._tail.pack(*readings[:3], rate_cov, *readings[3:], force_cov)
         if orientation is None and not self._late_ns:
             return data[: self._rate_at] + tail
-        start = data[:STAMP_AT] + self._stamp.pack(*divmod(stamp_ns - self._late_ns, NS))
+        stamp = self._stamp.pack(*divmod(stamp_ns - self._late_ns, NS_PER_S))
+        start = data[:ENCAPSULATION_SIZE] + stamp
         if orientation is None:
-            return start + data[HEAD_AT : self._rate_at] + tail
+            return start + data[FRAME_OFFSET : self._rate_at] + tail
         return start + self._head_out + self._four.pack(*orientation[0]) + orientation[1] + tail
 
 

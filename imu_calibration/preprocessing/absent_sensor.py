@@ -83,9 +83,9 @@ def without_sensor(samples: ImuSamples, sensor: str) -> ImuSamples:
 
 def missing_sensors(samples: ImuSamples) -> tuple[str, ...]:
     """Return the sensors without a finite reading."""
+    readings_of = {'accelerometer': samples.force_s, 'gyroscope': samples.rate_s}
     missing = []
-    if not np.isfinite(samples.force_s).all(axis=1).any():
-        missing.append('accelerometer')
-    if not np.isfinite(samples.rate_s).all(axis=1).any():
-        missing.append('gyroscope')
+    for sensor, readings in readings_of.items():
+        if not np.isfinite(readings).all(axis=1).any():
+            missing.append(sensor)
     return tuple(missing)

@@ -325,17 +325,20 @@ class MotionChunks:
         self._previous_ns = int(stamp_ns[-1])
         self._previous_is_lost = bool(is_lost[-1])
 
-        derivatives = self._joint_derivatives(
+        position, joint_rate, acceleration, jerk = self._joint_derivatives(
             joints.level[core], time[core], joints.phase[core], runs
         )
         temperature = self._temperature_at(stamp_ns, last_ns)
         vibration = self._vibration.of(period, imu.force_s[core])
         motion = JointMotion(
             time[core] + self.time_origin,
-            *derivatives,
-            thermal_branch=temperature.branch,
-            vibration=vibration,
-            temperature_rate=temperature.rate,
+            position,
+            joint_rate,
+            acceleration,
+            jerk,
+            temperature.branch,
+            vibration,
+            temperature.rate,
         )
         samples = PhasedSamples(
             stamp_ns,
