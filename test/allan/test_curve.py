@@ -7,7 +7,7 @@ What allantools gives, however the stream is cut, with holes, in bounded memory.
 import numpy as np
 import pytest
 
-from imu_calibration.allan.curve import FULL, AllanSums, SampleGrid, averaging_factors, spread
+from imu_calibration.allan.curve import FULL, AllanSums, SampleGrid, averaging_factors, on_grid
 
 from worlds.noise_worlds import overlapping_allan_variance
 
@@ -188,6 +188,6 @@ def test_a_loss_among_packets_is_still_found():
 
 
 def test_samples_are_spread_over_the_periods():
-    values, present = spread(np.array([[1.0], [2.0], [3.0]]), np.array([1, 3, 1]))
+    values, present = on_grid(np.array([[1.0], [2.0], [3.0]]), np.array([1, 3, 1]))
     np.testing.assert_array_equal(present, [True, False, False, True, True])
     np.testing.assert_array_equal(values[present, 0], [1.0, 2.0, 3.0])
