@@ -230,30 +230,22 @@ def open_recording(
     )
 
 
+@dataclass(eq=False)
 class Recording:
     """An open bag; use it as a context manager or call `close`."""
 
-    def __init__(
-        self,
-        path: Path,
-        source: 'Rosbag2 | Ros1File',
-        topics: tuple[Topic, ...],
-        *,
-        imu_topic: str,
-        joint_topic: str | None,
-        temperature_topic: str | None,
-        frame_id: str | None = None,
-    ):
-        self.path = path
-        self.topics = topics
-        self.imu_topic = imu_topic
-        self.joint_topic = joint_topic
-        """None where no joints are read."""
-        self.temperature_topic = temperature_topic
-        """None where no temperatures are read."""
-        self.source = source
-        self.frame_id = frame_id
-        """Frame of the Imu messages that are read; None: of all, which must have one frame."""
+    path: Path
+    source: 'Rosbag2 | Ros1File'
+    """Reader of the messages."""
+    topics: tuple[Topic, ...]
+    """All topics, in order of name."""
+    imu_topic: str
+    joint_topic: str | None
+    """None where no joints are read."""
+    temperature_topic: str | None
+    """None where no temperatures are read."""
+    frame_id: str | None = None
+    """Frame of the Imu messages that are read; None: of all, which must have one frame."""
 
     @property
     def message_counts(self) -> dict[str, int]:

@@ -281,7 +281,8 @@ def walk(buffer: np.ndarray) -> Walk:
         n_of_length = n_of_length + 1 if length == last_length else 0
         last_length = length
         stride = PREFIX.size + length
-        # After `RUN` messages of one length the next ones are compared in one step.
+        # After `RUN` messages of one length the next ones are compared in one step, four times as
+        # many as there were.
         if n_of_length < RUN:
             run_offsets = np.array([position])
         else:
@@ -292,8 +293,8 @@ def walk(buffer: np.ndarray) -> Walk:
 
     offset = np.concatenate(offsets)
     channel = overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64)
-    length = _record_lengths(buffer, offset)
-    messages = _packed_messages(buffer[:position], offset, length)
+    lengths = _record_lengths(buffer, offset)
+    messages = _packed_messages(buffer[:position], offset, lengths)
     return Walk(channel, messages, others, position)
 
 
