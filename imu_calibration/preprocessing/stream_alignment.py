@@ -10,7 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, runs_of
+from imu_calibration.core.samples import (
+    AlignedArrays,
+    ImuSamples,
+    JointSamples,
+    TemperatureSamples,
+    runs_of,
+)
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.signal_history import (
     BandVariance,
@@ -92,7 +98,7 @@ _LEAST_MARGIN = max(window_cutter.PHASE_REACH, QUIETNESS_REACH) + 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class _JointsAtImu:
+class _JointsAtImu(AlignedArrays):
     """The joints at the stamps of the IMU."""
 
     phase: np.ndarray
@@ -317,21 +323,23 @@ class MotionChunks:
 
         # From here on samples of the chunk only.
         core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
-        stamp_ns = imu.stamp_ns[core]
-        is_lost = joints.phase[core] == LOST
+        imu = imu.select(core)
+        joints = joints.select(core)
+        time = time[core]
+        is_lost = joints.phase == LOST
         # The sample before the first one is the last of the chunk before.
         after_loss = np.append(self._previous_is_lost, is_lost[:-1])
-        after_gap = self._after_gaps(stamp_ns, longest_step) | after_loss
-        self._previous_ns = int(stamp_ns[-1])
+        after_gap = self._after_gaps(imu.stamp_ns, longest_step) | after_loss
+        self._previous_ns = int(imu.stamp_ns[-1])
         self._previous_is_lost = bool(is_lost[-1])
 
         position, joint_rate, acceleration, jerk = self._joint_derivatives(
-            joints.level[core], time[core], joints.phase[core], runs
+            joints.level, time, joints.phase, runs
         )
-        temperature = self._temperature_at(stamp_ns, last_ns)
-        vibration = self._vibration.of(period, imu.force_s[core])
+        temperature = self._temperature_at(imu.stamp_ns, last_ns)
+        vibration = self._vibration.of(period, imu.force_s)
         motion = JointMotion(
-            time[core] + self.time_origin,
+            time + self.time_origin,
             position,
             joint_rate,
             acceleration,
@@ -341,22 +349,22 @@ class MotionChunks:
             temperature.rate,
         )
         samples = PhasedSamples(
-            stamp_ns,
-            imu.force_s[core],
-            imu.rate_s[core],
+            imu.stamp_ns,
+            imu.force_s,
+            imu.rate_s,
             motion,
             temperature.temperature_c,
-            joints.phase[core],
+            joints.phase,
             quiet[core],
             after_gap,
             after_loss,
-            joints.step[core],
-            None if imu.corrected is None else imu.corrected[core],
+            joints.step,
+            imu.corrected,
             imu.absent,
         )
         if not is_lost.any():
             return samples
-        is_edge = self._at_edge(stamp_ns, longest_step, final)
+        is_edge = self._at_edge(imu.stamp_ns, longest_step, final)
         self.counts.add('no joint state', np.count_nonzero(is_lost & ~is_edge))
         self.counts.add('edge of joints', np.count_nonzero(is_lost & is_edge))
         return None if is_lost.all() else samples.select(~is_lost)
