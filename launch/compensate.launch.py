@@ -13,20 +13,23 @@ Subscribers of imu/data, the usual topic, receive corrected readings with correc
 driver on imu/data_raw. An empty argument has no effect on `params`.
 """
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
-from launch_ros.substitutions import FindPackageShare
+from launch_ros.parameter_descriptions import ParameterFile
 
-from imu_calibration.nodes.launch_arguments import given_parameters
+from imu_calibration.nodes.launch_arguments import (
+    CONFIG,
+    argument,
+    given_parameters,
+    node,
+    parameter,
+    shared_arguments,
+)
 from launch import LaunchDescription
 
-CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
-USE_SIM_TIME = {
-    'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
-}
+USE_SIM_TIME = {'use_sim_time': parameter('use_sim_time', bool)}
 """Parameter of both nodes."""
 OPTIONAL_PARAMETERS = {
     'calibration': ('calibration_file', str),
@@ -44,86 +47,48 @@ def generate_launch_description():
     """Describe compensator_node, robot_localization's filter, and the names they can be given."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument(
+            argument(
                 'calibration',
-                default_value='',
-                description='calibration.yaml; empty: wait for the latched topic imu/calibration',
+                'calibration.yaml; empty: wait for the latched topic imu/calibration',
             ),
-            DeclareLaunchArgument(
+            argument(
                 'adopt',
-                default_value='',
-                description=(
-                    'source of calibrations: file (in the field), topic (replaces the file),'
-                    ' file_then_topic (the default of the node)'
-                ),
+                'source of calibrations: file (in the field), topic (replaces the file),'
+                ' file_then_topic (the default of the node)',
             ),
-            DeclareLaunchArgument(
+            argument(
                 'target_frame',
-                default_value='',
-                description=(
-                    'frame to move the readings to, by the transforms on /tf_static; empty: that of'
-                    ' the sensor'
-                ),
+                'frame to move the readings to, by the transforms on /tf_static; empty: that of'
+                ' the sensor',
             ),
-            DeclareLaunchArgument(
-                'anyway',
-                default_value='',
-                description='true: also correct a sensor whose decision is unproven',
+            argument('anyway', 'true: also correct a sensor whose decision is unproven'),
+            argument('gravity', 'gravity at the site of the robot, m/s^2, for the test at stops'),
+            argument('latitude', 'latitude of the robot, deg, from which gravity follows'),
+            argument(
+                'noise_file', 'noise.yaml of this IMU, from the verb noise, for the covariances'
             ),
-            DeclareLaunchArgument(
-                'gravity',
-                default_value='',
-                description='gravity at the site of the robot, m/s^2, for the test at stops',
-            ),
-            DeclareLaunchArgument(
-                'latitude',
-                default_value='',
-                description='latitude of the robot, deg, from which gravity follows',
-            ),
-            DeclareLaunchArgument(
-                'noise_file',
-                default_value='',
-                description='noise.yaml of this IMU, from the verb noise, for the covariances',
-            ),
-            DeclareLaunchArgument(
-                'respawn', default_value='false', description='start the node again when it ends'
-            ),
-            DeclareLaunchArgument(
+            *shared_arguments('respawn'),
+            argument(
                 'params',
-                default_value=PathJoinSubstitution([CONFIG, 'compensator_node.yaml']),
-                description='parameters of the node, YAML',
+                'parameters of the node, YAML',
+                PathJoinSubstitution([CONFIG, 'compensator_node.yaml']),
             ),
-            DeclareLaunchArgument(
-                'namespace', default_value='', description='one per IMU when there are several'
+            *shared_arguments('namespace', 'imu'),
+            argument('corrected', 'topic of the corrected messages', 'imu/data_corrected'),
+            argument(
+                'ekf', "start robot_localization's ekf_node on the corrected messages", 'false'
             ),
-            DeclareLaunchArgument(
-                'imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'
-            ),
-            DeclareLaunchArgument(
-                'corrected',
-                default_value='imu/data_corrected',
-                description='topic of the corrected messages',
-            ),
-            DeclareLaunchArgument(
-                'ekf',
-                default_value='false',
-                description="start robot_localization's ekf_node on the corrected messages",
-            ),
-            DeclareLaunchArgument(
+            argument(
                 'ekf_params',
-                default_value=PathJoinSubstitution([CONFIG, 'robot_localization_ekf.yaml']),
-                description='its parameters, YAML',
+                'its parameters, YAML',
+                PathJoinSubstitution([CONFIG, 'robot_localization_ekf.yaml']),
             ),
-            DeclareLaunchArgument(
+            argument(
                 'frame_prefix',
-                default_value=PythonExpression(
-                    ["'", LaunchConfiguration('namespace'), "/'.lstrip('/')"]
-                ),
-                description='prefix of the frames in ekf_params; default: the namespace and /',
+                'prefix of the frames in ekf_params; default: the namespace and /',
+                PythonExpression(["'", LaunchConfiguration('namespace'), "/'.lstrip('/')"]),
             ),
-            DeclareLaunchArgument(
-                'use_sim_time', default_value='false', description='use the time of /clock'
-            ),
+            *shared_arguments('use_sim_time'),
             OpaqueFunction(function=_nodes),
             Node(
                 package='robot_localization',
@@ -147,16 +112,11 @@ def _nodes(context):
     """Return the node; a parameter without an argument keeps its value in `params`."""
     parameters = USE_SIM_TIME | given_parameters(context, OPTIONAL_PARAMETERS)
     return [
-        Node(
-            package='imu_calibration',
-            executable='compensator_node',
-            namespace=LaunchConfiguration('namespace'),
-            output='screen',
-            respawn=LaunchConfiguration('respawn'),
-            parameters=[LaunchConfiguration('params'), parameters],
-            remappings=[
-                ('imu/data_raw', LaunchConfiguration('imu')),
-                ('imu/data_corrected', LaunchConfiguration('corrected')),
-            ],
+        node(
+            'compensator_node',
+            [LaunchConfiguration('params'), parameters],
+            {'imu/data_raw': 'imu', 'imu/data_corrected': 'corrected'},
+            namespace='namespace',
+            respawn='respawn',
         )
     ]

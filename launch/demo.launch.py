@@ -4,41 +4,30 @@ A simulated table with an IMU on it, calibrated and compensated live.
     ros2 launch imu_calibration demo.launch.py time_factor:=4.0
 """
 
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
+from launch.substitutions import PathJoinSubstitution
 
+from imu_calibration.nodes.launch_arguments import CONFIG, argument, node, parameter
 from launch import LaunchDescription
-
-CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 
 
 def generate_launch_description():
     """Describe the simulator and the two nodes that listen to it, all on the simulator's clock."""
-    table = {'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str)}
+    table = {'table_file': parameter('table')}
     simulator = {
-        'profile': ParameterValue(LaunchConfiguration('profile'), value_type=str),
+        'profile': parameter('profile'),
         'clock': True,
         'wait_for_subscribers': 2,
-        'time_factor': ParameterValue(LaunchConfiguration('time_factor'), value_type=float),
+        'time_factor': parameter('time_factor', float),
     }
     return LaunchDescription(
         [
-            DeclareLaunchArgument(
+            argument(
                 'table',
-                default_value=PathJoinSubstitution([CONFIG, 'table_simulated.yaml']),
-                description='table description, YAML',
+                'table description, YAML',
+                PathJoinSubstitution([CONFIG, 'table_simulated.yaml']),
             ),
-            DeclareLaunchArgument(
-                'profile', default_value='quick', description='motion of the table'
-            ),
-            DeclareLaunchArgument(
-                'time_factor',
-                default_value='1.0',
-                description='seconds of simulated time per second',
-            ),
+            argument('profile', 'motion of the table', 'quick'),
+            argument('time_factor', 'seconds of simulated time per second', '1.0'),
             _node('simulator_node', table, simulator),
             _node('calibration_node', table, {'use_sim_time': True}),
             _node('compensator_node', {'use_sim_time': True}),
@@ -47,9 +36,4 @@ def generate_launch_description():
 
 
 def _node(name, *parameters):
-    return Node(
-        package='imu_calibration',
-        executable=name,
-        output='screen',
-        parameters=[PathJoinSubstitution([CONFIG, f'{name}.yaml']), *parameters],
-    )
+    return node(name, [PathJoinSubstitution([CONFIG, f'{name}.yaml']), *parameters])

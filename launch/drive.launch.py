@@ -14,16 +14,19 @@ There is no motion before ~/start.
 An empty argument has no effect on the parameter files in config/.
 """
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
+from launch.actions import OpaqueFunction
+from launch.substitutions import PathJoinSubstitution
 
-from imu_calibration.nodes.launch_arguments import given_parameters
+from imu_calibration.nodes.launch_arguments import (
+    CONFIG,
+    argument,
+    given_parameters,
+    node,
+    parameter,
+    shared_arguments,
+)
 from launch import LaunchDescription
 
-CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 OPTIONAL_PARAMETERS = {
     'save_file': ('save_file', str),
     'gravity': ('gravity', float),
@@ -37,70 +40,36 @@ def generate_launch_description():
     """Describe calibration_node and planner_node, for the same table."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument(
+            argument(
                 'table',
-                default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
-                description=(
-                    'table description with the limits of its joints, YAML; the template is refused'
-                ),
+                'table description with the limits of its joints, YAML; the template is refused',
+                PathJoinSubstitution([CONFIG, 'table_template.yaml']),
             ),
-            DeclareLaunchArgument(
+            argument(
                 'urdf',
-                default_value='',
-                description=(
-                    'robot description (.urdf), path; or topic: '
-                    'robot_description; with table:=none, or a table with the site of the arm'
-                ),
+                'robot description (.urdf), path; or topic: '
+                'robot_description; with table:=none, or a table with the site of the arm',
             ),
-            DeclareLaunchArgument(
-                'imu_link',
-                default_value='',
-                description='link that carries the IMU; empty: the frame of its messages',
-            ),
-            DeclareLaunchArgument(
+            *shared_arguments('imu_link'),
+            argument(
                 'save_file',
-                default_value='',
-                description=(
-                    'where ~/save of calibration_node writes; empty: calibration.yaml in the'
-                    ' working directory'
-                ),
+                'where ~/save of calibration_node writes; empty: calibration.yaml in the'
+                ' working directory',
             ),
-            DeclareLaunchArgument(
-                'gravity',
-                default_value='',
-                description='local gravity, m/s^2, for the calibration; empty: that of table',
-            ),
-            DeclareLaunchArgument(
+            argument('gravity', 'local gravity, m/s^2, for the calibration; empty: that of table'),
+            argument(
                 'latitude',
-                default_value='',
-                description='latitude, deg, for the gravity there; as in table, if that states one',
+                'latitude, deg, for the gravity there; as in table, if that states one',
             ),
-            DeclareLaunchArgument(
-                'noise_file',
-                default_value='',
-                description='noise.yaml of this IMU, from the verb noise',
-            ),
-            DeclareLaunchArgument(
+            argument('noise_file', 'noise.yaml of this IMU, from the verb noise'),
+            argument(
                 'respawn',
-                default_value='false',
-                description='start a node again when it ends; motion only after ~/start',
+                'start a node again when it ends; motion only after ~/start',
+                'false',
             ),
-            DeclareLaunchArgument(
-                'imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'
-            ),
-            DeclareLaunchArgument(
-                'joint_states',
-                default_value='joint_states',
-                description='topic of sensor_msgs/JointState',
-            ),
-            DeclareLaunchArgument(
-                'joint_trajectory',
-                default_value='joint_trajectory',
-                description='topic of the controller',
-            ),
-            DeclareLaunchArgument(
-                'use_sim_time', default_value='false', description='use the time of /clock'
-            ),
+            *shared_arguments('imu', 'joint_states'),
+            argument('joint_trajectory', 'topic of the controller', 'joint_trajectory'),
+            *shared_arguments('use_sim_time'),
             OpaqueFunction(function=_nodes),
         ]
     )
@@ -109,10 +78,10 @@ def generate_launch_description():
 def _nodes(context):
     """Return both nodes; a parameter without an argument keeps its value."""
     table = {
-        'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
-        'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
-        'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
-        'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
+        'table_file': parameter('table'),
+        'urdf_file': parameter('urdf'),
+        'imu_link': parameter('imu_link'),
+        'use_sim_time': parameter('use_sim_time', bool),
     }
     parameters = given_parameters(context, OPTIONAL_PARAMETERS)
     noise = {name: value for name, value in parameters.items() if name == 'noise_file'}
@@ -120,15 +89,10 @@ def _nodes(context):
 
 
 def _node(name, *parameters):
-    return Node(
-        package='imu_calibration',
-        executable=name,
-        output='screen',
-        respawn=LaunchConfiguration('respawn'),
-        remappings=[
-            ('imu/data_raw', LaunchConfiguration('imu')),
-            ('joint_states', LaunchConfiguration('joint_states')),
-            ('joint_trajectory', LaunchConfiguration('joint_trajectory')),
-        ],
-        parameters=[PathJoinSubstitution([CONFIG, f'{name}.yaml']), *parameters],
-    )
+    topics = {
+        'imu/data_raw': 'imu',
+        'joint_states': 'joint_states',
+        'joint_trajectory': 'joint_trajectory',
+    }
+    files = [PathJoinSubstitution([CONFIG, f'{name}.yaml']), *parameters]
+    return node(name, files, topics, respawn='respawn')

@@ -69,6 +69,16 @@ def setting(default: Any, *declared: Any, **options: Any) -> Any:
     return field(default=default, metadata={'setting': Setting(default, *declared, **options)})
 
 
+def text_setting(text: str, symptom: str, *, default: str = '', **options: Any) -> Any:
+    """Declare a text, which has no unit; arguments as in `Setting`."""
+    return setting(default, '', text, symptom=symptom, **options)
+
+
+def path_setting(text: str, symptom: str, **options: Any) -> Any:
+    """Declare the path of a file that is an input of a session; as `text_setting`."""
+    return text_setting(text, symptom, session=True, path=True, **options)
+
+
 def height_setting(**options: Any) -> Any:
     """Declare the height of the place whose latitude is another field; as `setting`."""
     return setting(

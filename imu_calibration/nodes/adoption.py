@@ -11,7 +11,7 @@ from imu_calibration.compensation.unit_gate import GravityScale, UnitGate
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.settings import height_setting, setting
+from imu_calibration.core.settings import height_setting, path_setting, setting, text_setting
 from imu_calibration.document import files, trust
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
@@ -36,13 +36,9 @@ no other source.
 class CompensatorSettings:
     """Calibration, target frame and options of the compensation."""
 
-    calibration_file: str = setting(
-        '',
-        '',
+    calibration_file: str = path_setting(
         'calibration.yaml or its folder, read again on ~/reload; empty: wait for imu/calibration',
-        symptom='no messages are published, see diagnostics',
-        session=True,
-        path=True,
+        'no messages are published, see diagnostics',
     )
     wait_for_file: bool = setting(
         False,
@@ -50,13 +46,12 @@ class CompensatorSettings:
         'wait for calibration_file while it does not exist',
         symptom='the node ends at its start',
     )
-    adopt: str = setting(
-        FILE_THEN_TOPIC,
-        '',
+    adopt: str = text_setting(
         'source of calibrations; file: calibration_file only, for the field; '
         'topic: imu/calibration, which replaces the file; '
         'file_then_topic: imu/calibration only while no calibration_file is named',
-        symptom='a calibration on the topic is not adopted, or replaces the file',
+        'a calibration on the topic is not adopted, or replaces the file',
+        default=FILE_THEN_TOPIC,
         live=True,
         choices=(FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC),
     )
@@ -76,12 +71,10 @@ class CompensatorSettings:
         symptom='uncorrected messages on the corrected topic',
         live=True,
     )
-    target_frame: str = setting(
-        '',
-        '',
+    target_frame: str = text_setting(
         'frame of the same rigid body to move the readings to, by target_xyz and target_rpy, '
         'or where both are zero by the transforms on /tf_static; empty: the frame of the sensor',
-        symptom='subscribers expect a different frame_id',
+        'subscribers expect a different frame_id',
         live=True,
         session=True,
     )
@@ -126,15 +119,11 @@ class CompensatorSettings:
         symptom='covariances are too small, filters trust the readings too much',
         live=True,
     )
-    noise_file: str = setting(
-        '',
-        '',
+    noise_file: str = path_setting(
         'noise.yaml of this IMU, from the verb noise: '
         'covariances follow from it where the messages bring none; empty: '
         'from the noise that the calibration saw',
-        symptom='filters trust the readings too much or too little',
-        session=True,
-        path=True,
+        'filters trust the readings too much or too little',
     )
     covariance_rate: float = setting(
         1.0,

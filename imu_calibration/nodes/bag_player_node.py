@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import announce, declare_parameters, run_node
@@ -29,19 +29,13 @@ and again.
 class PlayerSettings:
     """Bag, topics and speed of playback."""
 
-    bag: str = setting(
-        '',
-        '',
+    bag: str = path_setting(
         'rosbag2 folder, .db3 or .mcap file; it must be given',
-        symptom='the node refuses to start with a reason',
-        session=True,
-        path=True,
+        'the node refuses to start with a reason',
     )
-    topics: str = setting(
-        '',
-        '',
+    topics: str = text_setting(
         'topics to play, separated by spaces; empty: all whose type is installed',
-        symptom='topics are missing',
+        'topics are missing',
         session=True,
     )
     rate: float = setting(

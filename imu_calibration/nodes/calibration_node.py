@@ -27,7 +27,7 @@ from visualization_msgs.msg import MarkerArray
 from imu_calibration.api.choices import calibration_options, provenance_with
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSession, LiveSettings
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, SessionFiles
@@ -78,46 +78,34 @@ MAX_SILENCE_SECONDS = 3.0
 class CalibrationNodeSettings:
     """Inputs, reference and outputs of the node."""
 
-    table_file: str = setting(
-        '',
-        '',
+    table_file: str = path_setting(
         'table description, path; empty or none: no table, calibrate by hand from poses held still'
         ' and the turns between them',
-        symptom='joint states are not listened to',
-        session=True,
-        path=True,
+        'joint states are not listened to',
         fixed='all motion gathered so far belongs to the table',
     )
-    frame_id: str = setting(
-        '',
-        '',
+    frame_id: str = text_setting(
         'frame of the Imu messages to use, all other messages are dropped; empty: that of the first'
         ' message',
-        symptom='every Imu message is dropped, see diagnostics',
+        'every Imu message is dropped, see diagnostics',
         session=True,
         fixed='all motion gathered so far is that of one sensor',
     )
-    accelerometer_model: str = setting(
-        '',
-        '',
+    accelerometer_model: str = text_setting(
         'named model or effect names joined by +; empty: bias+matrix, and with a table'
         ' accel_size_effect when the rotation shows it',
-        symptom='an effect of the sensor remains in the residuals',
+        'an effect of the sensor remains in the residuals',
         fixed='motion is gathered for the model',
     )
-    gyroscope_model: str = setting(
-        '',
-        '',
+    gyroscope_model: str = text_setting(
         'the same for the gyroscope; empty: bias+matrix',
-        symptom='an effect of the sensor remains in the residuals',
+        'an effect of the sensor remains in the residuals',
         fixed='motion is gathered for the model',
     )
-    reference_model: str = setting(
-        '',
-        '',
+    reference_model: str = text_setting(
         'effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when'
         ' latitude or azimuth is unknown',
-        symptom='a tilted table shows as accelerometer bias',
+        'a tilted table shows as accelerometer bias',
         fixed='motion is gathered for the model',
     )
     model_as_asked: bool = setting(
@@ -127,58 +115,38 @@ class CalibrationNodeSettings:
         symptom='an unmodelled effect biases the parameters',
         fixed='motion is gathered for the model',
     )
-    tolerances_file: str = setting(
-        '',
-        '',
+    tolerances_file: str = path_setting(
         'tolerances, path; empty: the installed config/tolerances.yaml',
-        symptom='good parameters are called weak',
-        session=True,
-        path=True,
+        'good parameters are called weak',
     )
-    effects_file: str = setting(
-        '',
-        '',
+    effects_file: str = path_setting(
         'own effects in addition to the catalogue, path: YAML with effects: NAME: {sensor, column,'
         ' unit, tolerance, text}, or a calibration with own effects; a model may then name them',
-        symptom='the node refuses a model that names them',
-        session=True,
-        path=True,
+        'the node refuses a model that names them',
         fixed='motion is gathered for the model',
     )
-    noise_file: str = setting(
-        '',
-        '',
+    noise_file: str = path_setting(
         'noise.yaml of this IMU, from the verb noise: motion of its biases between windows, on a'
         ' table; empty: estimated from the windows',
-        symptom='standard deviations of the biases are too large or too small',
-        session=True,
-        path=True,
+        'standard deviations of the biases are too large or too small',
         fixed='one session is judged by one noise',
     )
-    save_file: str = setting(
-        '',
-        '',
+    save_file: str = path_setting(
         'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same'
         ' folder, written also when the node ends with unsaved motion; files of an earlier session'
         ' are renamed (NAME.1), except with resume; empty: calibration.yaml in the working'
         ' directory, by ~/save only',
-        symptom='the node reports at its start that the folder is not writable',
-        session=True,
-        path=True,
+        'the node reports at its start that the folder is not writable',
     )
-    serial: str = setting(
-        '',
-        '',
+    serial: str = text_setting(
         'serial number of the IMU, for the calibration',
+        'calibrations of several units are not distinguished',
         session=True,
-        symptom='calibrations of several units are not distinguished',
     )
-    operator: str = setting(
-        '',
-        '',
+    operator: str = text_setting(
         'name of the operator, for the calibration',
+        'a calibration does not name its operator',
         session=True,
-        symptom='a calibration does not name its operator',
     )
     resume: bool = setting(
         False,

@@ -29,7 +29,7 @@ from visualization_msgs.msg import MarkerArray
 from imu_calibration.api.resources import config_file
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
@@ -84,46 +84,36 @@ from msg_adapters.layout import MessageError, Packed
 class PlannerNodeSettings:
     """Moved joints, parameters to determine, and interface of the commands."""
 
-    table_file: str = setting(
-        '',
-        '',
+    table_file: str = path_setting(
         'description of the table with the limits of its joints, path; empty: urdf_file describes'
         ' the arm',
-        symptom='other joints, or limits that are not theirs',
-        session=True,
-        path=True,
+        'other joints, or limits that are not theirs',
     )
-    tolerances_file: str = setting(
-        '',
-        '',
+    tolerances_file: str = path_setting(
         'tolerances, path; empty: the installed config/tolerances.yaml',
-        symptom='motions last too long, or end too early',
-        session=True,
-        path=True,
+        'motions last too long, or end too early',
     )
-    accelerometer_model: str = setting(
-        '', '', 'as of calibration_node', symptom='motions for parameters that are not estimated'
+    accelerometer_model: str = text_setting(
+        'as of calibration_node',
+        'motions for parameters that are not estimated',
     )
-    gyroscope_model: str = setting(
-        '', '', 'as of calibration_node', symptom='motions for parameters that are not estimated'
+    gyroscope_model: str = text_setting(
+        'as of calibration_node',
+        'motions for parameters that are not estimated',
     )
-    reference_model: str = setting(
-        '', '', 'as of calibration_node', symptom='motions for parameters that are not estimated'
+    reference_model: str = text_setting(
+        'as of calibration_node',
+        'motions for parameters that are not estimated',
     )
-    grade: str = setting(
-        'industrial',
-        '',
+    grade: str = text_setting(
         'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
-        symptom='the predicted standard deviations are not reached',
+        'the predicted standard deviations are not reached',
+        default='industrial',
         choices=tuple(sorted(GRADES)),
     )
-    noise_file: str = setting(
-        '',
-        '',
+    noise_file: str = path_setting(
         'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
-        symptom='the predicted standard deviations are not reached',
-        session=True,
-        path=True,
+        'the predicted standard deviations are not reached',
     )
     imu_rate: float = setting(
         100.0,
@@ -132,12 +122,11 @@ class PlannerNodeSettings:
         (1.0, 20000.0),
         'the predicted standard deviations are not reached',
     )
-    command: str = setting(
-        'topic',
-        '',
+    command: str = text_setting(
         'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory,'
         ' needs control_msgs) or auto (the action where there is one)',
-        symptom='nothing moves',
+        'nothing moves',
+        default='topic',
         choices=COMMANDS,
     )
     max_turns: float = setting(
@@ -158,11 +147,10 @@ class PlannerNodeSettings:
         'too large: collisions',
         fixed='the range of every joint is set at the first start',
     )
-    calibration_node: str = setting(
-        'calibration_node',
-        '',
+    calibration_node: str = text_setting(
         'name of the node that collects the windows',
-        symptom='~/start reports a missing service',
+        '~/start reports a missing service',
+        default='calibration_node',
     )
 
 

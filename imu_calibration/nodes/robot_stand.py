@@ -14,7 +14,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import StaticTransforms, root_of, table_from_urdf
@@ -119,32 +119,24 @@ Received = TypeVar('Received')
 class RobotSettings:
     """The arm that carries the IMU."""
 
-    urdf_file: str = setting(
-        '',
-        '',
+    urdf_file: str = path_setting(
         'description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path;'
         f' {URDF_FROM_TOPIC}: the topic robot_description; empty: table_file only. With an arm,'
         ' table_file describes the site: up, gravity, latitude, limits of joints by name',
-        symptom='the node waits for the missing input',
-        session=True,
-        path=True,
+        'the node waits for the missing input',
         fixed='all motion gathered so far is of that arm',
     )
-    imu_link: str = setting(
-        '',
-        '',
+    imu_link: str = text_setting(
         'link of the arm that carries the IMU; empty: the frame_id of its messages',
-        symptom='another place and attitude of the sensor',
+        'another place and attitude of the sensor',
         session=True,
         fixed='all motion gathered so far is of that link',
     )
-    world_frame: str = setting(
-        '',
-        '',
+    world_frame: str = text_setting(
         'frame whose z axis points up and that /tf_static ties to the root of the arm; '
         'empty: up of table_file, '
         "otherwise the root's z axis",
-        symptom='a tilted base shows as accelerometer bias',
+        'a tilted base shows as accelerometer bias',
         session=True,
         fixed='all motion gathered so far is for this attitude of the arm',
     )

@@ -23,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration.api.resources import config_file
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
@@ -59,21 +59,16 @@ such stretches ahead, a trajectory is effective about half a second later.
 class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
-    table_file: str = setting(
-        '',
-        '',
+    table_file: str = path_setting(
         'table description, path; empty: the installed config/table_simulated.yaml, or none with'
         ' urdf_file',
-        symptom='joint names differ from the expected ones',
-        session=True,
-        path=True,
+        'joint names differ from the expected ones',
     )
-    profile: str = setting(
-        'quick',
-        '',
+    profile: str = text_setting(
         "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until"
         ' a trajectory is received on joint_trajectory',
-        symptom='the node refuses and lists the names',
+        'the node refuses and lists the names',
+        default='quick',
         session=True,
     )
     repeat: bool = setting(
@@ -85,26 +80,19 @@ class SimulatorSettings:
         'end the node at the end of the profile; otherwise the table remains at rest',
         symptom='the node does not end',
     )
-    calibration_file: str = setting(
-        '',
-        '',
+    calibration_file: str = path_setting(
         'calibration document with the true parameters, path; empty: a random IMU',
-        symptom='another IMU is simulated',
-        session=True,
-        path=True,
+        'another IMU is simulated',
     )
-    grade: str = setting(
-        'industrial',
-        '',
+    grade: str = text_setting(
         'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
-        symptom='noise too large or small',
+        'noise too large or small',
+        default='industrial',
         choices=tuple(sorted(GRADES)),
     )
-    hide: str = setting(
-        '',
-        '',
+    hide: str = text_setting(
         'further errors of the IMU, by their physics, names joined by +: ' + ', '.join(CAUSES),
-        symptom='the diagnosis has a different finding, or none',
+        'the diagnosis has a different finding, or none',
         session=True,
     )
     hide_size: float = setting(
@@ -159,7 +147,11 @@ class SimulatorSettings:
         'publish imu/temperature, warming up from 25 C',
         symptom='thermal effects cannot be calibrated',
     )
-    frame_id: str = setting('imu_link', '', 'frame of the Imu messages', symptom='another frame_id')
+    frame_id: str = text_setting(
+        'frame of the Imu messages',
+        'another frame_id',
+        default='imu_link',
+    )
     truth: bool = setting(
         False,
         '',

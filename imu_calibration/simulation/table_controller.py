@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import setting, text_setting
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints, free_limits
 from imu_calibration.simulation.motion_builder import Profile
@@ -149,12 +149,11 @@ KEPT_MOTIONS = 8
 class ControllerSettings:
     """Execution of a trajectory by the joints, and their faults."""
 
-    limits: str = setting(
-        'refuse',
-        '',
+    limits: str = text_setting(
         'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow'
         ' (it is slowed to the limits; beyond the range it is refused) or none (it is followed)',
-        symptom='trajectories are not followed, or further and faster than the joints can',
+        'trajectories are not followed, or further and faster than the joints can',
+        default='refuse',
         choices=('refuse', 'slow', 'none'),
     )
     lag: float = setting(
@@ -178,8 +177,9 @@ class ControllerSettings:
         (-1, 1_000_000),
         'trajectories are not followed',
     )
-    stall_joint: str = setting(
-        '', '', 'joint that stalls', symptom='no joint stalls, or another one'
+    stall_joint: str = text_setting(
+        'joint that stalls',
+        'no joint stalls, or another one',
     )
     stall_time: float = setting(
         0.0,
