@@ -128,15 +128,19 @@ class Choices(TypedDict, total=False):
     """Who recorded and calibrated, for the document."""
 
 
-def topics_of(choices: Mapping[str, Any]) -> Topics:
-    """Return the topics that were chosen."""
+def topics_of(choices: Mapping[str, Any], readings: RawReadings | None = None) -> Topics:
+    """
+    Return the topics that were chosen.
+
+    `readings`: description of the readings, by default the one that was chosen.
+    """
     return Topics(
-        choices.get('imu_topic'),
-        choices.get('joint_topic'),
-        choices.get('temperature_topic'),
-        choices.get('frame_id'),
-        choices.get('gyroscope_topic'),
-        log_options(readings_of(choices), choices),
+        imu=choices.get('imu_topic'),
+        joints=choices.get('joint_topic'),
+        temperature=choices.get('temperature_topic'),
+        frame=choices.get('frame_id'),
+        gyroscope=choices.get('gyroscope_topic'),
+        log=log_options(readings or readings_of(choices), choices),
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.allan.figures import NoiseFigures
-from imu_calibration.api.choices import log_options, noise_of, readings_for
+from imu_calibration.api.choices import noise_of, readings_for, topics_of
 from imu_calibration.api.recordings import (
     Topics,
     existing,
@@ -183,6 +183,7 @@ def compensate_recording(
         required temperatures, or the output exists.
 
     """
+    choices = dict(locals())  # the arguments by name, among them some of `Choices`
     used = usable(files.given_calibration(calibration), anyway=anyway)
     calibration = used.calibration
     figures = noise_of(noise)
@@ -190,13 +191,7 @@ def compensate_recording(
         calibration = with_measured_noise(calibration, figures)
     transfer = requested_transfer(target_frame, target_xyz, target_rpy)
     shift_ns = late_ns(calibration, correct_stamps)
-    units = {
-        'nominal': nominal,
-        'accelerometer_unit': accelerometer_unit,
-        'gyroscope_unit': gyroscope_unit,
-        'increments': increments,
-    }
-    readings = readings_for(calibration, units)
+    readings = readings_for(calibration, choices)
     mask = ExclusionMask(parse_exclusions(exclude) if exclude else ())
     correction = _Correction(
         calibration=calibration,
@@ -215,14 +210,7 @@ def compensate_recording(
             f'the output {output} must not exist yet; choose another name or remove it',
             code='exists_already',
         )
-    log = log_options(readings, units | {'columns': columns, 'where': where})
-    topics = Topics(
-        imu=imu_topic,
-        temperature=temperature_topic,
-        frame=frame_id,
-        gyroscope=gyroscope_topic,
-        log=log,
-    )
+    topics = topics_of(choices, readings)
     if output is not None and is_text_log(output):
         return _into_text_log(recording, output, correction, topics)
     _refuse_corrected_log(recording)
@@ -275,7 +263,7 @@ def compensate_recording(
             mat_ts=None if transfer is None else transfer.mat_ts,
             late_ns=shift_ns,
             source_frame_id=topics.frame,
-            log=log,
+            log=topics.log,
             check=run.require_valid,
             keep=keep if exclude or other is not None else None,
             other=other,

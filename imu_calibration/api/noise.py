@@ -13,8 +13,8 @@ from imu_calibration.allan.document import (
 )
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
-from imu_calibration.api.choices import log_options, readings_of, require_same_inputs
-from imu_calibration.api.recordings import Topics, provenance_of, source_of, sources_without
+from imu_calibration.api.choices import readings_of, require_same_inputs, topics_of
+from imu_calibration.api.recordings import provenance_of, source_of, sources_without
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock
@@ -136,21 +136,9 @@ def identify_recording(
         When the recording cannot be used, or it has no rest of sufficient length.
 
     """
-    units = {
-        'nominal': nominal,
-        'accelerometer_unit': accelerometer_unit,
-        'gyroscope_unit': gyroscope_unit,
-        'increments': increments,
-    }
-    readings = readings_of(units)
-    log = log_options(readings, units | {'columns': columns, 'where': where})
-    topics = Topics(
-        imu=imu_topic,
-        temperature=temperature_topic,
-        frame=frame_id,
-        gyroscope=gyroscope_topic,
-        log=log,
-    )
+    choices = dict(locals())  # the arguments by name, among them some of `Choices`
+    readings = readings_of(choices)
+    topics = topics_of(choices)
     (source,) = sources_without([source_of(recording, topics)], [recording], exclude)
     result = identify_noise(source, readings)
 

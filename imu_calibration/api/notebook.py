@@ -5,11 +5,10 @@ The names that a notebook needs, with errors in terms of their arguments.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import wraps
 from inspect import signature
 from os import PathLike
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar
 
 from numpy.typing import ArrayLike
 
@@ -62,45 +61,31 @@ def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments,
     return with_hints
 
 
-@dataclass(frozen=True, eq=False)
-class Arrays:
-    """A recording as arrays; see `SampleBlock.from_arrays`."""
+def _recording(
+    verb: str,
+    recording: Any,
+    time: Any,
+    force: Any,
+    rate: Any,
+    joints: dict[str, ArrayLike] | None,
+    temperature_c: ArrayLike | None,
+) -> Any:
+    """
+    Return the recording, or the arrays as one; exactly one of both must be given.
 
-    time: ArrayLike | None
-    """Seconds, or integer nanoseconds, shape (n,)."""
-    force: ArrayLike | None
-    """Specific force, m/s^2, shape (n, 3)."""
-    rate: ArrayLike | None
-    """Angular rate, rad/s, shape (n, 3)."""
-    joints: dict[str, ArrayLike] | None
-    """Joint name -> position, rad, shape (n,)."""
-    temperature_c: ArrayLike | None
-    """Temperature, degrees Celsius, shape (n,)."""
-
-    def or_given(self, verb: str, recording: Any) -> Any:
-        """Return the recording, or these arrays as one; exactly one of both must be there."""
-        given = {
-            'recordings': recording,
-            'time': self.time,
-            'force': self.force,
-            'rate': self.rate,
-        }
-        names = [name for name, values in given.items() if values is not None]
-        if names == ['recordings']:
-            return recording
-        if names != ['time', 'force', 'rate']:
-            raise InputError(
-                f'{verb} must have either recordings, or the arrays time, force and rate, got'
-                f' {", ".join(names) or "none"}; give one or the other',
-                code='recording_or_arrays',
-            )
-        return SampleBlock.from_arrays(
-            cast(ArrayLike, self.time),
-            cast(ArrayLike, self.force),
-            cast(ArrayLike, self.rate),
-            joints=self.joints,
-            temperature_c=self.temperature_c,
+    Arrays as for `SampleBlock.from_arrays`; `verb`: name of the function, for the error.
+    """
+    arguments = {'recordings': recording, 'time': time, 'force': force, 'rate': rate}
+    given = [name for name, values in arguments.items() if values is not None]
+    if given == ['recordings']:
+        return recording
+    if given != ['time', 'force', 'rate']:
+        raise InputError(
+            f'{verb} must have either recordings, or the arrays time, force and rate, got'
+            f' {", ".join(given) or "none"}; give one or the other',
+            code='recording_or_arrays',
         )
+    return SampleBlock.from_arrays(time, force, rate, joints=joints, temperature_c=temperature_c)
 
 
 def _needed(verb: str, calibration: Any) -> Any:
@@ -155,8 +140,8 @@ def calibrate(
         As for `api.calibrate.calibrate_recordings`.
 
     """
-    arrays = Arrays(time, force, rate, joints, temperature_c)
-    return _calibrate(arrays.or_given('calibrate', recordings), table, **choices)
+    block = _recording('calibrate', recordings, time, force, rate, joints, temperature_c)
+    return _calibrate(block, table, **choices)
 
 
 @_for_notebooks
@@ -178,8 +163,7 @@ def check(
     ``check(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
     `api.calibrate.check_recording`.
     """
-    arrays = Arrays(time, force, rate, joints, temperature_c)
-    block = arrays.or_given('check', recording)
+    block = _recording('check', recording, time, force, rate, joints, temperature_c)
     return _check(block, _needed('check', calibration), table, **choices)
 
 
@@ -200,8 +184,7 @@ def compensate(
     ``compensate(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
     `api.compensate.compensate_recording`.
     """
-    arrays = Arrays(time, force, rate, None, temperature_c)
-    block = arrays.or_given('compensate', recording)
+    block = _recording('compensate', recording, time, force, rate, None, temperature_c)
     return _compensate(block, _needed('compensate', calibration), **options)
 
 
@@ -222,8 +205,7 @@ def inspect(
 
     Arguments as for `calibrate`.
     """
-    arrays = Arrays(time, force, rate, joints, temperature_c)
-    block = arrays.or_given('inspect', recording)
+    block = _recording('inspect', recording, time, force, rate, joints, temperature_c)
     return _inspect(block, table, choices)
 
 
@@ -242,8 +224,8 @@ def noise(
 
     Arguments as for `calibrate` and `api.noise.identify_recording`.
     """
-    arrays = Arrays(time, force, rate, None, temperature_c)
-    return _noise(arrays.or_given('noise', recording), **options)
+    block = _recording('noise', recording, time, force, rate, None, temperature_c)
+    return _noise(block, **options)
 
 
 diagnose = _for_notebooks(_diagnose)

@@ -395,10 +395,23 @@ class RateSlope:
             self._size_before = self._size_at_start()
         else:
             self._size_before = self._size(np.array(self._recent).reshape(-1, 3))
+        first_readings = list(self._recent)
+        self._begin_window(line)
 
-        # A new window.
-        stamps = list(self._stamps)[:-1]  # the newest sample is added by `push`
-        readings = list(self._recent)
+        # The first readings were stored before there was a derivative and fill its window. Counted
+        # samples need the number of lost ones, which these stamps do not show yet.
+        if is_first and self._tracker is not None and not self._max_step_ns:
+            stamps = list(self._stamps)[:-1]  # the newest sample is added by `push`
+            n_stored = min(len(stamps), len(first_readings))
+            for stamp_ns, reading in zip(stamps[-n_stored:], first_readings[-n_stored:]):
+                slope = self._tracker.push(stamp_ns, *reading)
+                self._recent.append(
+                    slope if self._tracker.n_used == self._tracker.taps else UNKNOWN
+                )
+        self._notify()
+
+    def _begin_window(self, line: StampLine) -> None:
+        """Begin an empty window of the derivative for stamps of a class; none if they are frozen."""
         self.derivative = None
         self._tracker = None
         if not _is_frozen(line):
@@ -413,16 +426,6 @@ class RateSlope:
         self._is_unreviewed = True
         self._n_in_window = 0
         self._n_growing = CLOCK_BLOCK
-
-        # The first readings were stored before there was a derivative and fill its window. Counted
-        # samples need the number of lost ones, which these stamps do not show yet.
-        if is_first and self._tracker is not None and not self._max_step_ns:
-            for stamp_ns, reading in zip(stamps[-len(readings) :], readings[-len(stamps) :]):
-                slope = self._tracker.push(stamp_ns, *reading)
-                self._recent.append(
-                    slope if self._tracker.n_used == self._tracker.taps else UNKNOWN
-                )
-        self._notify()
 
     def _is_kept_for(self, line: StampLine) -> bool:
         """Return whether the derivative in use, or none, remains right for stamps of a class."""

@@ -33,6 +33,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
 from imu_calibration.preprocessing.stamping import REGULAR, StampLine, describe_stamps
 
+NO_VIBRATION: tuple = (0.0, 0.0, 0.0)
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
 """A topic with this ending is refused, because a second correction would be wrong."""
 
@@ -147,14 +148,14 @@ class CompensationStream:
                 'force': imu.force_s[k],
                 'rate': imu.rate_s[k],
                 'derivative': slope[k],
-                'warming': (
-                    0.0
-                    if temperature is None
-                    else float(temperature[k]) - self.calibration.model.temperature_ref_c
-                ),
-                'branch': 0.0 if branch is None else float(branch[k]),
-                'vibration': (0.0,) * 3 if vibration is None else tuple(vibration[k].tolist()),
             }
+            if temperature is not None:
+                reference_c = self.calibration.model.temperature_ref_c
+                self._last_inputs['warming'] = float(temperature[k]) - reference_c
+            if branch is not None:
+                self._last_inputs['branch'] = float(branch[k])
+            if vibration is not None:
+                self._last_inputs['vibration'] = tuple(vibration[k].tolist())
         return corrected
 
     def _vibration_of(self, force_s: np.ndarray, finite: np.ndarray) -> np.ndarray | None:
@@ -201,12 +202,10 @@ class CompensationStream:
         """
         self._uncertainty.use(self.slope.derivative, self.slope.period)
         force_noise, rate_noise = self._uncertainty.noise
-        if force_cov is None or not is_known(force_cov):
-            force_cov = force_noise
-        if rate_cov is None or not is_known(rate_cov):
-            rate_cov = rate_noise
         sensitivity = self._uncertainty.at(**self._last_inputs, slope_error=self.slope.error())
-        return sensitivity.covariances(force_cov, rate_cov)
+        return sensitivity.covariances(
+            _stated_or_noise(force_cov, force_noise), _stated_or_noise(rate_cov, rate_noise)
+        )
 
     def warnings(self) -> list[str]:
         """
@@ -245,9 +244,9 @@ def derivative_for(
 
 def uses_slope(calibration: FittedErrors, transfer: Transfer | None = None) -> bool:
     """Return whether the correction uses the angular acceleration: there is a lever arm."""
-    return bool(np.any(arms_of(calibration))) or (
-        transfer is not None and bool(np.any(transfer.arm_t))
-    )
+    if transfer is not None and np.any(transfer.arm_t):
+        return True
+    return bool(np.any(arms_of(calibration)))
 
 
 def refuse_corrected(topic: str) -> None:
@@ -435,15 +434,12 @@ class SampleCompensation:
             self.at_zero['gyroscope'],
         )
         self._kernel = make_kernel(calibration, transfer)
-        self.last: tuple[Any, ...] = (
-            (0.0, 0.0, 9.8),
-            (0.0, 0.0, 0.0),
-            NO_SLOPE,
-            0.0,
-            0.0,
-            NO_SLOPE,
-        )
-        """Arguments of `Uncertainty.at` at the last sample: force, rate, slope, and conditions."""
+        at_rest = (0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE
+        self.last: tuple[Any, ...] = (*at_rest, 0.0, 0.0, NO_VIBRATION)
+        """
+        Arguments of `Uncertainty.at` at the last sample: force, rate, derivative of the rate,
+        warming, thermal branch, vibration. A tuple, because each sample makes one.
+        """
         self.revision = 0
         """Number of updates of the covariances."""
         self._n_changes = 0
@@ -478,11 +474,9 @@ class SampleCompensation:
             self.counts['not finite'] += 1
             return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._needs_stamps else NO_SLOPE
-        vibration = (
-            self.vibration.push(self.slope.period or 0.0, (fx, fy, fz))
-            if self._uses_vibration
-            else NO_SLOPE
-        )
+        vibration = NO_VIBRATION
+        if self._uses_vibration:
+            vibration = self.vibration.push(self.slope.period or 0.0, (fx, fy, fz))
         ux, uy, uz, vx, vy, vz = self._kernel(
             fx, fy, fz, wx, wy, wz, *slope, warming, self.branch.now, *vibration
         )
@@ -511,16 +505,12 @@ class SampleCompensation:
         """
         Return the covariances of corrected (force, rate), each (3, 3), at their last update.
 
-        Parameters
-        ----------
-        force_cov, rate_cov : ndarray or None
-            Covariances of the readings, shape (3, 3); zero or invalid: the noise of the calibration
-            is used; None: the sensor is absent.
-
+        Arguments as for `CompensationStream.propagate`, except None for an absent sensor.
         """
         force_noise, rate_noise = self._uncertainty.noise
-        force = _stated_covariance(force_cov, force_noise)
-        rate = _stated_covariance(rate_cov, rate_noise)
+        absent = np.zeros((3, 3))
+        force = absent if force_cov is None else _stated_or_noise(force_cov, force_noise)
+        rate = absent if rate_cov is None else _stated_or_noise(rate_cov, rate_noise)
         return self._sensitivity.covariances(force, rate, self.with_parameters)
 
     def refresh(self) -> None:
@@ -581,12 +571,6 @@ class SampleCompensation:
         self.refresh()
 
 
-def _stated_covariance(covariance: np.ndarray | None, noise: np.ndarray) -> np.ndarray:
-    """
-    Return the covariance of a reading, shape (3, 3).
-
-    The stated one if it is valid, else that of the `noise`; zero for None, an absent sensor.
-    """
-    if covariance is None:
-        return np.zeros((3, 3))
-    return covariance if is_known(covariance) else noise
+def _stated_or_noise(covariance: np.ndarray | None, noise: np.ndarray) -> np.ndarray:
+    """Return the stated covariance of a reading if it is valid, else its noise, shape (3, 3)."""
+    return noise if covariance is None or not is_known(covariance) else covariance

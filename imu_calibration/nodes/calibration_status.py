@@ -68,7 +68,7 @@ class WorkerState:
     session: LiveState | None = None
     """Progress in addition to the parameter groups: the poses of a calibration by hand."""
     diagnosis: LiveState | None = None
-    """Detected model errors; None without a table."""
+    """Progress and findings of the diagnosis; None without a table."""
     judged: str = ''
     """The decisions in one phrase."""
     complete: bool = False

@@ -88,11 +88,9 @@ class SessionFiles:
             When there is one that cannot be read.
 
         """
-        return (
-            files.read_bytes(self.accumulator, 'accumulator')
-            if os.path.isfile(self.accumulator)
-            else None
-        )
+        if not os.path.isfile(self.accumulator):
+            return None
+        return files.read_bytes(self.accumulator, 'accumulator')
 
     def put_aside(self) -> Path:
         """
@@ -116,19 +114,22 @@ class SessionFiles:
         """
         Write a file of this session; a file of an earlier session is renamed, not replaced.
 
-        Return a text about the renamed file, '' without one; raises as `files.write_whole`.
+        Return a text about the renamed file, '' without one; raises as `files.write_whole`, with
+        the file of the earlier session under its first name again.
         """
-        aside = None
+        renamed_to = None
         if path not in self._written and os.path.isfile(path):
-            aside = files.put_aside(path)
+            renamed_to = files.put_aside(path)
         try:
             files.write_whole(path, content, to_disk)
         except BaseException:
-            if aside is not None:
-                os.rename(aside, path)
+            if renamed_to is not None:
+                os.rename(renamed_to, path)
             raise
         self._written.add(path)
-        return '' if aside is None else f' (that of an earlier session is now {aside.name})'
+        return (
+            '' if renamed_to is None else f' (that of an earlier session is now {renamed_to.name})'
+        )
 
     def unsaved(self, live: LiveSession) -> int:
         """Return the number of windows or poses of a session that are in no file yet."""
@@ -282,7 +283,7 @@ class CalibrationWorker(threading.Thread):
         self._includes_pending = True
         """Whether no message was added after the last solution with open windows."""
         self._covered: tuple[int, int, int] | None = None
-        """State of the last picture of the coverage (see `_cover`)."""
+        """State of the last picture of the coverage (see `_update_coverage`)."""
         self._trouble = ''
         """Why the last attempt of a solution failed; '' otherwise."""
         self.session_files.note_saved(self.live.n_windows)
@@ -338,22 +339,22 @@ class CalibrationWorker(threading.Thread):
                 self._wake.wait(MESSAGE_CHECK_SECONDS)
                 self._wake.clear()
                 for step in (
-                    self._take,
-                    self._answer,
+                    self._process_messages,
+                    self._execute_requests,
                     self._solve_when_due,
-                    self._adopt_what_was_found,
+                    self._apply_diagnosis,
                     self._autosave,
                     self._diagnose_when_due,
-                    self._tell,
-                    self._cover,
+                    self._update_state,
+                    self._update_coverage,
                 ):
-                    self._survive(step)
-            self._survive(self._take)
+                    self._run_step(step)
+            self._run_step(self._process_messages)
         finally:
             while not self._requests.empty():
                 self._requests.get()[1].set_result((False, 'the node is ending'))
 
-    def _survive(self, step: Callable[[], None]) -> None:
+    def _run_step(self, step: Callable[[], None]) -> None:
         """Run one step; its error is reported until it succeeds again."""
         name = step.__name__.strip('_')
         try:
@@ -368,7 +369,7 @@ class CalibrationWorker(threading.Thread):
         else:
             self._faults[name] = ''
 
-    def _take(self) -> None:
+    def _process_messages(self) -> None:
         """Add the received messages to the session, and publish the residuals of new windows."""
         # Silence is measured from the last call: messages that arrived during a solution are
         # processed in the next one.
@@ -384,7 +385,7 @@ class CalibrationWorker(threading.Thread):
             if residuals is not None and len(residuals):
                 self.listeners.residuals(residuals)
 
-    def _answer(self) -> None:
+    def _execute_requests(self) -> None:
         """Execute the queued requests."""
         while not self._requests.empty():
             action, response = self._requests.get()
@@ -394,7 +395,7 @@ class CalibrationWorker(threading.Thread):
                 result = False, error.with_hint(self.hints)
             except Exception as error:  # every request gets a result
                 result = False, shortened(f'{type(error).__name__}: {error}', 300)
-            self._survive(self._tell)  # the requester reads the diagnostics next
+            self._run_step(self._update_state)  # the requester reads the diagnostics next
             response.set_result(result)
 
     def _solve_when_due(self) -> None:
@@ -426,12 +427,12 @@ class CalibrationWorker(threading.Thread):
         if self._diagnosis.is_running:
             self._n_diagnosed = max(n_windows, self._n_diagnosed)
 
-    def _adopt_what_was_found(self) -> None:
+    def _apply_diagnosis(self) -> None:
         """Publish a solution of the model that the last diagnosis requires, if it is new."""
-        if self._adopt():
+        if self._extend_model():
             self._publish_solution(pending=self._includes_pending)
 
-    def _adopt(self) -> bool:
+    def _extend_model(self) -> bool:
         """Apply the last result of the diagnosis to the model; return whether the model changes."""
         extension = self._diagnosis.take_extension()
         return extension is not None and self.live.adopt(extension)
@@ -446,7 +447,7 @@ class CalibrationWorker(threading.Thread):
         if not self._diagnosis_period:
             return published
         self._diagnosis.settle(question_about(self.live))
-        return self._publish_solution(pending=True) if self._adopt() else published
+        return self._publish_solution(pending=True) if self._extend_model() else published
 
     def _publish_solution(self, pending: bool) -> tuple[CalibrationResult, str]:
         """Solve, with open windows if `pending`; return (result, text of its document)."""
@@ -531,37 +532,11 @@ class CalibrationWorker(threading.Thread):
         if self.session_files.autosave(self.live, self.autosave_period):
             self._faults['place'] = ''
 
-    def _tell(self) -> None:
+    def _update_state(self) -> None:
         """Replace `state` by the present one."""
         counts = self.live.counts
         self._watch.note_counts(counts, self._read_at)
         result = self.live.result
-        lines: list[str] = []
-        verdict = ''
-        judged = ''
-        complete = False
-        if result is not None:
-            verdict = str(result.verdict.word)
-            judged = result.verdict.text
-            complete = result.verdict.complete
-            # First the causes of an incomplete state: a status has room for three lines.
-            reasons = shortcomings(result.calibration)
-            lines = list(dict.fromkeys([*reasons, *summary(result, self.hints)]))
-        values = {
-            self.gathered: self.live.n_windows,
-            'solutions': self._n_solutions,
-            'saves to': str(self.session_files.calibration),
-            f'{self.gathered} in no file yet': self.session_files.unsaved(self.live),
-            'process': os.getpid(),
-            **counts,
-        }
-        if result is not None:
-            values |= parameter_count(result.calibration).figures
-        if self.live.needs_linearising:
-            lines.append(
-                'an effect is outside the range of its linearisation and the stored windows are'
-                ' no longer available: calibrate the recording offline'
-            )
         # With a solution the groups change only with the next one; computing them is slow.
         groups = self.state.groups
         if self.state.solution != self._n_solutions or not groups or result is None:
@@ -571,25 +546,48 @@ class CalibrationWorker(threading.Thread):
             'diagnoses': self._diagnosis.n_answers,
             'being made': self._diagnosis.is_running,
         }
-        self.state = WorkerState(
+        state = WorkerState(
             groups=groups,
             streams=self._watch.state(self._read_at, self.live.stamping),
             solution=self._n_solutions,
-            verdict=verdict,
-            lines=tuple(lines),
             trouble=self._trouble,
             faults=tuple(line for line in self._faults.values() if line),
             gathered=self.live.n_windows,
-            values=values,
             session=self.live.status(self.hints),
             diagnosis=self.live.diagnosed(
                 replace(diagnosis, values={**diagnosis.values, **progress})
             ),
-            judged=judged,
-            complete=complete,
         )
 
-    def _cover(self) -> None:
+        # Decision, texts and figures of the last solution.
+        lines: list[str] = []
+        values = {
+            self.gathered: self.live.n_windows,
+            'solutions': self._n_solutions,
+            'saves to': str(self.session_files.calibration),
+            f'{self.gathered} in no file yet': self.session_files.unsaved(self.live),
+            'process': os.getpid(),
+            **counts,
+        }
+        if result is not None:
+            # First the causes of an incomplete state: a status has room for three lines.
+            reasons = shortcomings(result.calibration)
+            lines = list(dict.fromkeys([*reasons, *summary(result, self.hints)]))
+            values |= parameter_count(result.calibration).figures
+            state = replace(
+                state,
+                verdict=str(result.verdict.word),
+                judged=result.verdict.text,
+                complete=result.verdict.complete,
+            )
+        if self.live.needs_linearising:
+            lines.append(
+                'an effect is outside the range of its linearisation and the stored windows are'
+                ' no longer available: calibrate the recording offline'
+            )
+        self.state = replace(state, lines=tuple(lines), values=values)
+
+    def _update_coverage(self) -> None:
         """Update the picture of the coverage after a change."""
         # Session, rests and solution, on which the picture depends.
         present = (id(self.live), self.live.n_covered, self._n_solutions)

@@ -26,8 +26,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from imu_calibration.api.resources import config_file
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.api.choices import calibration_options
 from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.core.settings import path_setting, setting, text_setting
 from imu_calibration.document import files
@@ -154,6 +153,8 @@ class PlannerNodeSettings:
     )
 
 
+MODELS = ('accelerometer_model', 'gyroscope_model', 'reference_model')
+"""Parameters that are choices of a calibration."""
 CLOCK_CHECK_SECONDS = 0.1
 """Seconds between two checks of the clock."""
 MID_MOTION = 'stopped in mid-motion'
@@ -183,21 +184,14 @@ class PlannerNode(Node):
         self._table = live_reference(self, robot, settings.table_file).table_for(
             "planner_node moves the joints of 'table_file' or 'urdf_file'", 'table_missing'
         )
-        tolerances_path = config_file('tolerances.yaml')
+        choices: dict[str, Any] = {name: getattr(settings, name) or None for name in MODELS}
         if settings.tolerances_file:
-            tolerances_path = files.user_path(settings.tolerances_file)
-        tolerances = files.read_tolerances(tolerances_path)
-        self._options = CalibrationOptions(
-            settings.accelerometer_model or None,
-            settings.gyroscope_model or None,
-            settings.reference_model or None,
-            tolerances,
-            noise=(
-                files.read_noise(files.user_path(settings.noise_file))
-                if settings.noise_file
-                else None
-            ),
-        )
+            choices['tolerances'] = files.user_path(settings.tolerances_file)
+        if settings.noise_file:
+            choices['noise'] = files.user_path(settings.noise_file)
+        self._options = calibration_options(choices)
+
+        # State that several threads use.
         self._lock = threading.RLock()
         """Guards the driver."""
         self._stamp = 0.0
@@ -212,6 +206,8 @@ class PlannerNode(Node):
         """Number of received documents."""
         self._is_halted = False
         """Whether the end of the node stopped a motion."""
+        self._driven_marker: MarkerArray | None = None
+        """Picture of the motion that is driven, or was driven last."""
         self._complaints = Complaints(self.get_logger())
         self._names = tuple(self._table.joint_names)
         self.driver = Driver(self._names, limits_of(self._table), driver_settings)
@@ -225,17 +221,29 @@ class PlannerNode(Node):
             self.driver,
             self._make_campaign,
             peers=Peers(
-                self._measure,
-                self._latest,
-                self._diagnose,
-                self._send,
-                self._stop_joints,
-                self._say,
-                self._other_commanders.obstacle,
+                measure=self._measure,
+                latest=self._latest,
+                diagnose=self._diagnose,
+                send=self._send,
+                stop=self._stop_joints,
+                say=self._say,
+                obstacle=self._other_commanders.obstacle,
             ),
             lock=self._lock,
         )
         self.worker.stamp = lambda: self._stamp
+        self._connect()
+        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+        self.worker.start()
+        self.get_logger().info(
+            f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
+            f'no motion before ~/start; limits: {self._limit_words()}'
+        )
+        for line in range_warnings(self._table):
+            self.get_logger().warning(line)
+
+    def _connect(self) -> None:
+        """Subscribe to the inputs, and offer the services and the picture of the motion."""
         # All waiting joint states at once: one by one they would be delayed while a plan is made,
         # and the motion would begin at an earlier position of the joints.
         self._joints = BatchInput(
@@ -254,27 +262,18 @@ class PlannerNode(Node):
             DiagnosticArray, '/diagnostics', self._guarded(self._diagnostic), 100
         )
         self._calibration_clients = {
-            service: self.create_client(Trigger, f'{settings.calibration_node}/{service}')
+            service: self.create_client(Trigger, f'{self.settings.calibration_node}/{service}')
             for service in ('solve', 'diagnose')
         }
-        for service, action in (
-            ('start', lambda: self._go(-1)),
-            ('next', lambda: self._go(1)),
-            ('stop', self._stop),
-        ):
+        actions = {
+            'start': lambda: self._go(-1),
+            'next': lambda: self._go(1),
+            'stop': self._stop,
+        }
+        for service, action in actions.items():
             self.create_service(Trigger, f'~/{service}', partial(self._serve, service, action))
         every(self, CLOCK_CHECK_SECONDS, self._guarded(self._tick))
         self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
-        self._driven_marker: MarkerArray | None = None
-        """Picture of the motion that is driven, or was driven last."""
-        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
-        self.worker.start()
-        self.get_logger().info(
-            f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
-            f'no motion before ~/start; limits: {self._limit_words()}'
-        )
-        for line in range_warnings(self._table):
-            self.get_logger().warning(line)
 
     def close(self) -> str:
         """Stop the joints; return the outcome."""
@@ -322,7 +321,7 @@ class PlannerNode(Node):
         )
 
     def _make_separator(self, finding: CollinearFinding, noise: dict) -> Planner:
-        """Return the planner of motions that separate a model error from its collinear effects."""
+        """Return the planner of motions that separate a finding from its collinear effects."""
         calibration = self._latest()
         if calibration is None:
             raise InputError(
@@ -465,7 +464,7 @@ class PlannerNode(Node):
         return self._latest()
 
     def _diagnose(self) -> list[CollinearFinding] | None:
-        """Request a diagnosis; return its model errors, None without a result in time."""
+        """Request a diagnosis; return its findings, None without a result in time."""
         n_before = self._diagnosis_values.get('diagnoses', '0')
         response = self._ask('diagnose')
         if response is None or not response.success:

@@ -44,7 +44,7 @@ class Peers:
     latest: Callable[[], Any]
     """Returns the last calibration that was heard of."""
     diagnose: Callable[[], list[CollinearFinding] | None]
-    """Returns the detected model errors, the strongest first."""
+    """Returns the findings of a diagnosis, the strongest first."""
     send: Callable[[Any], None]
     """Sends a trajectory."""
     stop: Callable[[], None]
@@ -166,7 +166,7 @@ class PlannerWorker(threading.Thread):
         self._wait_for_rest()
         if self.driver.state is DriveState.MEASURING:
             self._measure()
-        # The campaign may require model errors before it can choose a motion.
+        # The campaign may require a diagnosis before it can choose a motion.
         decision = self._decide()
         while decision is not None and decision.diagnose:
             self.doing = Activity.DIAGNOSING
@@ -270,7 +270,7 @@ class PlannerWorker(threading.Thread):
 
 def findings_from(values: dict[str, str]) -> list[CollinearFinding]:
     """
-    Return the model errors that calibration_node has detected, the strongest first.
+    Return the findings of calibration_node's diagnosis, the strongest first.
 
     Each is an effect with the effects that are collinear with it, and the size of every parameter
     of all of these.

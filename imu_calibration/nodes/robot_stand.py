@@ -63,15 +63,13 @@ class StaticFrames:
 
     def waits_for(self, target: str, source: str) -> str:
         """Return a readable description of the awaited transform."""
-        return (
+        text = (
             f"the transform from '{target}' to '{source}' on {TF_STATIC}:"
             f' {self.transforms.why_not(target, source)}'
-            + (
-                f'; {self.n_unusable} received transforms are unusable (not finite)'
-                if self.n_unusable
-                else ''
-            )
         )
+        if self.n_unusable:
+            text += f'; {self.n_unusable} received transforms are unusable (not finite)'
+        return text
 
     def take(self, message: Any) -> None:
         """Process a tf2_msgs/TFMessage."""
@@ -229,11 +227,9 @@ def words_of(robot: RobotSettings, table_file: str) -> str:
     """Return a description of the result of `chain_of`."""
     if not robot.urdf_file:
         return f'the table {files.user_path(table_file)}'
-    return (
-        'the arm of the topic robot_description'
-        if robot.urdf_file == URDF_FROM_TOPIC
-        else f'the arm {files.user_path(robot.urdf_file)}'
-    )
+    if robot.urdf_file == URDF_FROM_TOPIC:
+        return 'the arm of the topic robot_description'
+    return f'the arm {files.user_path(robot.urdf_file)}'
 
 
 def _description_from_topic(node: Node) -> str:

@@ -4,6 +4,7 @@ Smooth joint motion put together from segments.
 Rests, moves, ramps, spins and oscillations, with exact derivatives.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -126,12 +127,8 @@ class Segment:
             for order in range(4):
                 for inner in range(order + 1):
                     motion[order] += (
-                        _BINOMIAL[order][inner] * envelope[order - inner][:, None] * waves[inner]
+                        math.comb(order, inner) * envelope[order - inner][:, None] * waves[inner]
                     )
-
-
-_BINOMIAL = ((1,), (1, 1), (1, 2, 1), (1, 3, 3, 1))
-"""Coefficients of the derivatives of a product by their order."""
 
 
 @dataclass(frozen=True, eq=False)

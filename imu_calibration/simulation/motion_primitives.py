@@ -34,7 +34,7 @@ class ProfileEntry:
     table: dict | None = None
     """Description of the table that the profile brings; None: it moves the given table."""
     n_joints: int | None = None
-    """Number of joints that the profile needs; None: any number."""
+    """Number of joints that the given table must have; None: any number, or `table`."""
     adapts: bool = False
     """
     Whether a table with another number of joints gets `any_table` instead, and one with joint
@@ -309,7 +309,6 @@ REGISTRY: dict[str, ProfileEntry] = {
             ),
             _equal_angles,
             _gimbals(order, up_axis),
-            3,
         )
         for order, (suffix, up_axis) in product(
             AXIS_ORDERS, (('', 'Z'), ('_up_x', 'X'), ('_up_y', 'Y'))
@@ -319,7 +318,6 @@ REGISTRY: dict[str, ProfileEntry] = {
         "the literal reading of 'around three axes simultaneously': one turn about (1, 1, 1)",
         _equal_angles,
         _table([[1.0, 1.0, 1.0]]),
-        1,
     ),
     **{
         f'avrutov_rates_{sample}': ProfileEntry(
@@ -329,7 +327,6 @@ REGISTRY: dict[str, ProfileEntry] = {
             ),
             partial(_body_rates, sample=sample),
             GIMBALS,
-            3,
         )
         for sample in (3, 4)
     },
@@ -341,7 +338,6 @@ REGISTRY: dict[str, ProfileEntry] = {
             ),
             partial(_gimbal_rates, sample=sample),
             GIMBALS,
-            3,
         )
         for sample in (3, 4)
     },
@@ -349,24 +345,20 @@ REGISTRY: dict[str, ProfileEntry] = {
         'six faces, spins about the sensor axes at 100, 150, 200 deg/s',
         _zhang_spins,
         GIMBALS,
-        3,
     ),
     'zhang_z60': ProfileEntry(
         'the same with a fixture skewed by 60 deg about (1, 1, 1)',
         _zhang_spins,
-        _table([AXIS_VECTORS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG),
-        3,
+        _table([AXIS_VECTORS[axis] for axis in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG),
     ),
     'zhang_o': ProfileEntry(
         'six faces, swings about the sensor axes: 10 deg 1 Hz, 5 deg 2 Hz, 90 deg 0.5 Hz',
         _zhang_oscillations,
         GIMBALS,
-        3,
     ),
     'zhang_m': ProfileEntry(
         'six faces, three spins, three swings, three simultaneous turns',
         _zhang_mixed,
         GIMBALS,
-        3,
     ),
 }

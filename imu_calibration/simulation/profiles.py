@@ -1,6 +1,6 @@
 """Named motions of a turntable, for the verb simulate and the simulator node."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
 from typing import Any
@@ -454,48 +454,38 @@ _ON_ARM = {
     'mount': {'rpy_deg': [0.0, 0.0, 0.0], 'xyz': [0.2, 0.15, 0.1]},
 }
 
+
+def _session(description: str, build: Callable) -> ProfileEntry:
+    """Return the entry of a session of a table with three axes, which adapts to other tables."""
+    return ProfileEntry(description, build, n_joints=3, adapts=True)
+
+
 _REGISTRY = {
-    'calibration': ProfileEntry(
+    'calibration': _session(
         'full session on a three-axis table, about 11 min: poses, spins, swings, two axes at once',
         _calibration,
-        n_joints=3,
-        adapts=True,
     ),
-    'short': ProfileEntry('the same in about 5 min', _short, n_joints=3, adapts=True),
-    'quick': ProfileEntry(
-        'the shortest that determines all parameters, about 2 min', _quick, n_joints=3, adapts=True
-    ),
-    'six_faces': ProfileEntry(
+    'short': _session('the same in about 5 min', _short),
+    'quick': _session('the shortest that determines all parameters, about 2 min', _quick),
+    'six_faces': _session(
         'every axis up and down, and turned both ways at one speed, about 1 min: similar effects'
         ' are collinear',
         _six_faces,
-        n_joints=3,
-        adapts=True,
     ),
     'static_only': ProfileEntry('26 poses, no deliberate rotation', _static_only, n_joints=3),
-    'random': ProfileEntry(
-        'poses, spins, swings and two-axis turns drawn from the seed, about 5 min',
-        _random,
-        n_joints=3,
-        adapts=True,
+    'random': _session(
+        'poses, spins, swings and two-axis turns drawn from the seed, about 5 min', _random
     ),
-    'random_short': ProfileEntry(
-        'the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True
-    ),
-    'separating': ProfileEntry(
+    'random_short': _session('the same in about 3 min, with two speeds', _random_short),
+    'separating': _session(
         'many angles, three speeds both ways, four frequencies: separates similar effects',
         _separating,
-        n_joints=3,
-        adapts=True,
     ),
-    'separating_short': ProfileEntry(
-        'the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True
-    ),
+    'separating_short': _session('the same with fewer angles, about 6 min', _separating_short),
     'separating_arm': ProfileEntry(
         'separating with the sensor on an arm of 0.27 m, so that spins exceed 1 g',
         _separating,
         _ON_ARM,
-        3,
     ),
     'thermal': ProfileEntry(
         'the same round six times while the temperature changes', _thermal, n_joints=3

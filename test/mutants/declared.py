@@ -1204,7 +1204,7 @@ LIVE = _of(
     ),
     (
         'its own work taken for silence of the sensor',
-        'CalibrationWorker._tell',
+        'CalibrationWorker._update_state',
         'self._watch.state(self._read_at, self.live.stamping)',
         'self._watch.state(time.monotonic(), self.live.stamping)',
         'test_calibration_worker.py',

@@ -45,14 +45,14 @@ def station(tmp_path, monkeypatch):
 def test_what_came_while_a_solution_was_made_is_no_silence(station):
     worker, waiting, clock = station
     waiting.append(make_session(1, profile='quick').block)
-    worker._take()
+    worker._process_messages()
     clock.now += LONG  # a solution, on a slow machine; messages wait meanwhile
     worker._solve_when_due()
-    worker._tell()
+    worker._update_state()
     found = worker.live.result.calibration.provenance
     assert (found['serial'], found['mode'], found['solution']) == ('A-17', 'live', 1)
     assert worker.state.streams.silent == () and not worker._includes_pending
-    worker._take()  # and now nothing has come
+    worker._process_messages()  # and now nothing has come
     worker._solve_when_due()
-    worker._tell()
+    worker._update_state()
     assert worker.state.streams.silent == ('imu', 'joints') and worker._includes_pending
