@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -44,6 +45,7 @@ from imu_calibration.preprocessing.checks import (
 from imu_calibration.preprocessing.exclusion import ExclusionMask, parse_exclusions
 from imu_calibration.preprocessing.recording_evidence import EvidenceGatherer
 from imu_calibration.preprocessing.scan import FrozenSearch
+from imu_calibration.preprocessing.sensor_join import OtherSensor
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.preprocessing.value_checks import rate_unit, refuse_units
 from msg_adapters.bag import Recording
@@ -189,17 +191,13 @@ def compensate_recording(
     figures = noise_of(noise)
     if figures is not None:
         calibration = with_measured_noise(calibration, figures)
-    transfer = requested_transfer(target_frame, target_xyz, target_rpy)
-    shift_ns = late_ns(calibration, correct_stamps)
-    readings = readings_for(calibration, choices)
-    mask = ExclusionMask(parse_exclusions(exclude) if exclude else ())
     correction = _Correction(
         calibration=calibration,
         used=used,
-        transfer=transfer,
-        shift_ns=shift_ns,
-        readings=readings,
-        mask=mask,
+        transfer=requested_transfer(target_frame, target_xyz, target_rpy),
+        shift_ns=late_ns(calibration, correct_stamps),
+        readings=readings_for(calibration, choices),
+        mask=ExclusionMask(parse_exclusions(exclude) if exclude else ()),
     )
 
     # Samples in memory, and text logs.
@@ -210,27 +208,26 @@ def compensate_recording(
             f'the output {output} must not exist yet; choose another name or remove it',
             code='exists_already',
         )
-    topics = topics_of(choices, readings)
+    topics = topics_of(choices, correction.readings)
     if output is not None and is_text_log(output):
         return _into_text_log(recording, output, correction, topics)
     _refuse_corrected_log(recording)
 
     # A bag with the sensors on two topics.
     other = None
-    frame = target_frame
-    checks = RawChecks(readings, calibration)
+    output_frame = target_frame
+    checks = RawChecks(correction.readings, calibration)
     if gyroscope_topic is not None:
         split = read_split(recording, topics)
         joined = split.joined.imu
         if output is None:
-            return _in_memory(
-                SampleBlock(joined, None, temperatures(recording, topics)), correction
-            )
+            block = SampleBlock(joined, None, temperatures(recording, topics))
+            return _in_memory(block, correction)
         # The messages of the slower sensor are corrected, in the frame of the accelerometer.
         checks.require_scale(joined.select(slice(UNIT_READINGS)))
         refuse_corrected(gyroscope_topic)
         other = split.other
-        frame = target_frame or joined.frame_id
+        output_frame = target_frame or joined.frame_id
         if split.topic == gyroscope_topic:
             topics = topics._replace(imu=gyroscope_topic, frame=None)
 
@@ -247,11 +244,12 @@ def compensate_recording(
 
         from msg_adapters.copying import copy_with_corrected
 
-        def keep(stamp_ns: np.ndarray) -> np.ndarray:
-            """Return which messages are corrected."""
-            kept = mask.kept(stamp_ns)
-            return kept if other is None else kept & other.known(stamp_ns)
-
+        # Messages are omitted in excluded times, and where the other sensor has no reading.
+        keep: Callable[[np.ndarray], np.ndarray] | None = None
+        if other is not None:
+            keep = partial(_kept_with, correction.mask, other)
+        elif exclude:
+            keep = correction.mask.kept
         lost = copy_with_corrected(
             recording,
             output,
@@ -259,16 +257,21 @@ def compensate_recording(
             corrected_topic=corrected_topic,
             correct=run.correct,
             propagate=run.propagate,
-            frame_id=frame or None,
-            mat_ts=None if transfer is None else transfer.mat_ts,
-            late_ns=shift_ns,
+            frame_id=output_frame or None,
+            mat_ts=None if correction.transfer is None else correction.transfer.mat_ts,
+            late_ns=correction.shift_ns,
             source_frame_id=topics.frame,
             log=topics.log,
             check=run.require_valid,
-            keep=keep if exclude or other is not None else None,
+            keep=keep,
             other=other,
         )
         return run.outcome(None, lost)
+
+
+def _kept_with(mask: ExclusionMask, other: OtherSensor, stamp_ns: np.ndarray) -> np.ndarray:
+    """Return which messages have no excluded time, and a reading of the other sensor."""
+    return mask.kept(stamp_ns) & other.known(stamp_ns)
 
 
 @dataclass(frozen=True, eq=False)

@@ -245,36 +245,33 @@ def plan(
             effects, sizes = files.read_mapping(diagnosis, 'diagnosis', class_in)
 
     # Separate effects, or determine every parameter.
-    if effects:
-        if prior is None:
-            raise InputError(
-                'separation of effects needs the calibration of the diagnosis with the finding,'
-                ' none was given; give it',
-                key='calibration',
-            )
-        keys = [(options.catalogue.owner_of(name, table.joint_names), name) for name in effects]
-        planner = make_separator(
-            table,
-            prior,
-            keys,
-            noise=noise,
-            rate=imu_rate,
-            options=options,
-            sizes=sizes,
-            limits=limits,
+    conditions: dict[str, Any] = {
+        'noise': noise,
+        'rate': imu_rate,
+        'options': options,
+        'limits': limits,
+    }
+    if not effects:
+        planner = make_planner(table, calibration=prior, **conditions)
+    elif prior is None:
+        raise InputError(
+            'separation of effects needs the calibration of the diagnosis with the finding,'
+            ' none was given; give it',
+            key='calibration',
         )
     else:
-        planner = make_planner(
-            table, noise=noise, rate=imu_rate, options=options, limits=limits, calibration=prior
-        )
-    provenance = {
-        'noise': grade if options.noise is None else 'as identified',
-        'imu_rate': imu_rate,
-        'known': 'a calibration' if prior else 'nothing',
-    }
+        keys = [(options.catalogue.owner_of(name, table.joint_names), name) for name in effects]
+        planner = make_separator(table, prior, keys, sizes=sizes, **conditions)
+
+    known = 'a calibration' if prior else 'nothing'
     if isinstance(calibration, (str, PathLike)):
-        provenance['known'] = Path(calibration).name
-    provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits))}
+        known = Path(calibration).name
+    provenance = {
+        **_stated_noise(options, grade, imu_rate),
+        'known': known,
+        'checked': NOT_CHECKED,
+        'limits': '; '.join(limit_words(table, limits)),
+    }
     warnings = range_warnings(table)
     if warnings:
         provenance['warnings'] = '; '.join(warnings)
@@ -286,6 +283,11 @@ def plan(
         unbounded=missing_ranges(table),
         notes=notes_on(table),
     )
+
+
+def _stated_noise(options: CalibrationOptions, grade: str, imu_rate: float) -> dict[str, Any]:
+    """Return the source of the noise and the sampling rate (Hz), for the file of a plan."""
+    return {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate}
 
 
 def notes_on(table: Table) -> list[str]:
@@ -364,11 +366,7 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     tolerances = tolerances_of(sensors, options.tolerances)
     return Planned(
         plan_by_hand(model, tolerances=tolerances, noise=noise, rate=imu_rate),
-        {
-            'noise': grade if options.noise is None else 'as identified',
-            'imu_rate': imu_rate,
-            'reference': 'gravity, by hand',
-        },
+        {**_stated_noise(options, grade, imu_rate), 'reference': 'gravity, by hand'},
     )
 
 

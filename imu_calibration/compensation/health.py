@@ -1,6 +1,7 @@
 """Health of a compensated stream: bias at stops, range, temperature."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -357,6 +358,24 @@ class _JudgedStop:
     """Residual bias of the gyroscope and its variance, each shape (3,); None without an update."""
 
 
+@dataclass(frozen=True, eq=False)
+class _RestErrors:
+    """Errors of corrected readings at a stop."""
+
+    rate: np.ndarray
+    """Mean of the rate, rad/s, shape (3,)."""
+    rate_off: np.ndarray
+    """Excess of each component over the Earth's rate, in standard deviations, shape (3,)."""
+    force_length: float
+    """Length of the mean specific force, m/s^2."""
+    gravity_error: float
+    """Difference of this length from gravity, m/s^2."""
+    gravity_sd: float
+    """Standard deviation of the length, m/s^2."""
+    force_off: float
+    """Excess of the difference over that between sites, in standard deviations."""
+
+
 class CalibrationHealth:
     """
     Judges stops of a stream of corrected readings.
@@ -442,39 +461,12 @@ class CalibrationHealth:
         return self._evaluated(self._last)
 
     def _evaluated(self, judged: _JudgedStop) -> LiveState:
-        """
-        Return the state after a stop, from the errors of rate and gravity at rest.
-
-        They are counted in standard deviations, beyond the Earth's rate and the local differences
-        of gravity::
-
-            rate_off  = max(|w| - Earth's rate, 0) / sd(w)             each axis
-            force_off = max(||f| - g| - local differences, 0) / sd(|f|)
-        """
-        stop = judged.stop
-        bias_update = judged.bias_update
-        covariance = self._known_covariance + np.diag(judged.mean_variance)
-        rate = stop.mean[3:]
-        rate_off = np.maximum(np.abs(rate) - EARTH_RATE, 0) / np.sqrt(np.diag(covariance)[3:])
-        axis = int(np.argmax(rate_off))
-        length = float(np.linalg.norm(stop.mean[:3]))
-        vertical = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
-        gravity_sd = float(np.sqrt(vertical @ covariance[:3, :3] @ vertical))
-        gravity_error = abs(length - self._gravity)
-        force_off = max(gravity_error - self._gravity_site_share * self._gravity, 0) / gravity_sd
-        values = {
-            'stops': judged.n_stops,
-            'seconds of the last stop': f'{stop.seconds:.1f}',
-            'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate),
-            'rate at rest [sd]': f'{rate_off.max():.1f}',
-            'gravity read [m/s^2]': f'{length:.4f}',
-            'gravity expected [m/s^2]': f'{self._gravity:.4f}',
-            'gravity off [sd]': f'{force_off:.1f}',
-        }
-        measured_length = float(np.linalg.norm(stop.further_mean[:3]))
-        measured_rate = float(np.linalg.norm(stop.further_mean[3:6]))
+        """Return the state after a stop, from the errors of rate and gravity at rest."""
+        errors = self._errors_at(judged)
+        values = self._values(judged, errors)
 
         # Readings in another unit have no other state.
+        measured_length = float(np.linalg.norm(judged.stop.further_mean[:3]))
         unit = unit_of_rest(measured_length)
         if unit:
             return LiveState(
@@ -485,56 +477,102 @@ class CalibrationHealth:
             )
 
         # Changes since the calibration, and the bias that would correct them.
-        lines = []
-        if rate_off[axis] > MAX_ERROR_SDS:
-            lines.append(
-                f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about'
-                f' {"xyz"[axis]}, {rate_off[axis]:.0f} times its sd'
-            )
-        if force_off > MAX_ERROR_SDS:
-            lines.append(
-                f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f}'
-                ' times its sd beyond what places differ by'
-            )
-        if bias_update is not None:
-            bias, variance = bias_update
+        if judged.bias_update is not None:
+            bias, variance = judged.bias_update
             values |= {
                 'bias update [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in bias),
                 'bias update, sd [deg/s]': ', '.join(
                     f'{value / DEG:.4f}' for value in np.sqrt(variance)
                 ),
             }
-        if not lines:
-            off = f'{rate_off.max():.1f} and {force_off:.1f} sd'
+        changes = '; '.join(self._changes(errors))
+        if not changes:
+            off = f'{errors.rate_off.max():.1f} and {errors.force_off:.1f} sd'
             return LiveState(
                 HOLDS,
                 f'the calibration holds: at the last stop rate and gravity were off by {off}',
                 values,
             )
-
-        # The same errors without the calibration.
-        rate_is_worse = np.linalg.norm(rate) > HARM_RATIO * measured_rate
-        measured_error = abs(measured_length - self._gravity)
-        force_is_worse = gravity_error > HARM_RATIO * measured_error + MAX_ERROR_SDS * gravity_sd
-        if (rate_off[axis] > MAX_ERROR_SDS and rate_is_worse) or (
-            force_off > MAX_ERROR_SDS and force_is_worse
-        ):
+        if self._is_harmful(errors, judged.stop):
             return LiveState(
                 HARMS,
-                '; '.join(lines)
-                + ': without the calibration it would be less; is it the right one? calibrate'
-                ' again',
+                changes + ': without the calibration it would be less; is it the right one?'
+                ' calibrate again',
                 values,
             )
-        if bias_update is not None and force_off <= MAX_ERROR_SDS:
-            return LiveState(
-                FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values
-            )
+        if judged.bias_update is not None and errors.force_off <= MAX_ERROR_SDS:
+            return LiveState(FOLLOWED, changes + ': corrected as long as stops confirm it', values)
         return LiveState(
             MOVED,
-            '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there',
+            changes + ': calibrate again, unless it turned slowly and steadily there',
             values,
         )
+
+    def _errors_at(self, judged: _JudgedStop) -> _RestErrors:
+        """
+        Return the errors of corrected rate and gravity at a stop.
+
+        They are counted in standard deviations, beyond the Earth's rate and the local differences
+        of gravity::
+
+            rate_off  = max(|w| - Earth's rate, 0) / sd(w)             each axis
+            force_off = max(||f| - g| - local differences, 0) / sd(|f|)
+        """
+        covariance = self._known_covariance + np.diag(judged.mean_variance)
+        force = judged.stop.mean[:3]
+        rate = judged.stop.mean[3:]
+        rate_excess = np.maximum(np.abs(rate) - EARTH_RATE, 0)
+        length = float(np.linalg.norm(force))
+        vertical = force / max(np.linalg.norm(force), 1e-9)
+        gravity_sd = float(np.sqrt(vertical @ covariance[:3, :3] @ vertical))
+        gravity_error = abs(length - self._gravity)
+        gravity_excess = max(gravity_error - self._gravity_site_share * self._gravity, 0)
+        return _RestErrors(
+            rate=rate,
+            rate_off=rate_excess / np.sqrt(np.diag(covariance)[3:]),
+            force_length=length,
+            gravity_error=gravity_error,
+            gravity_sd=gravity_sd,
+            force_off=gravity_excess / gravity_sd,
+        )
+
+    def _values(self, judged: _JudgedStop, errors: _RestErrors) -> dict[str, Any]:
+        """Return the figures of a stop by name."""
+        return {
+            'stops': judged.n_stops,
+            'seconds of the last stop': f'{judged.stop.seconds:.1f}',
+            'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in errors.rate),
+            'rate at rest [sd]': f'{errors.rate_off.max():.1f}',
+            'gravity read [m/s^2]': f'{errors.force_length:.4f}',
+            'gravity expected [m/s^2]': f'{self._gravity:.4f}',
+            'gravity off [sd]': f'{errors.force_off:.1f}',
+        }
+
+    def _changes(self, errors: _RestErrors) -> list[str]:
+        """Return a line on each sensor that has changed significantly since the calibration."""
+        lines = []
+        axis = int(np.argmax(errors.rate_off))
+        if errors.rate_off[axis] > MAX_ERROR_SDS:
+            lines.append(
+                f'the bias of the gyroscope has moved by {errors.rate[axis] / DEG:+.3g} deg/s about'
+                f' {"xyz"[axis]}, {errors.rate_off[axis]:.0f} times its sd'
+            )
+        if errors.force_off > MAX_ERROR_SDS:
+            lines.append(
+                f'gravity reads {errors.force_length:.3f} m/s^2 instead of {self._gravity:.3f},'
+                f' {errors.force_off:.0f} times its sd beyond what places differ by'
+            )
+        return lines
+
+    def _is_harmful(self, errors: _RestErrors, stop: Stop) -> bool:
+        """Return whether a significant error would be clearly smaller without the calibration."""
+        measured_rate = float(np.linalg.norm(stop.further_mean[3:6]))
+        rate_is_worse = np.linalg.norm(errors.rate) > HARM_RATIO * measured_rate
+        if errors.rate_off.max() > MAX_ERROR_SDS and rate_is_worse:
+            return True
+        measured_error = abs(float(np.linalg.norm(stop.further_mean[:3])) - self._gravity)
+        harmful_error = HARM_RATIO * measured_error + MAX_ERROR_SDS * errors.gravity_sd
+        return errors.force_off > MAX_ERROR_SDS and errors.gravity_error > harmful_error
 
 
 SIX = tuple[float, ...]

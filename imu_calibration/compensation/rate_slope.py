@@ -411,7 +411,7 @@ class RateSlope:
         self._notify()
 
     def _begin_window(self, line: StampLine) -> None:
-        """Begin an empty window of the derivative for stamps of a class; none if they are frozen."""
+        """Begin an empty window for stamps of a class, without a derivative if they are frozen."""
         self.derivative = None
         self._tracker = None
         if not _is_frozen(line):

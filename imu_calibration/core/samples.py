@@ -66,6 +66,24 @@ def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
     return start + np.round((time - time[0]) * (unit * 1e9)).astype(np.int64)
 
 
+def _numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Return values as an array of floats of a shape; `name` for errors."""
+    try:
+        array = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f'{name} must be numbers, got {shortened(str(error))}; convert the array',
+            code='array_type',
+        ) from error
+    if array.shape != shape or not shape[0]:
+        raise InputError(
+            f'{name} must have shape {shape} with at least one row, got'
+            f' {array.shape}; correct the array',
+            code='array_shape',
+        )
+    return array
+
+
 class AlignedArrays:
     """
     Slicing and joining for dataclasses whose array fields share their first axis.
@@ -281,43 +299,28 @@ class SampleBlock:
             When shapes differ, or times are not finite or in another unit.
 
         """
-        # Numbers of one shape for each name.
         times = _times_of(time)
-        given = {'time': times, 'force': force, 'rate': rate}
+        seconds = _numbers('time', times, (np.size(times),))
+        n = len(seconds)
+        force_s = _numbers('force', force, (n, 3))
+        rate_s = _numbers('rate', rate, (n, 3))
+        angles = {}
         for name, values in (joints or {}).items():
-            given[f"joint '{name}'"] = values
+            angles[name] = _numbers(f"joint '{name}'", values, (n,))
+        celsius = None
         if temperature_c is not None:
-            given['temperature_c'] = temperature_c
-        arrays = {}
-        for name, values in given.items():
-            try:
-                arrays[name] = np.asarray(values, float)
-            except (TypeError, ValueError) as error:
-                raise InputError(
-                    f'{name} must be numbers, got {shortened(str(error))}; convert the array',
-                    code='array_type',
-                ) from error
-            n = arrays['time'].size
-            shape = (n, 3) if name in ('force', 'rate') else (n,)
-            if arrays[name].shape != shape or not n:
-                raise InputError(
-                    f'{name} must have shape {shape} with at least one row, got'
-                    f' {arrays[name].shape}; correct the array',
-                    code='array_shape',
-                )
-        n_missing = np.count_nonzero(~np.isfinite(arrays['time']))
+            celsius = _numbers('temperature_c', temperature_c, (n,))
+        n_missing = np.count_nonzero(~np.isfinite(seconds))
         if n_missing:
             raise InputError(
                 f'every time must be finite, got {n_missing} that are not; remove these rows',
                 code='time_not_finite',
             )
         stamp_ns = _stamps_of_any(times)
-        angles = {name: arrays[f"joint '{name}'"] for name in joints or {}}
-        heat = arrays.get('temperature_c')
         return cls(
-            imu=ImuSamples(stamp_ns, arrays['force'], arrays['rate'], 'imu_link'),
+            imu=ImuSamples(stamp_ns, force_s, rate_s, 'imu_link'),
             joints=JointSamples.of_angles(stamp_ns, angles) if angles else None,
-            temperature=None if heat is None else TemperatureSamples(stamp_ns, heat),
+            temperature=None if celsius is None else TemperatureSamples(stamp_ns, celsius),
         )
 
 

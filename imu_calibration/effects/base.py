@@ -564,17 +564,22 @@ def cross_axis_coefficients(effect: Effect, values: Values, point: dict[str, Any
 def matrix_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
     """Return the sensor's matrix, or for another effect its rows times one value per axis."""
     matrix = values['matrix'].reshape(3, 3)
-    if effect.name != 'matrix':
+    if effect.role is not Role.LINEAR:
         matrix = matrix * values[effect.name][:, None]
     return {effect.groups[0].name: matrix.T}
 
 
 def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+    """Return the coefficients of the lever matrix for one arm, or for an arm of each output."""
+    arms = values[effect.name].reshape(-1, 3)
+    return {LEVER.name: matrix_times_arms(values['matrix'].reshape(3, 3), arms)}
+
+
+def matrix_times_arms(matrix: np.ndarray, arms: np.ndarray) -> np.ndarray:
     """
     Return the coefficients M_ij r_ik of the lever matrix W_jk for output i, shape (9, 3).
 
-    With the matrix M and the arm r_i of output i (Zhang 2017, eq. 11-17 with the true inverse).
+    With the matrix M and the arm r_i of output i, the rows of `arms`, or one row for all outputs
+    (Zhang 2017, eq. 11-17 with the true inverse).
     """
-    matrix = values['matrix'].reshape(3, 3)
-    arms = values[effect.name].reshape(-1, 3)  # one arm serves all three outputs
-    return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}
+    return (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import INPUT_OF, SENSORS, Effect, Lag, Role
+from imu_calibration.effects.base import INPUT_OF, SENSORS, Effect, Lag, Role, matrix_times_arms
 from imu_calibration.effects.expressions import ColumnCentre
 from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, ColumnLayout, SensorModel
 from imu_calibration.kinematics.chain import reference_motion
@@ -274,11 +274,11 @@ def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndar
     """
     Return the coefficients of the columns for parameters, real or complex, shape (n_columns, 3).
     """
-    of_sensor = model.values_of(sensor, values)
+    sensor_values = model.values_of(sensor, values)
     layout = model.layout(sensor)
     total = np.zeros((layout.width, 3), values.dtype)
     for effect in layout.effects:
-        _add_coefficients(total, model, effect, of_sensor, layout)
+        _add_coefficients(total, model, effect, sensor_values, layout)
     return total
 
 
@@ -286,30 +286,29 @@ def _add_coefficients(
     total: np.ndarray,
     model: SensorModel,
     effect: Effect,
-    of_sensor: dict[str, np.ndarray],
+    sensor_values: dict[str, np.ndarray],
     layout: ColumnLayout,
 ) -> None:
     """
     Add one effect's coefficients to `total`, shape (n_columns, 3), in place.
 
-    `of_sensor` has the values of all effects of the sensor by name. A warp with the change d_p of
-    parameter p, in output i of a sensor with matrix M and arms r, has the coefficients::
+    `sensor_values` has the values of all effects of the sensor by name. A warp with the change d_p
+    of parameter p, in output i of a sensor with matrix M and arms r, has the coefficients::
 
         d_p M_ij         of d(true input_j) / dp
         d_p M_ij r_ik    of d(lever matrix_jk) / dp
     """
     if effect.warp is not None:
-        change = of_sensor[effect.name] - model.point_of(effect)
-        matrix = of_sensor['matrix'].reshape(3, 3)
-        of_input = change[:, None, None] * matrix.T[None]
-        total[layout.rows[WARP + effect.name]] += of_input.reshape(-1, 3)
+        change = sensor_values[effect.name] - model.point_of(effect)
+        matrix = sensor_values['matrix'].reshape(3, 3)
+        input_block = change[:, None, None] * matrix.T[None]
+        total[layout.rows[WARP + effect.name]] += input_block.reshape(-1, 3)
         if WARP_LEVER + effect.name in layout.rows:
-            arms = sum((of_sensor[e.name].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
-            products = (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T
-            of_lever = change[:, None, None] * products[None]
-            total[layout.rows[WARP_LEVER + effect.name]] += of_lever.reshape(-1, 3)
+            arms = sum((sensor_values[e.name].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
+            lever_block = change[:, None, None] * matrix_times_arms(matrix, arms)[None]
+            total[layout.rows[WARP_LEVER + effect.name]] += lever_block.reshape(-1, 3)
     elif effect.coefficients is not None:
-        for group, block in effect.coefficients(effect, of_sensor, layout.point).items():
+        for group, block in effect.coefficients(effect, sensor_values, layout.point).items():
             if group in layout.rows:  # an effect on both sensors has groups of each
                 total[layout.rows[group]] += block
 
@@ -333,18 +332,18 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     layout = model.layout(sensor)
     step = 1e-30
     jacobian = np.zeros((layout.width, 3, len(values)))
-    of_sensor = model.values_of(sensor, values.astype(complex))
-    readers = _readers(model, of_sensor, layout)
+    sensor_values = model.values_of(sensor, values.astype(complex))
+    readers = _readers(model, sensor_values, layout)
     for effect in layout.effects:
         dependent_effects = readers.get(effect.name, ()) if effect.shared else (effect,)
         part = model.slices[effect.key]
         for place, index in enumerate(range(part.start, part.stop)):
-            moved = of_sensor[effect.name].copy()
+            moved = sensor_values[effect.name].copy()
             moved[place] += 1j * step
-            moved_of_sensor = {**of_sensor, effect.name: moved}
+            moved_values = {**sensor_values, effect.name: moved}
             total = np.zeros((layout.width, 3), complex)
             for dependent in dependent_effects:
-                _add_coefficients(total, model, dependent, moved_of_sensor, layout)
+                _add_coefficients(total, model, dependent, moved_values, layout)
             jacobian[:, :, index] = total.imag / step
     return jacobian
 
@@ -363,13 +362,13 @@ class _NotedReads(dict):
 
 
 def _readers(
-    model: SensorModel, of_sensor: dict[str, np.ndarray], layout: ColumnLayout
+    model: SensorModel, sensor_values: dict[str, np.ndarray], layout: ColumnLayout
 ) -> dict[str, list[Effect]]:
     """Return {effect name: the effects whose coefficients depend on its values}."""
     readers: dict[str, list[Effect]] = {}
     total = np.zeros((layout.width, 3), complex)
     for effect in layout.effects:
-        noted = _NotedReads(of_sensor)
+        noted = _NotedReads(sensor_values)
         _add_coefficients(total, model, effect, noted, layout)
         for name in noted.names:
             readers.setdefault(name, []).append(effect)
@@ -377,24 +376,26 @@ def _readers(
 
 
 def effect_slopes(
-    effect: Effect, of_sensor: dict[str, np.ndarray], point: dict[str, Any]
+    effect: Effect, sensor_values: dict[str, np.ndarray], point: dict[str, Any]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """
     Return the coefficients of one effect and their derivatives, by group.
 
     They are {group: coefficients (w, 3)} and {group: derivative by the values of the effect
-    (w, 3, size)}, by complex steps. `of_sensor` is `SensorModel.values_of` the sensor, `point` is
-    `SensorModel.full_point`.
+    (w, 3, size)}, by complex steps. `sensor_values` is `SensorModel.values_of` the sensor, and
+    `point` is `SensorModel.full_point`.
     """
     coefficients = effect.coefficients
     if coefficients is None:
         raise ValueError(f'{effect.name} has no coefficients')
-    blocks = coefficients(effect, of_sensor, point)
+    blocks = coefficients(effect, sensor_values, point)
     slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in blocks.items()}
     for k in range(effect.size):
-        moved = of_sensor[effect.name].astype(complex)
+        moved = sensor_values[effect.name].astype(complex)
         moved[k] += 1e-30j
-        for group, block in coefficients(effect, {**of_sensor, effect.name: moved}, point).items():
+        for group, block in coefficients(
+            effect, {**sensor_values, effect.name: moved}, point
+        ).items():
             slopes[group][..., k] = np.imag(block) / 1e-30
     return blocks, slopes
 
@@ -425,16 +426,16 @@ def output_of_effects(
 
     """
     point = model.full_point()
-    of_sensor = model.values_of(effects[0].sensor, values)
+    sensor_values = model.values_of(effects[0].sensor, values)
     output = np.zeros((len(ref.time), 3))
     derivatives = []
     for effect in effects:
-        coefficients_of, slopes = effect_slopes(effect, of_sensor, point)
+        effect_coefficients, slopes = effect_slopes(effect, sensor_values, point)
         contribution = np.zeros((len(ref.time), 3))
         derivative = np.zeros((len(ref.time), 3, effect.size))
         for group in effect.groups:
             basis = group.columns(ref, point)
-            contribution += basis @ coefficients_of[group.name]
+            contribution += basis @ effect_coefficients[group.name]
             derivative += np.einsum('mw,wip->mip', basis, slopes[group.name])
         output += contribution
         derivatives.append(derivative)
