@@ -94,48 +94,56 @@ def _blend(start, end, duration, step):
     return start + (end - start) * (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
 
 
+def _smooth(share):
+    """Return the step from 0 to 1 without a jump of its slope, at shares of its length."""
+    return 3 * share**2 - 2 * share**3
+
+
+def _plan(rng):
+    """Return (kind of motion, its parameters) of each motion, in deg, deg/s and Hz."""
+    poses = rng.permutation(
+        [[o, m, i] for o in (0, 90) for m in (-90, -45, 0, 45, 90) for i in (0, 90, 180)]
+    )[:26]
+    plan = [('pose', pose + rng.uniform(-8, 8, 3)) for pose in poses]
+    for joint in range(3):
+        for sign in (-1, 1):
+            plan.append(('spin', (joint, sign * rng.uniform(50, 110))))
+    for _ in range(5):
+        joints = rng.permutation(3)[:2]
+        plan.append(('swing', (joints, rng.uniform(0.25, 0.9, 2), rng.uniform(10, 35, 2))))
+    return [plan[number] for number in rng.permutation(len(plan))]
+
+
 def _motion(rng, step):
     """
     Return joint angles, rad, shape (n, 3).
 
     26 poses of 4 s, two spins of each joint, swings of two joints at a time.
     """
-    here, parts = np.zeros(3), []
-    poses = rng.permutation(
-        [[o, m, i] for o in (0, 90) for m in (-90, -45, 0, 45, 90) for i in (0, 90, 180)]
-    )[:26]
-    plan = [('pose', pose + rng.uniform(-8, 8, 3)) for pose in poses]
-    plan += [
-        ('spin', (joint, sign * rng.uniform(50, 110))) for joint in range(3) for sign in (-1, 1)
-    ]
-    plan += [
-        ('swing', (rng.permutation(3)[:2], rng.uniform(0.25, 0.9, 2), rng.uniform(10, 35, 2)))
-        for _ in range(5)
-    ]
-    for number in rng.permutation(len(plan)):
-        kind, what = plan[number]
+    position = np.zeros(3)
+    parts = []
+    for kind, parameters in _plan(rng):
         if kind == 'pose':
-            goal = what * DEG
-            parts.append(_blend(here, goal, max(1.0, np.abs(goal - here).max() / (70 * DEG)), step))
+            goal = parameters * DEG
+            seconds = max(1.0, np.abs(goal - position).max() / (70 * DEG))
+            parts.append(_blend(position, goal, seconds, step))
             parts.append(np.tile(goal, (round(4.0 / step), 1)))
+            position = goal
         elif kind == 'spin':
-            joint, speed = what
+            joint, speed = parameters
             time = np.arange(0.0, 9.0, step)
             ramp = np.clip(np.minimum(time, 9.0 - time), 0.0, 1.0)
-            path = np.cumsum(3 * ramp**2 - 2 * ramp**3) * step * speed * DEG
-            goal = here + path[-1] * np.eye(3)[joint]
-            parts.append(here + path[:, None] * np.eye(3)[joint])
+            path = np.cumsum(_smooth(ramp)) * step * speed * DEG
+            parts.append(position + path[:, None] * np.eye(3)[joint])
+            position = position + path[-1] * np.eye(3)[joint]
         else:
             time = np.arange(0.0, 12.0, step)
-            taper = np.clip(np.minimum(time, 12.0 - time) / 2.0, 0.0, 1.0)
-            taper = 3 * taper**2 - 2 * taper**3
+            taper = _smooth(np.clip(np.minimum(time, 12.0 - time) / 2.0, 0.0, 1.0))
             path = np.zeros((len(time), 3))
-            for joint, hertz, size in zip(*what):
+            for joint, hertz, size in zip(*parameters):
                 path[:, joint] = size * DEG * taper * np.sin(2 * np.pi * hertz * time)
-            goal = here
-            parts.append(here + path)
-        here = goal
-        parts.append(np.tile(here, (round(1.5 / step), 1)))
+            parts.append(position + path)
+        parts.append(np.tile(position, (round(1.5 / step), 1)))  # rest
     return np.concatenate(parts)
 
 
@@ -200,7 +208,10 @@ def make_world(kind: str, unit: int, motion: int) -> World:
 
     The unit fixes instrument and cause.
     """
-    own, rng = np.random.default_rng([unit, 1]), np.random.default_rng([motion, 2])
+    unit_rng = np.random.default_rng([unit, 1])
+    rng = np.random.default_rng([motion, 2])
+
+    # The true motion and temperature on the fine grid, and the errors of the instrument.
     step = 1.0 / RATE / FINE
     angle = _motion(rng, step)
     time = step * np.arange(len(angle))
@@ -208,78 +219,82 @@ def make_world(kind: str, unit: int, motion: int) -> World:
     mat_sn, force, rate = _inputs(angle, turn)
     warm = (
         24.0
-        + own.uniform(6, 9) * -np.expm1(-time / (0.4 * time[-1]))
+        + unit_rng.uniform(6, 9) * -np.expm1(-time / (0.4 * time[-1]))
         + 0.5 * np.sin(2 * np.pi * time / (0.7 * time[-1]))
     )
-    biases = own.normal(0.0, 0.05, 3), own.normal(0.0, 0.3 * DEG, 3)
-    mats = [np.eye(3) + own.normal(0.0, 4e-3, (3, 3)) for _ in range(2)]
-    axis = int(own.integers(3))
-    zeros = np.zeros_like(force)
+    force_bias = unit_rng.normal(0.0, 0.05, 3)
+    rate_bias = unit_rng.normal(0.0, 0.3 * DEG, 3)
+    force_mat = np.eye(3) + unit_rng.normal(0.0, 4e-3, (3, 3))
+    rate_mat = np.eye(3) + unit_rng.normal(0.0, 4e-3, (3, 3))
+
+    # The cause, which changes the scene.
     scene = Scene(
-        time,
-        angle,
-        turn,
-        mat_sn,
-        force.copy(),
-        rate.copy(),
-        warm,
-        np.random.default_rng([unit, 3]),
-        axis,
-        zeros.copy(),
-        zeros.copy(),
-        angle.copy(),
-        lambda t: t,
-        None,
+        time=time,
+        angle=angle,
+        turn=turn,
+        mat_sn=mat_sn,
+        force=force.copy(),
+        rate=rate.copy(),
+        warm=warm,
+        rng=np.random.default_rng([unit, 3]),
+        axis=int(unit_rng.integers(3)),
+        added_force=np.zeros_like(force),
+        added_rate=np.zeros_like(rate),
+        seen_angle=angle.copy(),
+        clock=lambda true_time: true_time,
     )
+    axes = ()
     if kind != 'nothing':
         KINDS[kind](scene)
-    outputs = [
-        bias + value @ mat.T + more
-        for bias, value, mat, more in zip(
-            biases, (scene.force, scene.rate), mats, (scene.added_force, scene.added_rate)
-        )
-    ]
-    outputs = [
-        scene.truth[key](out) if key in scene.truth else out
-        for key, out in zip(('filter_force', 'filter_rate'), outputs)
-    ]
-    outputs = [out[::FINE] for out in outputs]
-    count = len(outputs[0])
-    densities, wanders = (
-        (1.0e-3 * np.sqrt(RATE), 0.012 * DEG * np.sqrt(RATE) / 3),
-        (4e-4, 1.5e-3 * DEG),
-    )
-    for out, density, wander in zip(outputs, densities, wanders):
-        out += rng.normal(0.0, density, out.shape)
-        decay = np.exp(-1.0 / RATE / 120.0)
-        steps = rng.normal(0.0, wander * np.sqrt(1 - decay**2), out.shape)
-        out += lfilter([1.0], [1.0, -decay], steps, axis=0)
-    kept, places = (
-        (np.arange(count), np.arange(count) / RATE) if scene.thin is None else scene.thin(count)
-    )
-    stamps = scene.clock(places)
+        axes = scene.truth.get('axes', {scene.axis})
+
+    # Readings with noise and bias wander, at their stamps.
+    force_out = force_bias + scene.force @ force_mat.T + scene.added_force
+    rate_out = rate_bias + scene.rate @ rate_mat.T + scene.added_rate
+    if 'filter_rate' in scene.truth:
+        rate_out = scene.truth['filter_rate'](rate_out)
+    force_out = _noisy(force_out[::FINE], 1.0e-3 * np.sqrt(RATE), 4e-4, rng)
+    rate_out = _noisy(rate_out[::FINE], 0.012 * DEG * np.sqrt(RATE) / 3, 1.5e-3 * DEG, rng)
+    count = len(force_out)
+    kept, places = np.arange(count), np.arange(count) / RATE
+    if scene.thin is not None:
+        kept, places = scene.thin(count)
+
+    # Joint states, temperatures and the truth.
     joint_time = np.arange(0.0, time[-1], 1.0 / RATE) + 0.0037
     at_joint = np.minimum((joint_time / step).round().astype(int), len(time) - 1)
-    seen = scene.seen_angle[at_joint] + rng.normal(0.0, 2e-6, (len(at_joint), 3))
+    seen_angle = scene.seen_angle[at_joint] + rng.normal(0.0, 2e-6, (len(at_joint), 3))
     warm_time = np.arange(0.0, time[-1], 1.0)
     truth = {key: scene.truth[key] for key in ('sensor', 'place', 'names') if key in scene.truth}
     inside = scene.truth.get('inside')
-    axes = scene.truth.get('axes', {axis} if kind != 'nothing' else ())
     return World(
-        START_NS + (stamps * 1e9).round().astype(np.int64),
-        outputs[0][kept],
-        outputs[1][kept],
-        START_NS + (time[at_joint] * 1e9).round().astype(np.int64),
-        seen,
-        START_NS + (warm_time * 1e9).round().astype(np.int64),
-        np.interp(warm_time, time, warm) + rng.normal(0.0, 0.01, len(warm_time)),
-        force[::FINE][kept],
-        rate[::FINE][kept],
-        time[::FINE][kept],
+        stamp_ns=_stamps(scene.clock(places)),
+        force=force_out[kept],
+        rate=rate_out[kept],
+        joint_ns=_stamps(time[at_joint]),
+        angle=seen_angle,
+        temperature_ns=_stamps(warm_time),
+        temperature_c=np.interp(warm_time, time, warm) + rng.normal(0.0, 0.01, len(warm_time)),
+        true_force=force[::FINE][kept],
+        true_rate=rate[::FINE][kept],
+        time=time[::FINE][kept],
         axes=frozenset('xyz'[k] for k in axes),
         inside=None if inside is None else inside[::FINE][kept],
         **truth,
     )
+
+
+def _noisy(out, white_sd, wander_sd, rng):
+    """Return readings with white noise and a first-order Gauss-Markov bias of 120 s."""
+    out = out + rng.normal(0.0, white_sd, out.shape)
+    decay = np.exp(-1.0 / RATE / 120.0)
+    steps = rng.normal(0.0, wander_sd * np.sqrt(1 - decay**2), out.shape)
+    return out + lfilter([1.0], [1.0, -decay], steps, axis=0)
+
+
+def _stamps(seconds):
+    """Return stamps of seconds since the start, ns."""
+    return START_NS + (seconds * 1e9).round().astype(np.int64)
 
 
 # --- causes at a place ----------------------------------------------------------------------------
@@ -292,25 +307,22 @@ def _mark(scene, sensor, inside, *place, names=(), axes=None):
 
 
 def _arc(scene, joint, width):
-    middle = (
-        scene.rng.choice(
-            [0.0, 90.0, -45.0, 45.0]
-            if joint == 1
-            else [0.0, 90.0, 180.0]
-            if joint == 2
-            else [0.0, 90.0]
-        )
-        * DEG
-    )
+    rests_deg = ([0.0, 90.0], [0.0, 90.0, -45.0, 45.0], [0.0, 90.0, 180.0])
+    middle = scene.rng.choice(rests_deg[joint]) * DEG
     away = np.abs((scene.angle[:, joint] - middle + np.pi) % (2 * np.pi) - np.pi)
     return away < 0.5 * width * DEG
 
 
+def _target(scene, sensor):
+    """Return (readings that are added on the axis of a cause, size of a cause) of a sensor."""
+    if sensor == 'accelerometer':
+        return scene.added_force[:, scene.axis], FORCE
+    return scene.added_rate[:, scene.axis], TURN
+
+
 def _offset(scene, sensor, inside, *place, names=(), share=1.0):
-    target, size = (
-        (scene.added_force, FORCE) if sensor == 'accelerometer' else (scene.added_rate, TURN)
-    )
-    target[:, scene.axis] += share * size * scene.rng.choice([-1, 1]) * inside
+    added, size = _target(scene, sensor)
+    added += share * size * scene.rng.choice([-1, 1]) * inside
     _mark(scene, sensor, inside, *place, names=names)
 
 
@@ -321,26 +333,23 @@ def _arc_offset(sensor, joint):
     return act
 
 
+def _rattle(scene, inside, place):
+    """Add white noise on one axis of the accelerometer inside of a place."""
+    noise = np.repeat(scene.rng.normal(size=len(inside) // FINE + 1), FINE)[: len(inside)]
+    scene.added_force[:, scene.axis] += 3 * FORCE * inside * noise
+    _mark(scene, 'accelerometer', inside, place)
+
+
 def _rattle_in_an_arc(scene):
-    inside = _arc(scene, 1, 50.0)
-    scene.added_force[:, scene.axis] += (
-        3
-        * FORCE
-        * inside
-        * np.repeat(scene.rng.normal(size=len(inside) // FINE + 1), FINE)[: len(inside)]
-    )
-    _mark(scene, 'accelerometer', inside, 'angle of middle')
+    _rattle(scene, _arc(scene, 1, 50.0), 'angle of middle')
 
 
 def _gear_whine(scene):
     joint = int(scene.rng.integers(3))
     inside = np.abs(scene.turn[:, joint]) > 40 * DEG
-    scene.added_rate[:, scene.axis] += (
-        4
-        * TURN
-        * inside
-        * np.sin(2 * np.pi * 21.0 * scene.time + np.cumsum(scene.rng.normal(0, 0.02, len(inside))))
-    )
+    phase = np.cumsum(scene.rng.normal(0, 0.02, len(inside)))
+    tone = np.sin(2 * np.pi * 21.0 * scene.time + phase)
+    scene.added_rate[:, scene.axis] += 4 * TURN * inside * tone
     _mark(scene, 'gyroscope', inside, f'rate of {JOINTS[joint]}', 'speed', 'rate about')
 
 
@@ -424,13 +433,7 @@ def _fast_offset(scene):
 def _loose_for_a_while(scene):
     start = scene.rng.uniform(0.3, 0.6) * scene.time[-1]
     inside = (scene.time > start) & (scene.time < start + 0.2 * scene.time[-1])
-    scene.added_force[:, scene.axis] += (
-        3
-        * FORCE
-        * inside
-        * np.repeat(scene.rng.normal(size=len(inside) // FINE + 1), FINE)[: len(inside)]
-    )
-    _mark(scene, 'accelerometer', inside, 'time')
+    _rattle(scene, inside, 'time')
 
 
 def _axes_exchanged(scene):
@@ -495,10 +498,8 @@ PLACED = {
 
 
 def _add(scene, sensor, signal, *, names=(), axes=None, size=1.0):
-    target, rms = (
-        (scene.added_force, FORCE) if sensor == 'accelerometer' else (scene.added_rate, TURN)
-    )
-    target[:, scene.axis] += size * rms * signal / np.sqrt((signal**2).mean())
+    added, rms = _target(scene, sensor)
+    added += size * rms * signal / np.sqrt((signal**2).mean())
     _mark(scene, sensor, None, names=names, axes=axes)
 
 

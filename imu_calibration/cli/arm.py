@@ -1,7 +1,12 @@
 """``imu_calibration arm``: where one IMU sits relative to another on the same rigid body."""
 
+from typing import TYPE_CHECKING
+
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
+
+if TYPE_CHECKING:
+    from imu_calibration.api.recordings import Topics
 
 EXAMPLES = (
     'session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
@@ -34,50 +39,29 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Options) -> VerbResult:
     """Estimate and print."""
     from imu_calibration.api.choices import log_options, readings_of
-    from imu_calibration.api.recordings import Topics, open_bag, source_of, sources_without
+    from imu_calibration.api.recordings import open_bag, source_of, sources_without
     from imu_calibration.between_imus.arm import estimate_arm
     from imu_calibration.cli.show import warn
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, visible_findings
     from imu_calibration.preprocessing.sample_recording import read_recording
 
-    # Two topics, or two frames on one topic.
-    if len(options.imu_topic) != 2:
-        raise InputError(
-            f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both'
-            ' IMUs'
-        )
-    frames = options.frame_id or [None, None]
-    if len(frames) != 2:
-        raise InputError(
-            f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both'
-            ' frames'
-        )
+    # Read both IMUs; joints are not used.
+    topics_of_both = _topics_of_both(options)
     choices = options.choices()
     readings = readings_of(choices)
     log = log_options(readings, choices)
-    topics = []
-    distinct = set()
-    for topic, frame in zip(options.imu_topic, frames):
-        topics.append(Topics(imu=topic, frame=frame, log=log))
-        distinct.add((topic.lstrip('/'), frame))
-    if len(distinct) == 1:
-        raise InputError(
-            f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a'
-            ' frame_id for each',
-            key='frame_id',
-            code='same_imu',
-        )
-
-    # Read both IMUs; joints are not used.
     imus = []
-    for topic in topics:
-        open_bag(options.bag, topic, want_joints=False).close()  # refuses a missing topic
-        (source,) = sources_without([source_of(options.bag, topic)], [options.bag], options.exclude)
+    for topics in topics_of_both:
+        topics = topics._replace(log=log)
+        open_bag(options.bag, topics, want_joints=False).close()  # refuses a missing topic
+        (source,) = sources_without(
+            [source_of(options.bag, topics)], [options.bag], options.exclude
+        )
         recording = read_recording(source, readings, Preflight())
         imus.append(recording.imu)
         findings = visible_findings(recording.findings)
-        warn(finding.named(str(topic.imu)).to_mapping() for finding in findings)
+        warn(finding.named(str(topics.imu)).to_mapping() for finding in findings)
 
     # The arm from A to B, in mm as on a drawing.
     first, second = imus
@@ -90,3 +74,33 @@ def run(options: Options) -> VerbResult:
     return VerbResult(
         0, {'arm': result.arm, 'sd': result.arm_sd, 'unit': 'm', 'notes': list(result.lines())}
     )
+
+
+def _topics_of_both(options: Options) -> list['Topics']:
+    """Return the topics of A and of B: two Imu topics, or two frames on one of them."""
+    from imu_calibration.api.recordings import Topics
+
+    if len(options.imu_topic) != 2:
+        raise InputError(
+            f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both'
+            ' IMUs'
+        )
+    frames = options.frame_id or [None, None]
+    if len(frames) != 2:
+        raise InputError(
+            f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both'
+            ' frames'
+        )
+    topics = []
+    distinct = set()
+    for topic, frame in zip(options.imu_topic, frames):
+        topics.append(Topics(imu=topic, frame=frame))
+        distinct.add((topic.lstrip('/'), frame))
+    if len(distinct) == 1:
+        raise InputError(
+            f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a'
+            ' frame_id for each',
+            key='frame_id',
+            code='same_imu',
+        )
+    return topics

@@ -40,7 +40,7 @@ def run(options: Options) -> VerbResult:
     """
     Print the errors before and after with their interval and the decision.
 
-    Exit code 0 when it helps change sensor and no error has changed, otherwise 3.
+    The exit code is 0 when it helps each sensor and no error has changed, otherwise 3.
     """
     from imu_calibration.api.calibrate import check_recording
     from imu_calibration.cli.show import show_table, warn

@@ -55,6 +55,13 @@ QUANTITY_MOTIONS = (
     ('force', ('static_dense', 'centrifuge')),
 )
 """Standard motions that show a quantity; the first that a column uses applies."""
+NEEDED_DATA = {
+    'temperature': {'temperature', 'temperature rate', 'thermal branch'},
+    'cooling': {'thermal branch'},
+    'vibration': {'vibration'},
+    'rotation': {'rate', 'angular acceleration', 'joint rate'},
+}
+"""Data that an effect needs (`Effect.needs`) -> quantities in a column that require them."""
 DRAWN_AGAINST = {
     'joint angle': 'angle',
     'joint rate': 'angle',
@@ -172,15 +179,7 @@ def term(
         del definition['time_constant']
 
     # Data and motions that show the effect.
-    needs: tuple[str, ...] = ()
-    if uses & {'temperature', 'temperature rate', 'thermal branch'}:
-        needs += ('temperature',)
-    if 'thermal branch' in uses:
-        needs += ('cooling',)
-    if 'vibration' in uses:
-        needs += ('vibration',)
-    if uses & {'rate', 'angular acceleration', 'joint rate'}:
-        needs += ('rotation',)
+    needs = tuple(data for data, quantities in NEEDED_DATA.items() if uses & quantities)
     motions = [motions for quantity, motions in QUANTITY_MOTIONS if quantity in uses]
     abscissas = [abscissa for quantity, abscissa in DRAWN_AGAINST.items() if quantity in uses]
 

@@ -380,16 +380,15 @@ def run_node(
         print(help_text(make_node))
         return 0
     if not_of_ros:
-        print(
-            'error: arguments of the node follow --ros-args, got'
+        return _failed(
+            'arguments of the node follow --ros-args, got'
             f" '{shortened(not_of_ros[0])}' before it; write --ros-args -p NAME:=VALUE, and see"
-            ' --help',
-            file=sys.stderr,
+            ' --help'
         )
-        return 1
 
     # Signals. rclpy's handlers, installed by init, end the wait and call these; without them Python
-    # would also raise KeyboardInterrupt in mid-write.
+    # would also raise KeyboardInterrupt in mid-write. A node with a final message (`halt`) needs
+    # the context until it is sent: rclpy installs no handlers, and `on_signal` ends the context.
     received_signals: list[int] = []
     node = None
     halts = hasattr(make_node, 'halt')
@@ -407,7 +406,6 @@ def run_node(
     report = sys.unraisablehook
     sys.unraisablehook = lambda unraisable: None if received_signals else report(unraisable)
 
-    # A node with a final message needs the context until it is sent.
     init_options = {}
     if halts:
         init_options['signal_handler_options'] = SignalHandlerOptions.NO

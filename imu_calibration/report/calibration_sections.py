@@ -324,35 +324,36 @@ def axis_readings(
         At rest first, then by rate; three lines per position; empty when no window fits.
 
     """
-    measured = np.asarray(measured, float).reshape(-1, 3) / gravity
-    compensated = np.asarray(compensated, float).reshape(-1, 3) / gravity
-    reference = np.asarray(reference, float).reshape(-1, 3) / gravity
+    reference_g = np.asarray(reference, float).reshape(-1, 3) / gravity
+    measured_g = np.asarray(measured, float).reshape(-1, 3) / gravity
+    compensated_g = np.asarray(compensated, float).reshape(-1, 3) / gravity
     rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
     rate_deg_s = np.where(rate_deg_s < STILL_DEG_S, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
+
     # The sensor axis nearest to the vertical in each window, and the force along it.
-    size = np.linalg.norm(reference, axis=1)
-    axis = np.argmax(np.abs(reference), axis=1)
-    along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
-    is_near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
+    length = np.linalg.norm(reference_g, axis=1)
+    axis = np.argmax(np.abs(reference_g), axis=1)
+    along_axis = reference_g[np.arange(len(axis)), axis]
+    is_near = np.abs(along_axis) >= np.cos(np.deg2rad(WITHIN_DEG)) * length
+
+    # Windows with one rate, direction and axis are averaged; sorted by rate, then up before down.
+    is_down = np.sign(along_axis) < 0
+    positions = zip(rate_deg_s[is_near], is_down[is_near], axis[is_near])
     lines = []
-    # Windows with one rate, sign and axis are averaged; by rate, then +g before -g.
-    positions = zip(rate_deg_s[is_near], -np.sign(along[is_near]), axis[is_near])
-    for line_rate, minus_sign, line_axis in sorted(set(positions)):
+    for line_rate, line_is_down, line_axis in sorted(set(positions)):
         chosen = is_near & (rate_deg_s == line_rate) & (axis == line_axis)
-        chosen &= np.sign(along) == -minus_sign
-        mean_reference = np.mean(reference[chosen], axis=0)
-        mean_measured = np.mean(measured[chosen], axis=0)
-        mean_compensated = np.mean(compensated[chosen], axis=0)
-        for i, sensor in enumerate('xyz'):
+        chosen &= is_down == line_is_down
+        means = [np.mean(g[chosen], axis=0) for g in (reference_g, measured_g, compensated_g)]
+        for sensor, theoretical, before, after in zip('xyz', *means):
             lines.append(
                 AxisReading(
-                    position=('+' if minus_sign < 0 else '-') + 'xyz'[line_axis],
+                    position=('-' if line_is_down else '+') + 'xyz'[line_axis],
                     rate_deg_s=float(line_rate),
                     n_windows=int(np.sum(chosen)),
                     sensor=sensor,
-                    theoretical_g=float(mean_reference[i]),
-                    before_g=float(mean_measured[i]),
-                    after_g=float(mean_compensated[i]),
+                    theoretical_g=float(theoretical),
+                    before_g=float(before),
+                    after_g=float(after),
                 )
             )
     return lines

@@ -120,27 +120,18 @@ def simulate_on_recording(
             code='no_motion',
         )
 
-    # Outputs without noise.
+    # Outputs without noise; where biases follow the vibration, with that of the recording.
     outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
-    stamps = np.concatenate([window.stamp_ns for window in windows])
     period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
     noise = noise or recorded_noise(windows)
-    rng = np.random.default_rng([seed, 3])
     exact = {}
     for sensor in SENSORS:
         exact[sensor] = np.concatenate([output[sensor] for output in outputs])
-
-    # Biases follow the vibration of the readings: a hum with the variance of the recording.
     if model.uses('vibration'):
-        variances = []
-        for motion, _, rows in map(all_samples, chunks(windows)):
-            variances.append(np.asarray(motion.vibration)[rows])
-        variance = np.concatenate(variances)
-        unit = unit_hum(period * np.arange(len(variance)), 1.0 / period)
-        unit_variance = BandVariance().of(period, unit)[-1]
-        exact['accelerometer'] += unit * np.sqrt(variance / unit_variance)
+        exact['accelerometer'] += _recorded_hum(windows, period)
 
     # Noise and the limits of the sensors.
+    rng = np.random.default_rng([seed, 3])
     readings = []
     for sensor in SENSORS:
         sensor_noise = noise[sensor]
@@ -152,6 +143,7 @@ def simulate_on_recording(
         readings.append(clip(model, sensor, values, output=noisy))
 
     # The other streams of the recording are unchanged.
+    stamps = np.concatenate([window.stamp_ns for window in windows])
     imu_blocks = [block.imu for block in blocks if block.imu is not None]
     frame_id = next(imu.frame_id for imu in imu_blocks if len(imu))
     n_omitted = sum(len(imu) for imu in imu_blocks) - len(stamps)
@@ -162,6 +154,22 @@ def simulate_on_recording(
         _concatenated([block.temperature for block in blocks]),
     )
     return replayed, n_omitted
+
+
+def _recorded_hum(windows: Sequence[Window], period: float) -> np.ndarray:
+    """
+    Return a hum with the variance of the vibration in windows, m/s^2, shape (n, 3).
+
+    `period`: time between samples, s.
+    """
+    variances = []
+    for motion, _, rows in map(all_samples, chunks(windows)):
+        variances.append(np.asarray(motion.vibration)[rows])
+    variance = np.concatenate(variances)
+    hum = unit_hum(period * np.arange(len(variance)), 1.0 / period)
+    # Compensation measures the variance with a filter, which passes a part of it.
+    measured_variance = BandVariance().of(period, hum)[-1]
+    return hum * np.sqrt(variance / measured_variance)
 
 
 def _concatenated(parts: list) -> Any:
