@@ -56,24 +56,16 @@ def _replace(path, text, what='figures'):
 def beyond_table(rows):
     """Return the table of the worlds beyond the catalogue."""
     seeds = sorted({row['seed'] for row in rows})
+    kinds = {row['kind'] for row in rows} - {beyond_catalogue.NOTHING}
+    noises = ', '.join(sorted({row['noise'] for row in rows}))
     lines = [
-        (
-            f'{len(rows)} worlds of'
-            f' {len({row["kind"] for row in rows} - {beyond_catalogue.NOTHING})} kinds,'
-            f' {", ".join(sorted({row["noise"] for row in rows}))} noise, seeds {seeds[0]} to'
-            f' {seeds[-1]}, {date.today().isoformat()}:'
-        ),
+        f'{len(rows)} worlds of {len(kinds)} kinds, {noises} noise, seeds {seeds[0]} to'
+        f' {seeds[-1]}, {date.today().isoformat()}:',
         '',
-        '| what | required | measured |',
+        _line('what', 'required', 'measured'),
         '| --- | --- | --- |',
     ]
-    return '\n'.join(
-        lines
-        + [
-            f'| {what} | {required} | {measured} |'
-            for what, required, measured in beyond_catalogue.figures(rows)
-        ]
-    )
+    return '\n'.join(lines + [_line(*figures) for figures in beyond_catalogue.figures(rows)])
 
 
 def _count(values):
@@ -87,152 +79,211 @@ def _percent(values):
 
 
 def _table(rows, parts):
+    """Return the table of requirements and measured figures; `parts`: name -> rows of a part."""
     effects = parts.get('effects', [])
+    separating = parts.get('separating', [])
     seeds = [row['seed'] for row in rows if 'seed' in row]
     lines = [
-        (
-            f'{len(seeds)} sessions, seeds {min(seeds, default=0)} to {max(seeds, default=0)},'
-            f' {date.today().isoformat()}, made and counted by `make hide-and-seek`:'
-        ),
+        f'{len(seeds)} sessions, seeds {min(seeds, default=0)} to {max(seeds, default=0)},'
+        f' {date.today().isoformat()}, made and counted by `make hide-and-seek`:',
         '',
-        '| what | required | measured |',
+        _line('what', 'required', 'measured'),
         '| --- | --- | --- |',
+        *_lines_by_noise(effects),
+        *_lines_by_effect(effects),
     ]
-    for grade, noise, some in by_grade(effects):
+    if separating:
+        correct = _count(map(strictly_first, separating))
         lines.append(
-            f'| hidden effect first, or in the class of the first finding, {grade} grade, {noise}'
-            f' noise | {BARS[noise]} | {_percent(map(first_is_right, some))} (strictly first'
-            f' {_count(map(strictly_first, some))}; nothing else named'
-            f' {_count(len(row["found"]) == 1 for row in some)}) |'
+            _line('sessions made to separate a class: strictly first', 'as often', correct)
+        )
+    lines += [
+        *_lines_on_parameters(effects, separating),
+        *_lines_without_effect(parts.get('none', []), parts.get('outside', [])),
+        *_lines_on_pairs(parts.get('pairs', [])),
+        *_lines_by_size(parts.get('sizes', [])),
+    ]
+    if 'traps' in parts:
+        n_found = _count(bool(row['found']) for row in parts['traps'])
+        lines.append(_line('traps that give a finding', 'none', n_found))
+    ratios = [row['oracle_ratio'] for row in effects if row.get('oracle_ratio') is not None]
+    if ratios:
+        lines.append(
+            _line(
+                'held-out rms over that of a fit with the right effect alone, median (1 where'
+                ' nothing else is named)',
+                '1.02',
+                f'{np.median(ratios):.4f} ({len(ratios)} sessions)',
+            )
+        )
+    if 'failed' in parts:
+        what = 'tasks or worlds that failed and are counted nowhere'
+        lines.append(_line(what, 'none', len(parts['failed'])))
+    seconds = [row['seconds'] for row in rows if 'seconds' in row] or [np.nan]
+    lines.append(
+        _line(
+            'processor time per diagnosis, five minutes at 100 Hz',
+            '5 s, 95 % 10 s',
+            f'median {np.median(seconds):.1f} s, 95 % below {np.quantile(seconds, 0.95):.1f} s,'
+            f' largest {np.max(seconds):.1f} s',
+        )
+    )
+    return '\n'.join(lines)
+
+
+def _line(what, required, measured):
+    """Return one line of a table in Markdown."""
+    return f'| {what} | {required} | {measured} |'
+
+
+def _lines_by_noise(effects):
+    """Return the lines on single effects: by grade and noise, then over all grades."""
+    lines = []
+    for grade, noise, group in by_grade(effects):
+        alone = _count(len(row['found']) == 1 for row in group)
+        lines.append(
+            _line(
+                'hidden effect first, or in the class of the first finding,'
+                f' {grade} grade, {noise} noise',
+                BARS[noise],
+                f'{_percent(map(first_is_right, group))} (strictly first'
+                f' {_count(map(strictly_first, group))}; nothing else named {alone})',
+            )
         )
     for noise in BARS:
-        some = [row for _, kind, part in by_grade(effects) for row in part if kind == noise]
-        if some:
-            kinds = sorted(set(map(kind_of, some)))
-            each = (
-                '; '.join(
-                    f'{kind} {_count(first_is_right(row) for row in some if kind_of(row) == kind)}'
-                    for kind in kinds
-                )
-                if len(kinds) > 1
-                else ''
-            )
-            lines.append(
-                f'| the same, all grades, {noise} noise | {BARS[noise]} |'
-                f' {_percent(map(first_is_right, some))}{": " + each if each else ""} |'
-            )
-    if effects:
-        sizes = class_sizes(effects)
-        lines.append(
-            '| of the right ones, told with mates that the recording cannot tell apart |  |'
-            f' {_count(sizes > 1)} |'
-        )
-        names = sorted({row['hidden'][0] for row in effects})
-        shares = {
-            name: np.mean([first_is_right(row) for row in effects if row['hidden'][0] == name])
-            for name in names
-        }
-        low = [name for name in sorted(names, key=shares.__getitem__) if shares[name] < LEAST]
-        lines.append(
-            f'| the same for each of the {len(names)} effects, all grades and noises together, the'
-            f' worst | 85 % | {100 * min(shares.values()):.0f} %'
-            + (
-                f'; below 85 %: {", ".join(f"{name} {100 * shares[name]:.0f} %" for name in low)}'
-                if low
-                else ''
-            )
-            + ' |'
-        )
-    separating = parts.get('separating', [])
-    if separating:
-        lines.append(
-            '| sessions made to separate a class: strictly first | as often |'
-            f' {_count(map(strictly_first, separating))} |'
-        )
-    errors = np.abs(
-        [
-            e
-            for row in effects + separating
-            for values in row['errors_in_sd'].values()
-            for e in values
-        ]
-    )
+        group = []
+        for _, group_noise, group_rows in by_grade(effects):
+            if group_noise == noise:
+                group += group_rows
+        if not group:
+            continue
+        measured = _percent(map(first_is_right, group))
+        kinds = sorted(set(map(kind_of, group)))
+        if len(kinds) > 1:
+            counts = []
+            for kind in kinds:
+                correct = _count(first_is_right(row) for row in group if kind_of(row) == kind)
+                counts.append(f'{kind} {correct}')
+            measured += f': {"; ".join(counts)}'
+        lines.append(_line(f'the same, all grades, {noise} noise', BARS[noise], measured))
+    return lines
+
+
+def _lines_by_effect(effects):
+    """Return the lines on classes of collinear effects, and on the effect named least often."""
+    if not effects:
+        return []
+    correct_by_name = {}
+    for row in effects:
+        correct_by_name.setdefault(row['hidden'][0], []).append(first_is_right(row))
+    shares = {name: np.mean(correct_by_name[name]) for name in sorted(correct_by_name)}
+    low = [
+        f'{name} {100 * shares[name]:.0f} %'
+        for name in sorted(shares, key=shares.__getitem__)
+        if shares[name] < LEAST
+    ]
+    worst = f'{100 * min(shares.values()):.0f} %'
+    if low:
+        worst += f'; below 85 %: {", ".join(low)}'
+    return [
+        _line(
+            'of the right ones, told with mates that the recording cannot tell apart',
+            '',
+            _count(class_sizes(effects) > 1),
+        ),
+        _line(
+            f'the same for each of the {len(shares)} effects, all grades and noises together, the'
+            ' worst',
+            '85 %',
+            worst,
+        ),
+    ]
+
+
+def _lines_on_parameters(effects, separating):
+    """Return the lines on the errors of estimated parameters."""
+    errors = []
+    for row in effects + separating:
+        for values in row['errors_in_sd'].values():
+            errors += values
+    errors = np.abs(errors)
+    lines = []
     if len(errors):
+        rms = np.sqrt(np.mean(np.minimum(errors, 10) ** 2))
         lines.append(
-            f'| parameters within three sd of the truth | 97 % | {100 * np.mean(errors < 3):.1f} %'
-            f' of {len(errors)}; rms error {np.sqrt(np.mean(np.minimum(errors, 10) ** 2)):.2f} sd |'
+            _line(
+                'parameters within three sd of the truth',
+                '97 %',
+                f'{100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms error {rms:.2f} sd',
+            )
         )
     levels = [row['level_error'] for row in effects if 'level_error' in row]
     if levels:
-        lines.append(
-            f'| saturation level within 1 % | all | {_count(level < 0.01 for level in levels)} |'
-        )
-    for what, told in (
+        correct = _count(level < 0.01 for level in levels)
+        lines.append(_line('saturation level within 1 %', 'all', correct))
+    return lines
+
+
+def _lines_without_effect(none, outside):
+    """Return the lines on sessions without a hidden effect, and with a cause of no catalogue."""
+    lines = []
+    for what, key in (
         ('a finding', 'found'),
         ('"unexplained"', 'unexplained'),
         ('a formula', 'formulas'),
     ):
-        each = [
-            (grade, noise, [bool(row[told]) for row in some])
-            for grade, noise, some in by_grade(parts.get('none', []))
-        ]
-        if each:
-            lines.append(
-                f'| nothing hidden: {what} | at most 2 % |'
-                f' {_percent(value for *_, some in each for value in some)} '
-                f'({"; ".join(f"{grade} {noise} {_count(some)}" for grade, noise, some in each)}) |'
-            )
-    outside = parts.get('outside', [])
+        false_alarms = []
+        counts = []
+        for grade, noise, group in by_grade(none):
+            of_group = [bool(row[key]) for row in group]
+            false_alarms += of_group
+            counts.append(f'{grade} {noise} {_count(of_group)}')
+        if counts:
+            measured = f'{_percent(false_alarms)} ({"; ".join(counts)})'
+            lines.append(_line(f'nothing hidden: {what}', 'at most 2 %', measured))
     if outside:
+        cause = 'cause outside the catalogue:'
+        significant = _count(row['unexplained'] for row in outside)
+        unnamed = _count(not row['found'] for row in outside)
+        lines.append(_line(f'{cause} the rest is significant', '95 %', significant))
+        lines.append(_line(f'{cause} nothing named', '80 %', unnamed))
+    return lines
+
+
+def _lines_on_pairs(all_pairs):
+    """Return the lines on two effects at once."""
+    pairs = [row for row in all_pairs if separable(row)]
+    if not pairs:
+        return []
+    return [
+        _line(
+            f'two effects at once, all pairs but {len(all_pairs) - len(pairs)} that these'
+            ' sessions cannot separate: both named',
+            '90 %',
+            _percent(map(both_found, pairs)),
+        ),
+        _line(
+            'the same: a wrong name',
+            'at most 2 %',
+            _percent(bool(wrong_names(row)) for row in pairs),
+        ),
+    ]
+
+
+def _lines_by_size(sizes):
+    """Return the lines on effects of several sizes."""
+    lines = []
+    for factor in sorted({row['factor'] for row in sizes}):
+        group = [row for row in sizes if row['factor'] == factor]
+        marked = sum(first_is_right(row) and row['implausible'][0] for row in group)
         lines.append(
-            '| cause outside the catalogue: the rest is significant | 95 % |'
-            f' {_count(row["unexplained"] for row in outside)} |'
+            _line(
+                f'{factor:g} times the smallest detectable size: first right',
+                '95 %' if factor > 5 else '',
+                f'{_percent(map(first_is_right, group))}, {marked} of them with the mark',
+            )
         )
-        lines.append(
-            '| cause outside the catalogue: nothing named | 80 % |'
-            f' {_count(not row["found"] for row in outside)} |'
-        )
-    pairs = [row for row in parts.get('pairs', []) if separable(row)]
-    if pairs:
-        lines.append(
-            f'| two effects at once, all pairs but {len(parts["pairs"]) - len(pairs)} that these'
-            f' sessions cannot separate: both named | 90 % | {_percent(map(both_found, pairs))} |'
-        )
-        lines.append(
-            '| the same: a wrong name | at most 2 % |'
-            f' {_percent(bool(wrong_names(row)) for row in pairs)} |'
-        )
-    for factor in sorted({row['factor'] for row in parts.get('sizes', [])}):
-        some = [row for row in parts['sizes'] if row['factor'] == factor]
-        marked = sum(first_is_right(row) and row['implausible'][0] for row in some)
-        lines.append(
-            f'| {factor:g} times the smallest detectable size: first right |'
-            f' {"95 %" if factor > 5 else ""} | {_percent(map(first_is_right, some))}, {marked} of'
-            ' them with the mark |'
-        )
-    if 'traps' in parts:
-        lines.append(
-            '| traps that give a finding | none |'
-            f' {_count(bool(row["found"]) for row in parts["traps"])} |'
-        )
-    ratios = [row['oracle_ratio'] for row in effects if row.get('oracle_ratio') is not None]
-    if ratios:
-        lines.append(
-            '| held-out rms over that of a fit with the right effect alone, median (1 where'
-            f' nothing else is named) | 1.02 | {np.median(ratios):.4f} ({len(ratios)} sessions) |'
-        )
-    if 'failed' in parts:
-        lines.append(
-            '| tasks or worlds that failed and are counted nowhere | none |'
-            f' {len(parts["failed"])} |'
-        )
-    seconds = [row['seconds'] for row in rows if 'seconds' in row] or [np.nan]
-    lines.append(
-        '| processor time per diagnosis, five minutes at 100 Hz | 5 s, 95 % 10 s | median'
-        f' {np.median(seconds):.1f} s, 95 % below {np.quantile(seconds, 0.95):.1f} s, largest'
-        f' {np.max(seconds):.1f} s |'
-    )
-    return '\n'.join(lines)
+    return lines
 
 
 def _sentence(rows, parts):

@@ -5,7 +5,7 @@ from datetime import date
 
 import numpy as np
 
-from validation.hide_and_seek_sections import by_grade, kind_of, print_pairs, print_sizes
+from validation.hide_and_seek_sections import by_grade, kind_of, print_pairs, print_sizes, share_of
 
 from worlds import beyond_catalogue
 
@@ -49,23 +49,18 @@ def strictly_first(row):
     return bool(row['found']) and row['hidden'][0] == row['found'][0]
 
 
-def _share(values):
-    values = list(values)
-    return f'{sum(values)}/{len(values)} ({100 * np.mean(values):.1f} %)' if values else 'none'
-
-
 def _effects(rows, what):
     if not rows:
         return
     for grade, noise, some in by_grade(rows):
         print(
             f'\nfirst finding right or in its class, {what}, {grade} grade, {noise} noise:'
-            f' {_share(map(first_is_right, some))}; strictly first'
-            f' {_share(map(strictly_first, some))}; nothing else named'
-            f' {_share(len(row["found"]) == 1 for row in some)}'
+            f' {share_of(map(first_is_right, some))}; strictly first'
+            f' {share_of(map(strictly_first, some))}; nothing else named'
+            f' {share_of(len(row["found"]) == 1 for row in some)}'
         )
     for kind in sorted(set(map(kind_of, rows))):
-        print(f'  {kind}: {_share(first_is_right(row) for row in rows if kind_of(row) == kind)}')
+        print(f'  {kind}: {share_of(first_is_right(row) for row in rows if kind_of(row) == kind)}')
     for row in rows:
         if not first_is_right(row):
             print(
@@ -78,7 +73,7 @@ def _effects(rows, what):
     ]
     for name, right in weak:
         if np.mean(right) < 1:
-            print(f'  {name}: {_share(right)}')
+            print(f'  {name}: {share_of(right)}')
     print_confusion(rows)
 
 
@@ -111,12 +106,12 @@ def _parameters(rows):
         )
     levels = [row['level_error'] for row in rows if 'level_error' in row]
     if levels:
-        print(f'saturation level within 1 %: {_share(level < 0.01 for level in levels)}')
+        print(f'saturation level within 1 %: {share_of(level < 0.01 for level in levels)}')
 
 
 def _separating(rows):
     if rows:
-        print(f'\nsessions made to separate: strictly first {_share(map(strictly_first, rows))}')
+        print(f'\nsessions made to separate: strictly first {share_of(map(strictly_first, rows))}')
         for row in rows:
             if not strictly_first(row):
                 print(f'  {row["hidden"][0]} seed {row["seed"]}: {row["found"]} {row["classes"]}')
@@ -126,9 +121,9 @@ def _nothing(rows, what):
     for grade, noise, some in by_grade(rows):
         print(
             f'\n{what}, {grade} grade, {noise} noise: a finding in'
-            f' {_share(bool(row["found"]) for row in some)}; significant rest in'
-            f' {_share(row["unexplained"] for row in some)}; a formula in'
-            f' {_share(bool(row["formulas"]) for row in some)}'
+            f' {share_of(bool(row["found"]) for row in some)}; significant rest in'
+            f' {share_of(row["unexplained"] for row in some)}; a formula in'
+            f' {share_of(bool(row["formulas"]) for row in some)}'
         )
         for row in some:
             if row['found'] or row['unexplained'] or row['formulas']:
@@ -143,21 +138,21 @@ def _outside(rows):
         return
     print(
         '\ncauses outside the catalogue: unexplained significant in'
-        f' {_share(row["unexplained"] for row in rows)}, nothing named in'
-        f' {_share(not row["found"] for row in rows)}'
+        f' {share_of(row["unexplained"] for row in rows)}, nothing named in'
+        f' {share_of(not row["found"] for row in rows)}'
     )
     for name in sorted({row['hidden'][0] for row in rows}):
         some = [row for row in rows if row['hidden'][0] == name]
         print(
-            f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named'
-            f' {_share(not row["found"] for row in some)}'
+            f'  {name}: unexplained {share_of(row["unexplained"] for row in some)}, nothing named'
+            f' {share_of(not row["found"] for row in some)}'
             f' {[row["found"] for row in some if row["found"]]}'
         )
 
 
 def _traps(rows):
     if rows:
-        print(f'\ntraps: a finding in {_share(bool(row["found"]) for row in rows)}')
+        print(f'\ntraps: a finding in {share_of(bool(row["found"]) for row in rows)}')
         for row in rows:
             if row['found']:
                 print(f'  {row["trap"]} seed {row["seed"]}: {row["found"]}')
@@ -172,8 +167,8 @@ def _classes(rows):
     sizes = class_sizes(rows)
     if len(sizes):
         print(
-            f'\nright first findings told with mates: {_share(sizes > 1)}, of these with two:'
-            f' {_share(sizes[sizes > 1] > 2)}'
+            f'\nright first findings told with mates: {share_of(sizes > 1)}, of these with two:'
+            f' {share_of(sizes[sizes > 1] > 2)}'
         )
 
 

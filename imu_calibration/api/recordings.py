@@ -18,9 +18,9 @@ from imu_calibration.core.progress import counter, remark
 from imu_calibration.core.samples import (
     BlockSource,
     ImuSamples,
-    JointSamples,
     SampleBlock,
     TemperatureSamples,
+    joined_stream,
 )
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
@@ -124,9 +124,9 @@ class RecordingFile:
             When it cannot be read, or a topic is missing.
 
         """
-        return open_recording(
-            existing(self.path),
-            **self.topics.chosen(),
+        return open_bag(
+            self.path,
+            self.topics,
             want_joints=self.want_joints,
             want_temperature=self.want_temperature,
         )
@@ -152,41 +152,33 @@ class RecordingFile:
                 yield SampleBlock(dropped=recording.lost)
 
 
-def _with_gyroscope(blocks: Iterable[SampleBlock], path: str, topic: str) -> SampleBlock:
+def _with_gyroscope(blocks: Sequence[SampleBlock], path: str, topic: str) -> SampleBlock:
     """Return the blocks of a recording as one, with the rates of another Imu topic."""
-    # All samples of the first topic, with joints and temperatures.
-    imu_parts = []
-    joint_parts = []
-    temperature_parts = []
     dropped: Counter[str] = Counter()
     notes: Counter[str] = Counter()
     for block in blocks:
-        if block.imu is not None:
-            imu_parts.append(block.imu)
-        if block.joints is not None:
-            joint_parts.append(block.joints)
-        if block.temperature is not None:
-            temperature_parts.append(block.temperature)
         dropped.update(block.dropped or {})
         notes.update(block.notes or {})
 
     # The rates of the other topic, at the stamps of the first one.
     gyroscope = _imu_messages(path, Topics(imu=topic))
     dropped.update(gyroscope.lost)
-    if not imu_parts:
+    imu = joined_stream(blocks, 'imu')
+    if imu is None:
         raise _no_samples('the topic of the accelerometer')
-    imu = ImuSamples.concatenate(imu_parts)
     joined = join_sensors(
         finite_stream(imu.stamp_ns, imu.force_s),
         finite_stream(gyroscope.imu.stamp_ns, gyroscope.imu.rate_s),
         imu.frame_id,
     )
     remark(joined.text)
-    joints = JointSamples.concatenate(joint_parts) if joint_parts else None
-    temperature = None
-    if temperature_parts:
-        temperature = TemperatureSamples.concatenate(temperature_parts)
-    return SampleBlock(joined.imu, joints, temperature, dict(dropped), dict(notes))
+    return SampleBlock(
+        imu=joined.imu,
+        joints=joined_stream(blocks, 'joints'),
+        temperature=joined_stream(blocks, 'temperature'),
+        dropped=dict(dropped),
+        notes=dict(notes),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,14 +195,11 @@ class _ImuMessages:
 
 def _imu_messages(path: str | PathLike, topics: Topics) -> _ImuMessages:
     """Read an Imu topic to its end."""
-    parts = []
     with open_bag(path, topics, want_joints=False, want_temperature=False) as recording:
-        for block in recording.blocks():
-            if block.imu is not None:
-                parts.append(block.imu)
-    if not parts:
+        imu = joined_stream(recording.blocks(), 'imu')
+    if imu is None:
         raise _no_samples(recording.imu_topic)
-    return _ImuMessages(recording.imu_topic, ImuSamples.concatenate(parts), recording.lost)
+    return _ImuMessages(recording.imu_topic, imu, recording.lost)
 
 
 def _no_samples(topic: str) -> InputError:
@@ -341,13 +330,10 @@ def _hash_of(recording: str | PathLike | SampleBlock) -> str:
 
 def temperatures(path: str | PathLike, topics: Topics) -> TemperatureSamples | None:
     """Return all temperatures of a recording, or None."""
-    parts = []
     with open_bag(path, topics, want_joints=False) as recording:
-        if recording.temperature_topic:
-            for block in recording.blocks():
-                if block.temperature is not None and len(block.temperature):
-                    parts.append(block.temperature)
-    return TemperatureSamples.concatenate(parts) if parts else None
+        if not recording.temperature_topic:
+            return None
+        return joined_stream(recording.blocks(), 'temperature')
 
 
 def jobs_for(requested: int | None, n_items: int) -> int:

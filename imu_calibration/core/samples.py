@@ -324,6 +324,13 @@ class SampleBlock:
         )
 
 
+def joined_stream(blocks: Iterable[SampleBlock], stream: str) -> Any:
+    """Return the samples of 'imu', 'joints' or 'temperature' of all blocks; None without any."""
+    parts = [getattr(block, stream) for block in blocks]
+    parts = [part for part in parts if part is not None and len(part)]
+    return parts[0].concatenate(parts) if parts else None
+
+
 def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
     """
     Return (start, stop) of each run of true flags, half open, shape (n_runs, 2).

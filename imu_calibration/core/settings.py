@@ -74,6 +74,11 @@ def text_setting(text: str, symptom: str, *, default: str = '', **options: Any) 
     return setting(default, '', text, symptom=symptom, **options)
 
 
+def flag_setting(text: str, symptom: str, *, default: bool = False, **options: Any) -> Any:
+    """Declare a choice between true and false; arguments as in `Setting`."""
+    return setting(default, '', text, symptom=symptom, **options)
+
+
 def path_setting(text: str, symptom: str, **options: Any) -> Any:
     """Declare the path of a file that is an input of a session; as `text_setting`."""
     return text_setting(text, symptom, session=True, path=True, **options)

@@ -11,7 +11,13 @@ from imu_calibration.compensation.unit_gate import GravityScale, UnitGate
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.settings import height_setting, path_setting, setting, text_setting
+from imu_calibration.core.settings import (
+    flag_setting,
+    height_setting,
+    path_setting,
+    setting,
+    text_setting,
+)
 from imu_calibration.document import files, trust
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
@@ -40,11 +46,9 @@ class CompensatorSettings:
         'calibration.yaml or its folder, read again on ~/reload; empty: wait for imu/calibration',
         'no messages are published, see diagnostics',
     )
-    wait_for_file: bool = setting(
-        False,
-        '',
+    wait_for_file: bool = flag_setting(
         'wait for calibration_file while it does not exist',
-        symptom='the node ends at its start',
+        'the node ends at its start',
     )
     adopt: str = text_setting(
         'source of calibrations; file: calibration_file only, for the field; '
@@ -55,20 +59,16 @@ class CompensatorSettings:
         live=True,
         choices=(FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC),
     )
-    anyway: bool = setting(
-        False,
-        '',
+    anyway: bool = flag_setting(
         'also correct a sensor whose decision is unproven, and adopt a calibration from the topic'
         ' that changes the readings by more than such sensors need; one whose decision is harms is'
         ' never corrected',
-        symptom='the correction may increase the error of the readings',
+        'the correction may increase the error of the readings',
         live=True,
     )
-    passthrough: bool = setting(
-        False,
-        '',
+    passthrough: bool = flag_setting(
         'publish the messages unchanged until there is a calibration',
-        symptom='uncorrected messages on the corrected topic',
+        'uncorrected messages on the corrected topic',
         live=True,
     )
     target_frame: str = text_setting(
@@ -95,28 +95,22 @@ class CompensatorSettings:
         live=True,
         session=True,
     )
-    check_frame_id: bool = setting(
-        True,
-        '',
+    check_frame_id: bool = flag_setting(
         'correct only messages that carry the frame_id of the calibration',
-        symptom=(
-            'no messages are published, diagnostics name both frames; '
-            'if false, messages of a different sensor are corrected'
-        ),
+        'no messages are published, diagnostics name both frames; '
+        'if false, messages of a different sensor are corrected',
+        default=True,
         live=True,
     )
-    correct_stamps: bool = setting(
-        False,
-        '',
+    correct_stamps: bool = flag_setting(
         'move the stamps back by the time_offset of the calibration',
-        symptom='stamps differ from those of the driver',
+        'stamps differ from those of the driver',
         live=True,
     )
-    parameter_covariance: bool = setting(
-        True,
-        '',
+    parameter_covariance: bool = flag_setting(
         'add the uncertainty of the calibration to the covariances',
-        symptom='covariances are too small, filters trust the readings too much',
+        'covariances are too small, filters trust the readings too much',
+        default=True,
         live=True,
     )
     noise_file: str = path_setting(
@@ -151,14 +145,10 @@ class CompensatorSettings:
         live=True,
     )
     height: float = height_setting()
-    update_gyro_bias: bool = setting(
-        False,
-        '',
+    update_gyro_bias: bool = flag_setting(
         'correct the residual bias of the gyroscope measured at stops',
-        symptom=(
-            'headings drift as the sensor warms up; if true where the robot turns slowly and'
-            ' steadily at "rest", that rotation counts as a bias'
-        ),
+        'headings drift as the sensor warms up; if true where the robot turns slowly and'
+        ' steadily at "rest", that rotation counts as a bias',
         live=True,
     )
     gyro_bias_time: float = setting(
@@ -169,12 +159,10 @@ class CompensatorSettings:
         'too long: the bias of long ago is believed; too short: it is forgotten between stops',
         live=True,
     )
-    public_executor: bool = setting(
-        False,
-        '',
+    public_executor: bool = flag_setting(
         "use rclpy's public executor, at two to four times the computing time, "
         'instead of a wait set of our own',
-        symptom='messages are lost above 3 kHz',
+        'messages are lost above 3 kHz',
         fixed='the loop is chosen when the node starts',
     )
 

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.settings import path_setting, setting, text_setting
+from imu_calibration.core.settings import flag_setting, path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import announce, declare_parameters, run_node
@@ -45,17 +45,13 @@ class PlayerSettings:
         (0.0, 10000.0),
         'too large: messages are lost',
     )
-    clock: bool = setting(
-        False,
-        '',
+    clock: bool = flag_setting(
         "publish /clock with the recorder's times, for nodes with use_sim_time",
-        symptom='nodes with use_sim_time do not advance',
+        'nodes with use_sim_time do not advance',
     )
-    loop: bool = setting(
-        False,
-        '',
+    loop: bool = flag_setting(
         'start again at the end; the stamps then jump back',
-        symptom='the node ends after one round',
+        'the node ends after one round',
     )
     wait_for_subscribers: int = setting(
         0,
@@ -64,8 +60,10 @@ class PlayerSettings:
         (0, 100),
         'the first messages are missed',
     )
-    stop_at_end: bool = setting(
-        True, '', 'end the node after the last message', symptom='the node does not end'
+    stop_at_end: bool = flag_setting(
+        'end the node after the last message',
+        'the node does not end',
+        default=True,
     )
 
 

@@ -27,7 +27,7 @@ from visualization_msgs.msg import MarkerArray
 from imu_calibration.api.choices import calibration_options, provenance_with
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSession, LiveSettings
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.settings import path_setting, setting, text_setting
+from imu_calibration.core.settings import flag_setting, path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, SessionFiles
@@ -108,11 +108,9 @@ class CalibrationNodeSettings:
         'a tilted table shows as accelerometer bias',
         fixed='motion is gathered for the model',
     )
-    model_as_asked: bool = setting(
-        False,
-        '',
+    model_as_asked: bool = flag_setting(
         'do not extend the model by effects that the data support',
-        symptom='an unmodelled effect biases the parameters',
+        'an unmodelled effect biases the parameters',
         fixed='motion is gathered for the model',
     )
     tolerances_file: str = path_setting(
@@ -148,11 +146,9 @@ class CalibrationNodeSettings:
         'a calibration does not name its operator',
         session=True,
     )
-    resume: bool = setting(
-        False,
-        '',
+    resume: bool = flag_setting(
         'continue with the accumulator in the folder of save_file if it exists',
-        symptom='old motion of another IMU enters the calibration',
+        'old motion of another IMU enters the calibration',
         session=True,
     )
     autosave_period: float = setting(

@@ -14,7 +14,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.settings import path_setting, setting, text_setting
+from imu_calibration.core.settings import flag_setting, path_setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import StaticTransforms, root_of, table_from_urdf
@@ -138,11 +138,9 @@ class RobotSettings:
         session=True,
         fixed='all motion gathered so far is for this attitude of the arm',
     )
-    allow_xacro: bool = setting(
-        False,
-        '',
+    allow_xacro: bool = flag_setting(
         'expand a .xacro file, which is a program: its expressions can execute any Python code',
-        symptom='the node refuses a .xacro file',
+        'the node refuses a .xacro file',
     )
 
 

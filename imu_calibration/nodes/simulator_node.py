@@ -23,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration.api.resources import config_file
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.settings import path_setting, setting, text_setting
+from imu_calibration.core.settings import flag_setting, path_setting, setting, text_setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
@@ -71,14 +71,13 @@ class SimulatorSettings:
         default='quick',
         session=True,
     )
-    repeat: bool = setting(
-        False, '', 'start the profile again at its end', symptom='the table rests after one round'
+    repeat: bool = flag_setting(
+        'start the profile again at its end',
+        'the table rests after one round',
     )
-    stop_at_end: bool = setting(
-        False,
-        '',
+    stop_at_end: bool = flag_setting(
         'end the node at the end of the profile; otherwise the table remains at rest',
-        symptom='the node does not end',
+        'the node does not end',
     )
     calibration_file: str = path_setting(
         'calibration document with the true parameters, path; empty: a random IMU',
@@ -124,8 +123,10 @@ class SimulatorSettings:
         (1.0, 20000.0),
         'too small: fast motion is not followed',
     )
-    velocity: bool = setting(
-        True, '', 'whether JointState holds velocities', symptom='velocities are missing'
+    velocity: bool = flag_setting(
+        'whether JointState holds velocities',
+        'velocities are missing',
+        default=True,
     )
     encoder_resolution: float = setting(
         0.0,
@@ -141,22 +142,18 @@ class SimulatorSettings:
         (0.0, 0.01),
         'too large: stamps out of order',
     )
-    temperature: bool = setting(
-        False,
-        '',
+    temperature: bool = flag_setting(
         'publish imu/temperature, warming up from 25 C',
-        symptom='thermal effects cannot be calibrated',
+        'thermal effects cannot be calibrated',
     )
     frame_id: str = text_setting(
         'frame of the Imu messages',
         'another frame_id',
         default='imu_link',
     )
-    truth: bool = setting(
-        False,
-        '',
+    truth: bool = flag_setting(
         'publish imu/truth: readings of a perfect IMU',
-        symptom='no messages on imu/truth',
+        'no messages on imu/truth',
     )
     time_factor: float = setting(
         1.0,
@@ -165,11 +162,9 @@ class SimulatorSettings:
         (0.0, 10000.0),
         'too large: messages are lost',
     )
-    clock: bool = setting(
-        False,
-        '',
+    clock: bool = flag_setting(
         'publish /clock, for nodes with use_sim_time',
-        symptom='nodes with use_sim_time do not advance',
+        'nodes with use_sim_time do not advance',
     )
     start_time: float = setting(
         0.0, 's', 'first stamp; 0: the present time', (0.0, 4e9), 'stamps of another day'

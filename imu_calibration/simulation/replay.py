@@ -1,12 +1,12 @@
 """Simulation of a calibrated IMU on the motion of a recording."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.core.samples import ImuSamples, SampleBlock, joined_stream
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import clip, predict
 from imu_calibration.effects.sensor_model import SensorModel
@@ -150,8 +150,8 @@ def simulate_on_recording(
     force, rate = readings
     replayed = SampleBlock(
         ImuSamples(stamps, force, rate, frame_id),
-        _concatenated([block.joints for block in blocks]),
-        _concatenated([block.temperature for block in blocks]),
+        joined_stream(blocks, 'joints'),
+        joined_stream(blocks, 'temperature'),
     )
     return replayed, n_omitted
 
@@ -170,9 +170,3 @@ def _recorded_hum(windows: Sequence[Window], period: float) -> np.ndarray:
     # Compensation measures the variance with a filter, which passes a part of it.
     measured_variance = BandVariance().of(period, hum)[-1]
     return hum * np.sqrt(variance / measured_variance)
-
-
-def _concatenated(parts: list) -> Any:
-    """Return the samples of several blocks of one stream; None without samples."""
-    parts = [part for part in parts if part is not None and len(part)]
-    return type(parts[0]).concatenate(parts) if parts else None
