@@ -12,6 +12,8 @@ with" for "correlates with"), and a vague pronoun. Good packages have 0.5 to 5 p
 
 import argparse
 import ast
+import collections
+import dataclasses
 import io
 import pathlib
 import re
@@ -96,6 +98,36 @@ def files(root):
     return sorted(found) + sorted((root / 'docs').rglob('*.md'))
 
 
+@dataclasses.dataclass
+class Count:
+    """Words and markers of some sentences."""
+
+    words: int = 0
+    """Number of words."""
+    markers: int = 0
+    """Number of marker words."""
+    long: int = 0
+    """Number of sentences above 30 words."""
+
+    def add(self, words, markers):
+        """Count a sentence."""
+        self.words += words
+        self.markers += markers
+        self.long += words > 30
+
+    @property
+    def rate(self):
+        """Markers per 1,000 words."""
+        return 1000 * self.markers / max(self.words, 1)
+
+    def line(self, name):
+        """Return the printed line of these sentences."""
+        return (
+            f'{name:34s} {self.words:7d} words {self.rate:6.1f} markers per 1,000 '
+            f' {self.long:4d} sentences above 30 words'
+        )
+
+
 def main():
     """Print the rate by folder and by kind of text."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
@@ -105,66 +137,54 @@ def main():
     )
     parser.add_argument('--folders', action='store_true', help='print the rate of each folder')
     arguments = parser.parse_args()
-    count, sentences = {}, []
+    by_kind = collections.defaultdict(Count)
+    by_place = collections.defaultdict(Count)
+    sentences = []  # (share of markers, place, sentence) of each with several markers
     for path in files(arguments.root):
-        place = (
-            '/'.join(path.relative_to(arguments.root).parts[:2])
-            if arguments.root.is_dir()
-            else path.name
-        )
+        place = path.name
+        if arguments.root.is_dir():
+            place = '/'.join(path.relative_to(arguments.root).parts[:2])
         for kind, line, text in texts(path):
             for sentence in SENTENCE.split(text):
                 words = re.findall(r"[A-Za-z][A-Za-z'-]*", sentence)
-                hits = [w for w in words if w.lower() in MARKERS]
-                for key in (('all', kind), ('place', place)):
-                    known = count.setdefault(key, [0, 0, 0])
-                    known[0] += len(words)
-                    known[1] += len(hits)
-                    known[2] += len(words) > 30
-                if len(hits) > 1:
-                    sentences.append(
-                        (len(hits) / (len(words) + 8), f'{path}:{line}', ' '.join(sentence.split()))
-                    )
+                n_markers = sum(word.lower() in MARKERS for word in words)
+                by_kind[kind].add(len(words), n_markers)
+                by_place[place].add(len(words), n_markers)
+                if n_markers > 1:
+                    share = n_markers / (len(words) + 8)
+                    sentences.append((share, f'{path}:{line}', ' '.join(sentence.split())))
 
-    def row(name, numbers):
-        words, hits, long = numbers
-        return (
-            f'{name:34s} {words:7d} words {1000 * hits / max(words, 1):6.1f} markers per 1,000 '
-            f' {long:4d} sentences above 30 words'
-        )
-
-    for (group, name), numbers in sorted(
-        count.items(), key=lambda item: (item[0][0] != 'place', -item[1][1])
-    ):
-        if arguments.folders and group == 'place':
-            print(row(name, numbers))
-    for share, place, sentence in sorted(sentences, reverse=True)[: arguments.worst]:
+    if arguments.folders:
+        for place, count in sorted(by_place.items(), key=lambda item: -item[1].markers):
+            print(count.line(place))
+    for _, place, sentence in sorted(sentences, reverse=True)[: arguments.worst]:
         print(f'  {place}: {sentence[:200]}')
-    total = [sum(n[k] for (g, _), n in count.items() if g == 'all') for k in range(3)]
+    total = Count()
     for kind in ('docstring', 'comment', 'message', 'page'):
-        if ('all', kind) in count:
-            print(row(kind, count['all', kind]))
-    print(row('total', total))
-    rates = {
-        kind: 1000 * numbers[1] / max(numbers[0], 1)
-        for (group, kind), numbers in count.items()
-        if group == 'all'
-    }
+        if kind in by_kind:
+            print(by_kind[kind].line(kind))
+            total.words += by_kind[kind].words
+            total.markers += by_kind[kind].markers
+            total.long += by_kind[kind].long
+    print(total.line('total'))
+
+    # The limits are those of the whole repository.
     if not arguments.root.is_dir():
         return
-    faults = [
-        f'marker words per 1,000 words in {kind}s must be at most {MOST[kind]:g}, got {rate:.2f};'
-        ' rewrite the sentences that `tools/plain.py --worst 20` prints'
-        for kind, rate in rates.items()
-        if rate > MOST[kind]
-    ]
+    faults = []
+    for kind, count in by_kind.items():
+        if count.rate > MOST[kind]:
+            faults.append(
+                f'marker words per 1,000 words in {kind}s must be at most {MOST[kind]:g}, got'
+                f' {count.rate:.2f}; rewrite the sentences that `tools/plain.py --worst 20` prints'
+            )
     for pattern, most in MOST_WORDS.items():
         for path in sorted(arguments.root.glob(pattern)):
-            words = len(path.read_text().split())
-            if words > most:
+            n_words = len(path.read_text().split())
+            if n_words > most:
                 faults.append(
                     f'{path.relative_to(arguments.root)} must have at most {most} words, got'
-                    f' {words}; shorten it'
+                    f' {n_words}; shorten it'
                 )
     if faults:
         sys.exit('\n'.join(faults))

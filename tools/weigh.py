@@ -18,6 +18,10 @@ import pathlib
 import sys
 import tokenize
 
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
 LAYOUT = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -87,35 +91,14 @@ def imports(root, files):
 
 
 def cycles(graph):
-    """Return the strongly connected sets of more than one module (Tarjan)."""
-    index, low, stack, on, found = {}, {}, [], set(), []
-    sys.setrecursionlimit(10000)
-
-    def visit(v):
-        index[v] = low[v] = len(index)
-        stack.append(v)
-        on.add(v)
-        for w in graph[v]:
-            if w not in index:
-                visit(w)
-                low[v] = min(low[v], low[w])
-            elif w in on:
-                low[v] = min(low[v], index[w])
-        if low[v] == index[v]:
-            part = []
-            while True:
-                w = stack.pop()
-                on.discard(w)
-                part.append(w)
-                if w == v:
-                    break
-            if len(part) > 1:
-                found.append(sorted(part))
-
-    for v in graph:
-        if v not in index:
-            visit(v)
-    return found
+    """Return the sets of more than one module that import each other, directly or not."""
+    modules = sorted(graph)
+    adjacency = np.array([[other in graph[module] for other in modules] for module in modules])
+    _, labels = connected_components(csr_array(adjacency), connection='strong')
+    components = collections.defaultdict(list)
+    for module, label in zip(modules, labels):
+        components[label].append(module)
+    return [component for component in components.values() if len(component) > 1]
 
 
 def main():
