@@ -150,10 +150,13 @@ def bound(moments, truth, names):
     shares = np.array(spectra) / sum(spectra[: len(names)])
     information += shares @ shares.T
     sd = np.sqrt(np.diag(np.linalg.inv(information)))
-    return {
-        name: float(value)
-        for name, value in zip([*names, *([TIME_KEY] if 'gauss_markov' in names else [])], sd)
-    }
+    return _by_name(names, sd)
+
+
+def _by_name(names, sd):
+    """Return process, and the correlation time of a Gauss-Markov process -> its bound."""
+    keys = [*names, TIME_KEY] if 'gauss_markov' in names else names
+    return dict(zip(keys, sd.tolist()))
 
 
 def moment_bound(moments, truth, names):
@@ -172,10 +175,7 @@ def moment_bound(moments, truth, names):
         np.einsum('p,q,pqij->ij', squares, squares, moments.scales.tensor(processes))
     )(design)
     sd = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)))
-    return {
-        name: float(value)
-        for name, value in zip([*names, *([TIME_KEY] if 'gauss_markov' in names else [])], sd)
-    }
+    return _by_name(names, sd)
 
 
 def _derivatives(truth, names, of):

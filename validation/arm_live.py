@@ -76,28 +76,33 @@ def prepare(folder, name, arm_from, *, seconds, pair=PAIR):
 
     Calibrations from its poses, the arm from the recording `arm_from`.
     """
-    topics = [f'/imu_{k}/data_raw' for k in pair]
-    imus = [load(folder, name, topic) for topic in topics]
-    found = []
-    for topic in topics:
-        with open_recording(folder / name, topic, want_joints=False) as recording:
-            poses = GravityReference().gather([recording.blocks()], CalibrationOptions())
-            result = calibrate_by_evidence(poses)
-            found.append((result.calibration, result.applied))
-    arm = estimate_arm(*(load(folder, arm_from, topic) for topic in topics))
-    a, b = imus
-    part = a.select(a.stamp_ns > a.stamp_ns[-1] - int(seconds * 1e9))
-    origin = a.stamp_ns[0]
-    time_b = 1e-9 * (b.stamp_ns - origin)
-    time_a = 1e-9 * (part.stamp_ns - origin)
-    force_b = found[1][1].compensate(b.force_s, b.rate_s)[0]
+    topic_a, topic_b = (f'/imu_{k}/data_raw' for k in pair)
+    a = load(folder, name, topic_a)
+    b = load(folder, name, topic_b)
+    calibration_a = _calibrated(folder / name, topic_a).calibration
+    applied_b = _calibrated(folder / name, topic_b).applied
+    arm = estimate_arm(load(folder, arm_from, topic_a), load(folder, arm_from, topic_b))
+
+    # The calibrated force of B at the stamps of A.
+    stretch = a.select(a.stamp_ns > a.stamp_ns[-1] - int(seconds * 1e9))
+    time_a = 1e-9 * (stretch.stamp_ns - a.stamp_ns[0])
+    time_b = 1e-9 * (b.stamp_ns - a.stamp_ns[0])
+    force_b, _ = applied_b.compensate(b.force_s, b.rate_s)
     force_b = np.stack([np.interp(time_a, time_b, force_b[:, k]) for k in range(3)], axis=1)
-    bad_b = clipped(b.force_s) | clipped(b.rate_s)
-    bad = _after(clipped(a.force_s) | clipped(a.rate_s))[-len(part) :] | (
-        np.interp(time_a, time_b, _after(bad_b).astype(float)) > 0
-    )
-    fast = np.linalg.norm(part.rate_s, axis=1) > MOVING
-    return Case(part, force_b, fast & ~bad, calibration_to_text(found[0][0]), arm)
+
+    # Moving, and neither IMU clipped.
+    bad_a = _after(clipped(a.force_s) | clipped(a.rate_s))[-len(stretch) :]
+    bad_b = _after(clipped(b.force_s) | clipped(b.rate_s))
+    bad = bad_a | (np.interp(time_a, time_b, bad_b.astype(float)) > 0)
+    is_fast = np.linalg.norm(stretch.rate_s, axis=1) > MOVING
+    return Case(stretch, force_b, is_fast & ~bad, calibration_to_text(calibration_a), arm)
+
+
+def _calibrated(bag, topic):
+    """Return the result of a calibration by hand from one topic of a bag."""
+    with open_recording(bag, topic, want_joints=False) as recording:
+        poses = GravityReference().gather([recording.blocks()], CalibrationOptions())
+        return calibrate_by_evidence(poses)
 
 
 def _after(bad):
@@ -160,24 +165,23 @@ def _exchange(rclpy, context, case, speed):
         node.create_subscription(
             Imu, f'/{name}/imu/data_corrected', store.append, input_qos(reliable=True), raw=True
         )
-    _spin_until(
-        executor,
-        lambda: all(p.get_subscription_count() for p in publishers.values()),
-        60.0,
-        'both nodes',
-    )
-    _spin_until(
-        executor,
-        lambda: all(node.count_publishers(f'/{name}/imu/data_corrected') for name in received),
-        60.0,
-        'their outputs',
-    )
-    _spin_until(executor, lambda: False, 1.0)
+
+    def have_subscribed():
+        return all(publisher.get_subscription_count() for publisher in publishers.values())
+
+    def do_publish():
+        return all(node.count_publishers(f'/{name}/imu/data_corrected') for name in received)
+
+    _spin_until(executor, have_subscribed, 60.0, 'both nodes')
+    _spin_until(executor, do_publish, 60.0, 'their outputs')
+    _spin_until(executor, lambda: False, 1.0)  # the nodes may find this one later
+
+    # Each message at its time, then the wait for the last ones.
     messages = [row.tobytes() for row in encode_imu(case.imu_a)]
     due = time.monotonic() + 1e-9 * (case.imu_a.stamp_ns - case.imu_a.stamp_ns[0]) / speed
     for data, moment in zip(messages, due, strict=True):
-        while (left := moment - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=left)
+        while time.monotonic() < moment:
+            executor.spin_once(timeout_sec=max(moment - time.monotonic(), 0.0))
         for publisher in publishers.values():
             publisher.publish(data)
     _spin_until(

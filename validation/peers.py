@@ -156,19 +156,24 @@ def ours(calibration):
     ]
 
 
+def _truth(values):
+    """Return the true errors of accelerometer and gyroscope of a session."""
+    from worlds.hand_sessions import unpack
+
+    bias_f, matrix_f, bias_w, matrix_w = unpack(values)
+    return Forward(bias_f, matrix_f), Forward(bias_w, matrix_w)
+
+
 def by_hand(make):
     """
     Return rms errors over the seeds of ours, the plain fit on means and on medians, shape (3, 2).
 
     Inf where we refuse.
     """
-    from worlds.hand_sessions import unpack
-
     rows = []
     for seed in SEEDS:
         imu, ranges, values = make(seed)
-        bias_f, matrix_f, bias_w, matrix_w = unpack(values)
-        truth = Forward(bias_f, matrix_f), Forward(bias_w, matrix_w)
+        truth = _truth(values)
         try:
             mine = errors(
                 ours(calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration), truth
@@ -190,13 +195,10 @@ def trial(make):
 
     None for a sensor that a method does not calibrate.
     """
-    from worlds.hand_sessions import unpack
-
     found = {}
     for seed in TRIAL_SEEDS:
         imu, ranges, values = make(seed)
-        bias_f, matrix_f, bias_w, matrix_w = unpack(values)
-        truth = Forward(bias_f, matrix_f), Forward(bias_w, matrix_w)
+        truth = _truth(values)
         methods = {
             'ours': ours(calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration),
             **{

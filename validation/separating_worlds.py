@@ -20,7 +20,7 @@ from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count, islice
+from itertools import chain, count, islice
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,7 @@ import numpy as np
 from imu_calibration.api.diagnose import Diagnosed, diagnose
 from imu_calibration.api.plan import LONGEST_SEPARATION, plan
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.samples import (
-    ImuSamples,
-    JointSamples,
-    SampleBlock,
-    TemperatureSamples,
-)
+from imu_calibration.core.samples import SampleBlock, joined_stream
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.planner import Plan
 from imu_calibration.preprocessing.window_finder import MotionGatherer
@@ -115,7 +110,7 @@ def _spin_one_way(builder, up, speed):
 
 def appended(first: SampleBlock, second: SampleBlock) -> SampleBlock:
     """Return two recordings as one, the second some time after the first."""
-    assert first.imu and first.joints and first.temperature, 'simulated sessions have all three'
+    assert first.imu, 'simulated sessions have all three'
     assert second.imu and second.joints and second.temperature, 'simulated sessions have all three'
     shift = first.imu.stamp_ns[-1] + to_ns(PAUSE) - second.imu.stamp_ns[0]
     later = SampleBlock(
@@ -123,49 +118,47 @@ def appended(first: SampleBlock, second: SampleBlock) -> SampleBlock:
         replace(second.joints, stamp_ns=second.joints.stamp_ns + shift),
         replace(second.temperature, stamp_ns=second.temperature.stamp_ns + shift),
     )
-    return SampleBlock(
-        ImuSamples.concatenate([first.imu, later.imu]),
-        JointSamples.concatenate([first.joints, later.joints]),
-        TemperatureSamples.concatenate([first.temperature, later.temperature]),
-    )
+    streams = ('imu', 'joints', 'temperature')
+    return SampleBlock(*(joined_stream([first, later], stream) for stream in streams))
 
 
 def run(world: World) -> dict:
     """Return one row: the hidden effect, the class, the planned motion, the final findings."""
-    hidden, start = world.hidden(), time.process_time()
+    start = time.process_time()
+    hidden = world.hidden()
     first = world.session(0, world.round(), hidden)
     table = Table.from_mapping(first.table)
     row: dict[str, Any] = {'seed': world.seed, 'hidden': world.effect, 'factor': world.factor}
-    found = diagnose(first.block, table)
-    row['before'] = names(found)
+    diagnosis = diagnose(first.block, table)
+    row['before'] = names(diagnosis)
     if not is_class(row['before']):
         return row
-    block, done = first.block, []
-    while len(done) < SEPARATIONS:
-        left = LONGEST_SEPARATION - sum(made.seconds for made in done)
+
+    # Plan a motion, append its recording and diagnose both, until one cause remains.
+    block = first.block
+    plans: list[Plan] = []
+    while len(plans) < SEPARATIONS:
         try:
-            made = plan(
+            planned = plan(
                 table,
-                calibration=found.calibration,
-                diagnosis=found.document,
-                longest=left,
+                calibration=diagnosis.calibration,
+                diagnosis=diagnosis.document,
+                longest=LONGEST_SEPARATION - sum(earlier.seconds for earlier in plans),
                 with_bound=False,
             ).plan
         except ImuCalibrationError as error:
-            if not done:
+            if not plans:
                 return row | {'refused': str(error), 'right': False}
             break
-        done.append(made)
-        if made.motions:
-            motion = Profile(
-                'separating',
-                tuple(segment for one in made.segments for segment in one),
-                first.truth['profile'].joint_names,
-            )
-            block = appended(block, world.session(len(done), motion, hidden).block)
-            found = diagnose(block, table)
-        row |= judged(names(found), world.effect, done)
-        if not made.motions or row['right'] or row['one_cause'] or not is_class(names(found)):
+        plans.append(planned)
+        if planned.motions:
+            segments = tuple(chain.from_iterable(planned.segments))
+            motion = Profile('separating', segments, first.truth['profile'].joint_names)
+            block = appended(block, world.session(len(plans), motion, hidden).block)
+            diagnosis = diagnose(block, table)
+        findings = names(diagnosis)
+        row |= judged(findings, world.effect, plans)
+        if not planned.motions or row['right'] or row['one_cause'] or not is_class(findings):
             break
     return row | {'processor': time.process_time() - start}
 
@@ -175,32 +168,31 @@ def is_class(found: list) -> bool:
     return any(mates for _, mates in found)
 
 
-def judged(found: list, hidden: str, done: Sequence[Plan]) -> dict:
+def judged(findings: list, hidden: str, plans: Sequence[Plan]) -> dict:
     """
     Return the predictions of the plans, and whether the finding is correct.
 
     It is correct when it is only the hidden effect, or a class that the first plan reported as one
     cause.
     """
-    missing = done[0].missing  # of all three minutes
-    alike = {
-        hidden,
-        *(
-            name
-            for pair in missing
-            for name in pair.split(' and ')
-            if hidden in pair.split(' and ')
-        ),
-    }
-    named = {name for effect, mates in found for name in (effect, *mates)}
+    # Effects that all three minutes of motion do not separate from the hidden one.
+    missing = plans[0].missing
+    alike = {hidden}
+    for pair in missing:
+        effects = pair.split(' and ')
+        if hidden in effects:
+            alike.update(effects)
+    named: set[str] = set()
+    for effect, mates in findings:
+        named.update((effect, *mates))
     return {
-        'after': found,
-        'seconds': sum(made.seconds for made in done),
-        'motions': sum(len(made.motions) for made in done),
-        'rounds': len(done),
+        'after': findings,
+        'seconds': sum(planned.seconds for planned in plans),
+        'motions': sum(len(planned.motions) for planned in plans),
+        'rounds': len(plans),
         'missing': missing,
-        'right': found == [(hidden, ())],
-        'one_cause': len(found) == 1 and hidden in named and named <= alike,
+        'right': findings == [(hidden, ())],
+        'one_cause': len(findings) == 1 and hidden in named and named <= alike,
     }
 
 

@@ -83,13 +83,13 @@ def simultaneous_turn(
     return Rotation.from_rotvec(np.outer(angle, axis) / np.linalg.norm(axis)).inv().as_matrix()
 
 
-def equal_angles(step_deg: float = 10.0, stop_deg: float = 400.0) -> np.ndarray:
+def equal_angles(step_deg: float = 10.0) -> np.ndarray:
     """
     Return the paper's turn angles in rad.
 
-    0 to `stop_deg` with the end, 41 positions (40 in the paper).
+    0 to 400 deg with the end, 41 positions (40 in the paper).
     """
-    return np.deg2rad(np.arange(0.0, stop_deg + step_deg / 2, step_deg))
+    return np.deg2rad(np.arange(0.0, 400.0 + step_deg / 2, step_deg))
 
 
 def gravity_readings(
@@ -130,14 +130,14 @@ def series_4() -> np.ndarray:
     return np.column_stack([rate, np.exp(-rate), rate**2])
 
 
-def factorial_rates(rate_deg_s: float = 10.0, n_static: int = 3) -> np.ndarray:
+def factorial_rates(rate_deg_s: float = 10.0) -> np.ndarray:
     """
-    Return all eight sign combinations of one rate on each axis and `n_static` runs at rest, deg/s.
+    Return all eight sign combinations of one rate on each axis and three runs at rest, deg/s.
 
     The orthogonal design.
     """
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    return np.vstack([rate_deg_s * corners, np.zeros((n_static, 3))])
+    return np.vstack([rate_deg_s * corners, np.zeros((3, 3))])
 
 
 def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float) -> np.ndarray:
@@ -235,8 +235,12 @@ class TiltedSolution:
     """Last linear step; its `unit_covariance` holds for the names in `linear.param_names`."""
 
 
+TILT_STEPS = 8
+"""Gauss-Newton steps of `calibrate_with_tilt`."""
+
+
 def calibrate_with_tilt(
-    mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: str, *, iterations: int = 8
+    mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: str
 ) -> TiltedSolution:
     """
     Estimate the parameters of all three accelerometers jointly.
@@ -255,7 +259,7 @@ def calibrate_with_tilt(
     ) + ('tilt_1', 'tilt_2')
     tilt = np.zeros(2)
     coefficients = calibrate(gravity_readings(mat_bn, gravity_axis), outputs).values
-    for _ in range(iterations):
+    for _ in range(TILT_STEPS):
         design = design_matrix(gravity_readings(mat_bn, gravity_axis, tilt), 'linear')
         slopes = mat_bn @ _tilt_derivative(gravity_axis, tilt)
         full = np.zeros((3, len(design), 14))
@@ -271,11 +275,7 @@ def calibrate_with_tilt(
 
 
 def reference_error(
-    inputs: np.ndarray,
-    input_changes: np.ndarray,
-    coefficients: np.ndarray,
-    *,
-    model: str = 'linear',
+    inputs: np.ndarray, input_changes: np.ndarray, coefficients: np.ndarray
 ) -> np.ndarray:
     """
     Return the errors of the coefficients from errors of the reference inputs.
@@ -286,8 +286,8 @@ def reference_error(
     together (tilt, Earth rate), which the paper's section V cannot express.
 
     """
-    true_outputs = design_matrix(np.asarray(inputs) + input_changes, model) @ coefficients
-    return calibrate(inputs, true_outputs, model).values - coefficients
+    true_outputs = design_matrix(np.asarray(inputs) + input_changes) @ coefficients
+    return calibrate(inputs, true_outputs).values - coefficients
 
 
 def estimation_operator(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:

@@ -211,10 +211,6 @@ def static_navigation(
     rng: np.random.Generator,
     *,
     n_draws: int = 400,
-    seconds: float = 50.0,
-    noise_sd_g: float = 1e-3,
-    sample_rate: float = 100.0,
-    calibration_seconds: float = 60.0,
 ) -> np.ndarray:
     """
     Return errors of navigation at rest with x up, attitude known.
@@ -232,12 +228,14 @@ def static_navigation(
         Sd of the bias, which is drawn for every run (six positions and the navigation), g.
     rng : numpy.random.Generator
     n_draws : int
-    seconds, noise_sd_g, sample_rate, calibration_seconds : float
-        Navigation time, white noise per sample, samples per second, time per position.
 
     """
+    seconds = 50.0  # of navigation
+    position_seconds = 60.0  # in each of the six positions
+    sample_rate = 100.0  # Hz
+    noise_sd_g = 1e-3  # white noise of a sample, g
     true = static_model_from_matrix(model.matrix, model.bias)
-    mean_sd = np.hypot(noise_sd_g / np.sqrt(sample_rate * calibration_seconds), drift_sd_g)
+    mean_sd = np.hypot(noise_sd_g / np.sqrt(sample_rate * position_seconds), drift_sd_g)
     noise = rng.normal(scale=mean_sd, size=(n_draws, 6, 3))
     readings = true.predict(six_positions()) + noise * true.scale
     _, solution = fit_static(six_positions(), np.moveaxis(readings, 0, 1).reshape(6, -1))
@@ -318,12 +316,10 @@ def spin_growth(
     arms: np.ndarray,
     axis: tuple[float, float, float],
     *,
-    rate_deg_s: float = 100.0,
     seconds: float = 100.0,
-    sample_rate: float = 100.0,
 ) -> dict[str, Any]:
     """
-    Return errors of an uncompensated size effect in a constant spin.
+    Return errors of an uncompensated size effect in a constant spin of 100 deg/s.
 
     (velocity, position) in n, the same summed in the body frame.
 
@@ -332,8 +328,8 @@ def spin_growth(
 
     """
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
-    time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
-    rate = np.tile(np.deg2rad(rate_deg_s) * axis, (len(time), 1))
+    time = np.arange(int(round(seconds * 100.0)) + 1) / 100.0
+    rate = np.tile(np.deg2rad(100.0) * axis, (len(time), 1))
     error = size_effect_error(cosines, arms, rate, alpha=np.zeros_like(rate))
     mat_ns = Rotation.from_rotvec(rate * time[:, None]).as_matrix()
     return {
@@ -365,7 +361,6 @@ class Tumbling:
 def tumble(
     amplitude_deg: tuple[float, float, float],
     frequency_hz: tuple[float, float, float],
-    phase: tuple[float, float, float] = (0.3, 1.1, 2.0),
     *,
     seconds: float = 60.0,
     sample_rate: float = 200.0,
@@ -373,7 +368,7 @@ def tumble(
     """Return a `Tumbling` motion; each argument has one value per body axis, or one for all."""
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
     angular = 2 * np.pi * np.asarray(frequency_hz, float)
-    angle = np.multiply.outer(time, angular) + np.asarray(phase)
+    angle = np.multiply.outer(time, angular) + np.array([0.3, 1.1, 2.0])
     size = np.deg2rad(amplitude_deg) * angular
     rate, alpha = size * np.cos(angle), -size * angular * np.sin(angle)
     return Tumbling(time, strapdown.integrate_attitude(time, rate), rate, alpha)
@@ -392,16 +387,16 @@ def arm_responses(motion: Tumbling, cosines: np.ndarray) -> tuple[np.ndarray, np
     return error_growth(motion.time, errors, motion.mat_ns)
 
 
-def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray, every: int = 5) -> np.ndarray:
+def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray) -> np.ndarray:
     """
     Return the largest velocity and position error for arm errors of shape (n_draws, 3, 3).
 
-    Shape (2, n_draws).
+    At every fifth time, shape (2, n_draws).
     """
     flat = np.asarray(arms, float).reshape(-1, 9)
     out = []
     for response in responses:
-        thinned = response[:, ::every]
+        thinned = response[:, ::5]
         histories = (flat @ thinned.reshape(9, -1)).reshape(len(flat), -1, 3)
         out.append(largest(histories))
     return np.array(out)

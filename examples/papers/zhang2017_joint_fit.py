@@ -118,26 +118,20 @@ def two_axis(
     return Run('two-axis', STANDARD_GRAVITY * up, rate, alpha, noise_sd)
 
 
-def design_runs(
-    name: str, sample_sd: float = 1e-3 * STANDARD_GRAVITY, n_samples: int = 100
-) -> list[Run]:
+def design_runs(name: str) -> list[Run]:
     """
-    Return the runs of a named design: six faces and nine dynamic runs of `n_samples` samples each.
+    Return the runs of one of `DESIGNS`: six faces and nine dynamic runs of 100 samples each.
 
-    Parameters
-    ----------
-    name : str
-        One of `DESIGNS`.
-    sample_sd : float
-        White noise of one sample, m/s^2; runs with constant readings carry ``sample_sd /
-        sqrt(n_samples)``.
-
+    A sample has white noise of 1 mg; the mean of a run with constant readings a tenth of it.
     """
     if name not in DESIGNS:
         raise InputError(
             f"design must be one of {', '.join(DESIGNS)}, got '{name}'; choose one of them"
         )
-    mean_sd, axes = sample_sd / np.sqrt(n_samples), np.eye(3)
+    n_samples = 100
+    sample_sd = 1e-3 * STANDARD_GRAVITY
+    mean_sd = sample_sd / np.sqrt(n_samples)
+    axes = np.eye(3)
     runs = [face(sign * axis, mean_sd) for sign in (1, -1) for axis in axes]
     if name in ('Z0', 'Z60'):
         skew_deg = {'Z0': 0.0, 'Z60': 60.0}[name]
@@ -168,15 +162,13 @@ def skewed_axes(skew_deg: float) -> np.ndarray:
     return Rotation.from_rotvec(np.deg2rad(skew_deg) * np.ones(3) / np.sqrt(3)).as_matrix().T
 
 
-def average_headings(tilt: float, up: np.ndarray, noise_sd: float, *, n_headings: int = 4) -> Run:
+def average_headings(tilt: float, up: np.ndarray, noise_sd: float) -> Run:
     """
-    Return the mean of a tilted position over equally spaced headings.
+    Return the mean of a tilted position over four equally spaced headings.
 
     The error of levelling cancels in this mean.
     """
-    parts = [
-        face(up, noise_sd, tilt, azimuth=2 * np.pi * k / n_headings) for k in range(n_headings)
-    ]
+    parts = [face(up, noise_sd, tilt, azimuth=2 * np.pi * k / 4) for k in range(4)]
     return replace(parts[0], force=np.mean([part.force for part in parts], axis=0))
 
 
@@ -239,19 +231,17 @@ def judge_design(
     runs: Sequence[Run],
     matrix: np.ndarray,
     arms: np.ndarray,
-    *,
-    tolerances: np.ndarray = TOLERANCES,
 ) -> list[ToleranceScaled]:
     """
     Predict the precision of a design, one `ToleranceScaled` per accelerometer.
 
-    Sd over tolerance and weak directions.
+    Sd over `TOLERANCES` and weak directions.
 
     An sd over tolerance above 1 means that the parameter must not be reported as a plain value.
 
     """
     return [
-        tolerance_scaled(jacobian(runs, np.concatenate([[0.0], m, r])), tolerances)
+        tolerance_scaled(jacobian(runs, np.concatenate([[0.0], m, r])), TOLERANCES)
         for m, r in zip(matrix, arms)
     ]
 

@@ -200,8 +200,8 @@ class _OpenPart:
 
     anchor: str | None
     """Its name for aliases."""
-    count_before: int
-    """Number of parts of the document before it."""
+    count_at_start: int
+    """Number of parts of the document up to its start, itself included."""
     keys: set[Any] | None
     """Keys so far of a mapping; None for a list."""
     expects_key: bool = True
@@ -223,13 +223,11 @@ def _refuse_large(events: Iterable[Any], name: str, aliases: bool) -> None:
     open_parts: list[_OpenPart] = []
     for event in events:
         kind = type(event).__name__
-        if kind.endswith(
-            ('StreamStartEvent', 'DocumentStartEvent', 'StreamEndEvent', 'DocumentEndEvent')
-        ):
+        if kind.startswith(('Stream', 'Document')):
             continue
         if kind.endswith('EndEvent'):
             part = open_parts.pop()
-            sizes[part.anchor] = count - part.count_before
+            sizes[part.anchor] = count - part.count_at_start
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
             raise DocumentError(
@@ -242,19 +240,22 @@ def _refuse_large(events: Iterable[Any], name: str, aliases: bool) -> None:
         count += sizes[event.anchor] if kind == 'AliasEvent' else 1
         if kind == 'ScalarEvent':
             sizes[event.anchor] = 1
-            if event.implicit[0] or event.tag:  # false for a quoted text
-                _require_at_most(
-                    len(event.value), MAX_SCALAR_CHARACTERS, name, 'characters in a row'
-                )
-                if NUMBER_START.fullmatch(event.value):
-                    _require_at_most(
-                        len(event.value), MAX_NUMBER_CHARACTERS, name, 'characters in a number'
-                    )
-        elif kind != 'AliasEvent':
+            _check_scalar(event, name)
+        elif kind != 'AliasEvent':  # the start of a list or mapping
             keys = set() if kind == 'MappingStartEvent' else None
             open_parts.append(_OpenPart(event.anchor, count, keys))
         _require_at_most(len(open_parts), MAX_DOCUMENT_DEPTH, name, 'levels')
         _require_at_most(count, MOST_PARTS, name, 'parts')
+
+
+def _check_scalar(event: Any, name: str) -> None:
+    """Refuse a long text that the parser may convert to a number or date."""
+    if not (event.implicit[0] or event.tag):  # a quoted text
+        return
+    n_characters = len(event.value)
+    _require_at_most(n_characters, MAX_SCALAR_CHARACTERS, name, 'characters in a row')
+    if NUMBER_START.fullmatch(event.value):
+        _require_at_most(n_characters, MAX_NUMBER_CHARACTERS, name, 'characters in a number')
 
 
 def _check_key(event: Any, mapping: _OpenPart, name: str) -> None:

@@ -281,25 +281,25 @@ def _first_message(
 
 
 def _waited_for(
-    node: Node, look: Callable[[], Received | None], what: Callable[[], str]
+    node: Node, received: Callable[[], Received | None], describe: Callable[[], str]
 ) -> Received:
     """
-    Spin a node until `look` returns an object that is not None, and return it.
+    Spin a node until `received` returns an object that is not None, and return it.
 
-    Meanwhile `what()`, a description of the object, is logged, the first time after one second.
-    Raises an ExternalShutdownException when the context ends before.
+    Meanwhile the description of the object is logged, the first time after one second. Raises an
+    ExternalShutdownException when the context ends before.
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     logged_at = time.monotonic() - WAIT_LOG_SECONDS + 1.0
     try:
         while True:
-            awaited = look()
+            awaited = received()
             if awaited is not None:
                 return awaited
             executor.spin_once(timeout_sec=WAIT_SECONDS)
             if time.monotonic() - logged_at > WAIT_LOG_SECONDS:
-                node.get_logger().info(f'waits for {what()}')
+                node.get_logger().info(f'waits for {describe()}')
                 logged_at = time.monotonic()
     finally:
         executor.remove_node(node)
