@@ -153,35 +153,13 @@ CSV_KEYS = (
 
 def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
-    # One unit per folder or file, each with its recordings and its exclusions.
     paths_of_units = find_units(options.folder, options.output)
-    recordings = []
-    names_of_recordings = {}
-    for name, paths in paths_of_units:
-        recordings += paths
-        names_of_recordings[name] = [path.name for path in paths]
-    table = _table(options, recordings)
-    choices = options.choices()
-    provenance_options = provenance_with('fleet', (), choices, stand=options.stand())['options']
-    exclusions = exclusions_of_units(
-        parse_exclusions(options.exclude) if options.exclude else (), names_of_recordings
-    )
-    units = []
-    for name, paths in paths_of_units:
-        units.append(
-            fleet_unit(
-                name,
-                paths,
-                topics_of(choices),
-                joint_names=table.joint_names,
-                options=provenance_options,
-                exclusions=exclusions[name],
-            )
-        )
+    table = _table(options, [path for _, paths in paths_of_units for path in paths])
+    units = _units(options, paths_of_units, table)
     if not options.force:
         _require_same_units(Path(options.output), units, report=not options.no_report)
 
-    # Calibrate them here or on a cluster; files of each unit are written as it ends.
+    # Calibrate the units here or on a cluster, then write the files of each.
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
         step = FleetStep(table, settings, None if options.no_report else calibration_report)
@@ -215,6 +193,31 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
         {'units': unit_rows, 'parameters': parameter_rows},
         reasons,
     )
+
+
+def _units(
+    options: Options, paths_of_units: Sequence[tuple[str, list[Path]]], table: Table
+) -> list[Unit]:
+    """Return the units of `find_units`, each with its recordings and its exclusions."""
+    choices = options.choices()
+    provenance_options = provenance_with('fleet', (), choices, stand=options.stand())['options']
+    exclusions = exclusions_of_units(
+        parse_exclusions(options.exclude) if options.exclude else (),
+        {name: [path.name for path in paths] for name, paths in paths_of_units},
+    )
+    units = []
+    for name, paths in paths_of_units:
+        units.append(
+            fleet_unit(
+                name,
+                paths,
+                topics_of(choices),
+                joint_names=table.joint_names,
+                options=provenance_options,
+                exclusions=exclusions[name],
+            )
+        )
+    return units
 
 
 def _require_same_units(folder: Path, units: Sequence[Unit], *, report: bool) -> None:
