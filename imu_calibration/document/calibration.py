@@ -379,16 +379,11 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
     """
     model = calibration.model
-    names: dict[str, tuple[str, ...]] = {section: () for section in SECTIONS}
+    names: dict[str, Any] = {section: () for section in SECTIONS}
     for effect in model.effects:
         if _remains(effect, sensors):
             names[effect.sensor] += (effect.name,)
-    reduced = replace(
-        model,
-        accelerometer=names['accelerometer'],
-        gyroscope=names['gyroscope'],
-        reference=names['reference'],
-    )
+    reduced = replace(model, **names)
     # Of the parameters that remain: their indices in the complete model, in the reduced order.
     all_indices = np.arange(len(calibration.values))
     indices = np.concatenate([all_indices[model.slices[key]] for key in reduced.slices])
@@ -632,15 +627,15 @@ def beyond_known(share: float, section: str) -> str:
     )
 
 
-def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:
+def implausible(calibration: Calibration, section: str) -> list[str]:
     """
     Return a line for each effect with a value beyond those of all grades of instruments.
 
-    The effects are those of one section of the document, or of all.
+    The effects are those of one section of the document.
     """
     lines = []
     for effect in calibration.model.effects:
-        if sensor not in (None, effect.sensor):
+        if effect.sensor != section:
             continue
         amplitudes = effect.amplitudes(calibration.values[calibration.model.slices[effect.key]])
         if effect.surpasses(amplitudes):
@@ -648,7 +643,6 @@ def implausible(calibration: Calibration, sensor: str | None = None) -> list[str
             size = max(map(abs, amplitudes))
             lines.append(
                 f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than'
-                f' ten times the known values of {grade} instruments ({largest:.3g}; {source}):'
-                ' check units and axes'
+                f' ten times the known values of {grade} instruments ({largest:.3g}; {source})'
             )
     return lines

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -15,7 +16,6 @@ from imu_calibration.document.calibration import (
     beyond_known,
     implausible,
     listed,
-    needs_accelerometer,
     never_applied,
     scale_questions,
     surpassed_limit,
@@ -29,6 +29,7 @@ from imu_calibration.document.decision import (
     WARNING,
     Reason,
     SensorDecision,
+    StatementKind,
     Verdict,
     decide,
     lines_of,
@@ -91,20 +92,17 @@ LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
 
 
+def _to_diagnose(word: StatementKind, text: str, sensor: str) -> Reason:
+    """Return a statement on a sensor whose next step is a diagnosis."""
+    return Reason(word, text, 'find the cause', key='diagnose', sensors=(sensor,))
+
+
 def _doubtful_scales(calibration: Calibration) -> list[Reason]:
     """Return a warning for each sensor with a scale factor that a wrong unit may explain."""
-    reasons = []
-    for sensor, question in scale_questions(calibration).items():
-        reasons.append(
-            Reason(
-                WARNING,
-                question,
-                CONVERT,
-                key=f'{sensor}_unit',
-                sensors=(sensor,),
-            )
-        )
-    return reasons
+    return [
+        Reason(WARNING, question, CONVERT, key=f'{sensor}_unit', sensors=(sensor,))
+        for sensor, question in scale_questions(calibration).items()
+    ]
 
 
 def _harmed_regimes(calibration: Calibration) -> list[Reason]:
@@ -112,10 +110,7 @@ def _harmed_regimes(calibration: Calibration) -> list[Reason]:
     reasons = []
     for sensor, entry in calibration.proof.items():
         for line in worse_regimes(entry):
-            text = f'{sensor}: {line}'
-            reasons.append(
-                Reason(WARNING, text, 'find the cause', key='diagnose', sensors=(sensor,))
-            )
+            reasons.append(_to_diagnose(WARNING, f'{sensor}: {line}', sensor))
     return reasons
 
 
@@ -126,21 +121,20 @@ def _unused_rests(calibration: Calibration) -> list[Reason]:
     Noise and sds are then estimated only from motion.
     """
     counts = calibration.statistics.get('stream') or {}
-    n_unused = 0
-    parts = []
+    unused = {}  # reason -> number of samples at rest
     for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET):
-        count = counts.get(reason, 0)
-        n_unused += count
-        if count:
-            parts.append(f'{count} {reason}')
+        if counts.get(reason):
+            unused[reason] = counts[reason]
+    n_unused = sum(unused.values())
     n_used = sum((calibration.statistics.get('samples_used') or {}).values())
     if rested(calibration.statistics) or n_unused <= LOST_SHARE * n_used:
         return []
+    numbers = ', '.join(f'{count} {reason}' for reason, count in unused.items())
     return [
         Reason(
             WARNING,
             f'the recording has {n_unused} samples at rest, but no static window is used'
-            f' ({", ".join(parts)}):'
+            f' ({numbers}):'
             ' noise and bias changes come from motion only, and the standard deviations of the'
             ' biases may be too small',
             'reduce static_minimum, or increase quiet_ratio',
@@ -149,13 +143,23 @@ def _unused_rests(calibration: Calibration) -> list[Reason]:
     ]
 
 
+class _ModelChange(NamedTuple):
+    """The note on effects by which the recording changes the model, or fails to."""
+
+    note: str
+    """Its text, with a place for the names of the effects."""
+    next_step: str
+    key: str | None
+    """The input needed for the next step, a key of `errors.ERROR_KEYS`."""
+
+
 CHANGES = {
-    'added': (
+    'added': _ModelChange(
         'added to the model, because the recording demands it: {}',
         'see the evidence; the requested model omits it',
         'diagnose',
     ),
-    'denied': (
+    'denied': _ModelChange(
         (
             'not added to the model, because parts of the recording disagree, no coefficient is'
             ' significant or the size is implausible: {}; the standard deviations allow for it'
@@ -163,7 +167,7 @@ CHANGES = {
         'see the evidence',
         'diagnose',
     ),
-    'lacking': (
+    'lacking': _ModelChange(
         (
             'the motion demands {}, which cannot join the model, since not all of it is kept: the'
             ' standard deviations allow for it'
@@ -171,41 +175,47 @@ CHANGES = {
         'calibrate the recording offline',
         None,
     ),
-    'not_believed': (
-        'held, because only the misfit of the model determines them, at an implausible value: {}',
-        'move the table so that gravity or the rate of turn act along their axes',
-        None,
-    ),
 }
-"""
-Entry of the statistics -> (note with the names, next step, its key) on a change of the model by the
-recording.
-"""
+"""Entry of the statistics with the names of effects -> the note on them."""
 
 
 def _model_changes(calibration: Calibration) -> list[Reason]:
-    """Return a note for each change of the model by the recording, a key of `CHANGES`."""
-    statistics = calibration.statistics
+    """Return a note for each change of the model by the recording (`CHANGES`)."""
     reasons = []
-    for change, (text, step, key) in CHANGES.items():
-        names = list(statistics.get(change) or [])
+    for entry, change in CHANGES.items():
+        names = calibration.statistics.get(entry)
         if not names:
             continue
-        if change == 'added':
+        if entry == 'added':
             names = [_with_size(calibration, name) for name in names]
-        if change == 'not_believed':
-            # The motions suffice where the remedy is no motion: the misfit has another cause.
-            remedies = [need for need in _by_need(calibration, names) if need in REMEDY_KEYS]
-            if remedies:
-                step = remedies[0]
-                key = REMEDY_KEYS[remedies[0]]
-            values = statistics[change]
-            n_names = len(names)
-            names = [f'{name} ({values[name]:.3g})' for name in names[:SHOWN_NAMES]]
-            if n_names > SHOWN_NAMES:
-                names.append('...')
-        reasons.append(Reason(NOTE, text.format(', '.join(names)), step, key=key))
+        note = change.note.format(', '.join(names))
+        reasons.append(Reason(NOTE, note, change.next_step, key=change.key))
     return reasons
+
+
+def _held_as_implausible(calibration: Calibration) -> list[Reason]:
+    """Return a note on parameters that are held, because the misfit gives implausible values."""
+    values = calibration.statistics.get('not_believed')
+    if not values:
+        return []
+    next_step = 'move the table so that gravity or the rate of turn act along their axes'
+    # The motions suffice where the remedy is no motion: the misfit has another cause.
+    for need in _by_need(calibration, list(values)):
+        if need in REMEDY_KEYS:
+            next_step = need
+            break
+    shown = [f'{name} ({values[name]:.3g})' for name in list(values)[:SHOWN_NAMES]]
+    if len(values) > SHOWN_NAMES:
+        shown.append('...')
+    return [
+        Reason(
+            NOTE,
+            'held, because only the misfit of the model determines them, at an implausible value:'
+            f' {", ".join(shown)}',
+            next_step,
+            key=REMEDY_KEYS.get(next_step),
+        )
+    ]
 
 
 def _unexplained(calibration: Calibration) -> list[Reason]:
@@ -215,7 +225,7 @@ def _unexplained(calibration: Calibration) -> list[Reason]:
         text = unexplained_text(sensor, residual['rms'], residual.get('unit'))
         if residual['axes']:
             text += f' ({", ".join(residual["axes"])})'
-        reasons.append(Reason(NOTE, text, 'find the cause', key='diagnose', sensors=(sensor,)))
+        reasons.append(_to_diagnose(NOTE, text, sensor))
     return reasons
 
 
@@ -234,14 +244,12 @@ def _least_squares(calibration: Calibration) -> list[Reason]:
         error = error_text(entry['error'], unit)
         error_of_model = error_text(entry['error_of_model'], unit)
         reasons.append(
-            Reason(
+            _to_diagnose(
                 NOTE,
                 f'{sensor}: bias and matrix are those of plain least squares without other effects,'
                 f' because the residual is unexplained (held-out error {error}, {error_of_model}'
                 ' with the model)',
-                'find the cause',
-                key='diagnose',
-                sensors=(sensor,),
+                sensor,
             )
         )
     return reasons
@@ -260,13 +268,13 @@ def _with_size(calibration: Calibration, name: str) -> str:
     effect = next((effect for effect in calibration.model.effects if effect.name == name), None)
     if effect is None:
         return name
-    part = calibration.model.slices[effect.key]
-    values = calibration.values[part]
-    sd = calibration.sd[part]
-    best = int(np.argmax(np.abs(values) / np.maximum(sd, 1e-300)))
-    factor, unit = for_people(effect.unit_of(best), calibration.param_names[part.start + best])
-    value = significant(values[best] * factor)
-    return f'{name} ({value} ± {significant(sd[best] * factor, 2)} {unit})'
+    parameters = calibration.model.slices[effect.key]
+    values = calibration.values[parameters]
+    sds = calibration.sd[parameters]
+    shown = int(np.argmax(np.abs(values) / np.maximum(sds, 1e-300)))  # the most significant one
+    factor, unit = for_people(effect.unit_of(shown), calibration.param_names[parameters][shown])
+    value = significant(values[shown] * factor)
+    return f'{name} ({value} ± {significant(sds[shown] * factor, 2)} {unit})'
 
 
 def misfit_ratios(statistics: Mapping, sensor: str) -> dict[str, float]:
@@ -281,12 +289,14 @@ def misfit_ratios(statistics: Mapping, sensor: str) -> dict[str, float]:
 
     """
     chi2 = statistics.get(sensor, {}).get('chi2_per_dof') or {}
-    of_stamps = (statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
+    jitter = statistics.get('stamp_jitter') or {}
+    # Kind of window -> variance of noise and errors of the stamps / variance of the noise.
+    with_stamps = jitter.get('variance_ratio', {}).get(sensor, {})
     ratios = {}
     for kind, ratio in chi2.items():
         # 'means' is the entry of the window means, the others are of samples within windows.
         if kind != 'means' and ratio is not None:
-            ratios[kind] = ratio / of_stamps.get(kind, 1.0)
+            ratios[kind] = ratio / with_stamps.get(kind, 1.0)
     return ratios
 
 
@@ -337,9 +347,9 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
     Without a rest they are compared with their slow part; lags are visible in the fast part.
     """
     at_rest = rested(calibration.statistics)
-    reference = 'their slow part (as after a lag or a late clock)'
-    if at_rest:
-        reference = 'the noise at rest'
+    reference = 'the noise at rest'
+    if not at_rest:
+        reference = 'their slow part (as after a lag or a late clock)'
     reasons = []
     for sensor in SENSORS:
         exception = ''
@@ -358,29 +368,15 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
                     Reason(NOTE, f'{size}, {LOUDER_ONLY}', 'reduce vibration', sensors=(sensor,))
                 )
                 continue
-            reasons.append(
-                Reason(
-                    WARNING if ratio > MAX_MISFIT_RATIO else NOTE,
-                    f'{size}: the model is incomplete{exception}',
-                    'find the cause',
-                    key='diagnose',
-                    sensors=(sensor,),
-                )
-            )
+            word = WARNING if ratio > MAX_MISFIT_RATIO else NOTE
+            text = f'{size}: the model is incomplete{exception}'
+            reasons.append(_to_diagnose(word, text, sensor))
         if 'static' in incomplete:
-            size = (
+            text = (
                 f'the {sensor} means at rest scatter {np.sqrt(incomplete["static"]):.1f} times as'
-                ' much as around a dependence on the attitude'
+                f' much as around a dependence on the attitude: the model is incomplete{exception}'
             )
-            reasons.append(
-                Reason(
-                    NOTE,
-                    f'{size}: the model is incomplete{exception}',
-                    'find the cause',
-                    key='diagnose',
-                    sensors=(sensor,),
-                )
-            )
+            reasons.append(_to_diagnose(NOTE, text, sensor))
     return reasons
 
 
@@ -412,11 +408,11 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """
     reasons = []
     for sensor in calibration.sensors:
-        bias = calibration.model.part(sensor, Role.OFFSET)
-        scatter = float(np.max(calibration.noise(sensor)[1]))
-        lower_limit = scatter * _smallest_share(calibration, sensor)
         if motions_at_rest(calibration.by_hand, (sensor,)):
             continue
+        bias = calibration.model.part(sensor, Role.OFFSET)
+        scatter = float(calibration.noise(sensor)[1])
+        lower_limit = scatter * _smallest_share(calibration, sensor)
         if lower_limit > tolerances[bias][0] and scatter > _misfit_scatter(calibration, sensor):
             factor, unit = for_people(UNITS[sensor])
             reasons.append(
@@ -499,42 +495,45 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     # The requested parameter with the largest sd relative to its tolerance.
     count = parameter_count(calibration)
     requested = np.array([name in calibration.requested for name in calibration.param_names])
-    share = np.where(requested, calibration.own_sd / tolerances, 0.0)
-    worst = int(np.argmax(share))
+    sd_over_tolerance = np.where(requested, calibration.own_sd / tolerances, 0.0)
+    worst = int(np.argmax(sd_over_tolerance))
     limiting = ('', 0.0)
     if count.requested:
-        limiting = (calibration.param_names[worst], float(share[worst]))
+        limiting = (calibration.param_names[worst], float(sd_over_tolerance[worst]))
     # The common scale of the accelerometer is in none of these sds.
     common = calibration.common_scale
     if common:
-        common_share = common['sd'] / common['tolerance']
-        if common_share > limiting[1]:
-            limiting = (COMMON_SCALE, common_share)
+        common_ratio = common['sd'] / common['tolerance']
+        if common_ratio > limiting[1]:
+            limiting = (COMMON_SCALE, common_ratio)
 
     # The order of the statements is that of their importance.
-    reasons = [_decided(calibration, *entry) for entry in decisions.items()]
-    reasons += _absent(calibration)
-    reasons.append(_parameters(count, limiting, complete=complete))
-    reasons += (
-        _undetermined(calibration)
-        + _undetermined_sensors(calibration)
-        + _moved_sensors(calibration)
-        + _implausible(calibration)
-        + motion_misfits(calibration)
-    )
-    reasons += _doubtful_scales(calibration) + _implausible_causes(calibration)
-    reasons += _harmed_regimes(calibration) + _unused_rests(calibration)
-    reasons += [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
-    reasons += (
-        _model_changes(calibration)
-        + _unexplained(calibration)
-        + _least_squares(calibration)
-        + _stamp_jitter(calibration)
-        + unsteady(calibration, tolerances)
+    reasons = (
+        *(_decided(calibration, sensor, decision) for sensor, decision in decisions.items()),
+        *_absent(calibration),
+        _parameters(count, limiting, complete=complete),
+        *_undetermined(calibration),
+        *_undetermined_sensors(calibration),
+        *_moved_sensors(calibration),
+        *_implausible(calibration),
+        *motion_misfits(calibration),
+        *_doubtful_scales(calibration),
+        *_implausible_causes(calibration),
+        *_harmed_regimes(calibration),
+        *_unused_rests(calibration),
+        *(Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)),
+        *_model_changes(calibration),
+        *_held_as_implausible(calibration),
+        *_unexplained(calibration),
+        *_least_squares(calibration),
+        *_stamp_jitter(calibration),
+        *unsteady(calibration, tolerances),
+        *_left_out(calibration),
+        *_dropped(calibration),
     )
     return Verdict(
         decisions=decisions,
-        reasons=(*reasons, *_left_out(calibration), *_dropped(calibration)),
+        reasons=reasons,
         within=count.determined,
         requested=count.requested,
         limiting=limiting,
@@ -635,8 +634,6 @@ def _decisions(calibration: Calibration) -> dict[str, SensorDecision]:
         if _periodic(calibration, sensor) or _undecided_motion(calibration, sensor):
             decision = most_cautious([decision, UNPROVEN])
         decisions[sensor] = decision
-    if needs_accelerometer(calibration, decisions):
-        decisions['gyroscope'] = most_cautious([decisions['gyroscope'], UNPROVEN])
     return decisions
 
 
@@ -658,11 +655,8 @@ def _undecided_motion(calibration: Calibration, sensor: str) -> str:
 
 def _requested_of(calibration: Calibration, sensor: str) -> dict[str, str]:
     """Return name -> status of the requested parameters of a sensor."""
-    requested = {}
-    for name, status in calibration.requested.items():
-        if name.startswith(sensor):
-            requested[name] = status
-    return requested
+    requested = calibration.requested.items()
+    return {name: status for name, status in requested if name.startswith(sensor)}
 
 
 def _held_out_motions(calibration: Calibration, sensor: str) -> str:
@@ -730,8 +724,7 @@ def _implausible(calibration: Calibration) -> list[Reason]:
     check = 'check the units of the recording and the axes in the table description'
     reasons = []
     for section in SECTIONS:
-        for line in implausible(calibration, section):
-            text, _, _ = line.partition(': check')
+        for text in implausible(calibration, section):
             reasons.append(Reason(WARNING, text, check, sensors=_concerned_sensors([section])))
     return reasons
 
@@ -846,15 +839,12 @@ def _by_need(calibration: Calibration, names: Sequence[str]) -> dict[str, list[s
     Return {motion or remedy: names}, by the weak direction with the largest weight of each name.
     """
     by_need: dict[str, list[str]] = {}
+    directions = calibration.undetermined
     for name in names:
-        need = ''
-        largest_weight = 0.0
-        for direction in calibration.undetermined:
-            weight = abs(direction['parameters'].get(name, 0.0))
-            if weight > largest_weight:
-                need = direction['needs']
-                largest_weight = weight
-        if largest_weight == 0.0:  # in no direction: the need of another component of its effect
+        weights = [abs(direction['parameters'].get(name, 0.0)) for direction in directions]
+        if any(weights):
+            need = directions[int(np.argmax(weights))]['needs']
+        else:  # in no direction: the need of another component of its effect
             need = _need_of_effect(calibration, name.rpartition('.')[0])
         by_need.setdefault(need, []).append(name)
     return by_need

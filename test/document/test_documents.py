@@ -275,9 +275,12 @@ def test_a_text_that_is_not_a_document_is_refused_in_one_line(text, code):
 def test_implausible_values_are_named():
     model = SensorModel()
     values = model.start()
-    assert implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24)) == []
+    assert (
+        implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24), 'accelerometer')
+        == []
+    )
     values[1] = 50.0
-    lines = implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24))
+    lines = implausible(Calibration(model, values, np.eye(24), (DETERMINED,) * 24), 'accelerometer')
     assert len(lines) == 1 and 'accelerometer bias' in lines[0] and '50' in lines[0]
 
 
