@@ -270,9 +270,9 @@ def _check_covariance(covariance: np.ndarray) -> None:
         )
 
 
-def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
+def _unchecked(document: Mapping[str, Any]) -> Calibration:
     """
-    Return {field of a `Calibration`: value} from the mapping of its document.
+    Return the calibration that a document describes, without the checks of `check_numbers`.
 
     Raises
     ------
@@ -320,24 +320,22 @@ def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
         if sensor in SENSORS:
             proof[sensor] = ProofEntry.from_mapping(entry)
 
-    # Some fields are copied without change.
-    parts: dict[str, Any] = {
-        'model': replace(model.at(values), centre=centre),
-        'values': values,
-        'covariance': matrix,
-        'status': tuple(map(Status, status)),
-        'frame_id': document.get('frame_id', ''),
-        'covariance_terms': terms,
-        'held_reason': held_reason,
-        'undetermined': tuple(document.get('undetermined_directions') or ()),
-        'absent': tuple(document.get('absent') or ()),
-        'notes': tuple(document.get('notes') or ()),
-        'readings': RawReadings.from_mapping(document.get('readings') or {}),
-        'proof': proof,
-    }
-    for name in _COPIED:
-        parts[name] = dict(document.get(name) or {})
-    return parts
+    copied: dict[str, Any] = {name: dict(document.get(name) or {}) for name in _COPIED}
+    return Calibration(
+        model=replace(model.at(values), centre=centre),
+        values=values,
+        covariance=matrix,
+        status=tuple(map(Status, status)),
+        frame_id=document.get('frame_id', ''),
+        covariance_terms=terms,
+        held_reason=held_reason,
+        undetermined=tuple(document.get('undetermined_directions') or ()),
+        absent=tuple(document.get('absent') or ()),
+        notes=tuple(document.get('notes') or ()),
+        readings=RawReadings.from_mapping(document.get('readings') or {}),
+        proof=proof,
+        **copied,
+    )
 
 
 def _joined(values: Iterable[Any], kind: type = float) -> np.ndarray:
@@ -366,10 +364,9 @@ def _model(document: Mapping[str, Any]) -> SensorModel:
                     code='effect_repeated',
                 )
             members[sensor].append(name)
+    effects: dict[str, Any] = {section: tuple(names) for section, names in members.items()}
     return SensorModel(
-        accelerometer=tuple(members['accelerometer']),
-        gyroscope=tuple(members['gyroscope']),
-        reference=tuple(members['reference']),
+        **effects,
         joint_names=joint_names,
         temperature_ref_c=float(document.get('reference_temperature_c', 25.0)),
         catalogue=catalogue,
@@ -501,7 +498,7 @@ def from_mapping(document: Any) -> Calibration:
     require(document, CALIBRATION, mapping())
     _check_format(document.get('format'))
     try:
-        calibration = Calibration(**parts_of(document))
+        calibration = _unchecked(document)
     except InputError as error:
         if isinstance(error, DocumentError):
             raise

@@ -343,10 +343,11 @@ def _compared(
     excluded = not_estimated | in_other_axes
 
     # 3. A row for each parameter.
-    units = {}
-    for effect in first.model.effects:
-        for k, name in enumerate(effect.param_names()):
-            units[name] = effect.unit_of(k)
+    units = {
+        name: effect.unit_of(k)
+        for effect in first.model.effects
+        for k, name in enumerate(effect.param_names())
+    }
     rows = []
     for k, name in enumerate(common):
         rows.append(
@@ -401,34 +402,23 @@ def _compared(
             f'not compared, because their axes differ by {np.degrees(angle):.2g} deg:'
             f' {listed(names)}'
         )
-    if n_known < 2:
-        lines.append(
-            'agreement of the calibrations cannot be tested: the uncertainties of imported values'
-            ' are unknown'
-        )
-        return Comparison(rows=tuple(rows), agree=None, lines=tuple(lines))
-    reference_agree = None
     if of_reference:
-        reference_agree = not rejected_reference
-        word = 'agree' if reference_agree else 'differ'
+        word = 'differ' if rejected_reference else 'agree'
         lines.append(f'table and clock {word}, which is no property of the IMU')
-    if not of_imu:
-        lines.append(
-            'agreement of the calibrations cannot be tested: no parameter of the IMU is determined'
-            ' in both'
-        )
-        return Comparison(
-            rows=tuple(rows), agree=None, lines=tuple(lines), reference_agree=reference_agree
-        )
-    verdict = 'the calibrations disagree' if rejected else 'the calibrations agree'
-    if in_other_axes.any():
-        verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'
-    lines.append(verdict)
+    if of_imu:
+        verdict = 'the calibrations disagree' if rejected else 'the calibrations agree'
+        if in_other_axes.any():
+            verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'
+    else:
+        cause = 'no parameter of the IMU is determined in both'
+        if n_known < 2:
+            cause = 'the uncertainties of imported values are unknown'
+        verdict = f'agreement of the calibrations cannot be tested: {cause}'
     return Comparison(
         rows=tuple(rows),
-        agree=not rejected,
-        lines=tuple(lines),
-        reference_agree=reference_agree,
+        agree=not rejected if of_imu else None,
+        lines=(*lines, verdict),
+        reference_agree=not rejected_reference if of_reference else None,
         differences=tuple(differences),
     )
 
