@@ -155,18 +155,18 @@ def imu_of_corrections(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]])
 
     """
     matrix = {}
-    for sensor, (correction, _) in corrections.items():
+    bias = {}
+    for sensor, (correction, offset) in corrections.items():
         try:
-            matrix[sensor] = np.linalg.inv(correction)
+            inverse = np.linalg.inv(correction)
         except np.linalg.LinAlgError as error:
             raise InputError(
                 f'the correction matrix of the {sensor} must have an inverse, got'
                 f' {np.asarray(correction).tolist()}; calibrate again',
                 code='matrix_singular',
             ) from error
-    bias = {}
-    for sensor, (_, offset) in corrections.items():
-        bias[sensor] = matrix[sensor] @ offset
+        matrix[sensor] = inverse
+        bias[sensor] = inverse @ offset
     perfect = AffineImu()
     return replace(perfect, matrix=perfect.matrix | matrix, bias=perfect.bias | bias)
 

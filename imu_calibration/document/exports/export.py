@@ -197,11 +197,9 @@ def _noise_numbers(
         return None, []
     noise = _noise_of(calibration, figures, rate)
     if noise is None or (target.needs_walk and not noise.walk_known):
-        lacks = (
-            'noise with random walks'
-            if target.needs_walk
-            else 'noise, or the rate of the readings of the calibration,'
-        )
+        lacks = 'noise, or the rate of the readings of the calibration,'
+        if target.needs_walk:
+            lacks = 'noise with random walks'
         if target.only_noise:
             raise InputError(
                 f'for {target.title} there must be {lacks} and there is none; give a noise'
@@ -212,10 +210,10 @@ def _noise_numbers(
         return None, [
             f'the noise figures are left out: there must be {lacks} from a noise document'
         ]
-    if target.needs_walk and figures is not None:
-        _require_rest_for_walk(figures)
     notes = []
     if target.needs_walk:
+        if figures is not None:
+            _require_rest_for_walk(figures)
         for sensor in SENSORS:
             basis = getattr(noise, sensor).basis
             if basis != 'walk':
@@ -271,9 +269,9 @@ def _noise_of(
 
 def _placement_lines(calibration: Calibration, target: Target, placement: Placement) -> list[str]:
     """Describe the frame of the numbers relative to the sensor frame."""
-    name = calibration.frame_id or UNNAMED
     if target.only_noise:
         return []
+    name = calibration.frame_id or UNNAMED
     if not np.array_equal(placement.mat_readings, np.eye(3)):  # an autopilot
         if np.array_equal(placement.mat_readings, FRD):
             return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']

@@ -328,36 +328,47 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     pose = affine.find_pose(content)
     if pose is not None:  # a file of an export, which states its placement
         placement, parent = pose
-        imu = affine.calibration_moved(imu, placement.inverse())
-        return _document(target, file, imu, 'mount', path, frame_id or parent)
-    if target.forward_right_down:
-        back = affine.forward_right_down(IMPORTED_FROM_AUTOPILOT)
+        back = placement.inverse()
+        axes = 'mount'
+        frame_id = frame_id or parent
     else:
         back = target.back(imu)
+        if target.forward_right_down:
+            back = affine.forward_right_down(IMPORTED_FROM_AUTOPILOT)
+        axes = target.axes
     imu = affine.calibration_moved(imu, back)
-    return _document(target, file, imu, target.axes, path, frame_id)
+    return _imported(target, file, imu, axes=axes, path=path, frame_id=frame_id)
 
 
-def _document(
-    target: Target, file: Read, imu: affine.AffineImu, axes: str, path: Any, frame_id: str
+def _imported(
+    target: Target, file: Read, imu: affine.AffineImu, *, axes: str, path: Any, frame_id: str
 ) -> Calibration:
     """
-    Return the calibration of an IMU that was read, in the frame of the calibration.
+    Return the calibration of an IMU that was read from the file at `path`.
 
-    `axes` is the convention that fixes its axes, as named by the gauge.
+    Parameters
+    ----------
+    target : Target
+    file : Read
+    imu : AffineImu
+        In the frame of the calibration.
+    axes : str
+        The convention that fixes its axes, as named by the gauge.
+    path, frame_id
+        As of `import_file`.
+
     """
     holds = tuple(capability for capability in target.holds if capability not in file.lacks)
     # Bias and matrix always, further effects where the file gives them a value.
     capabilities = [*affine.OFFSETS, *affine.MATRICES]
     capabilities += [capability for capability in holds if np.any(imu.value(capability))]
-    names: dict[str, tuple[str, ...]] = {sensor: () for sensor in SENSORS}
-    for capability in capabilities:  # several of them may have the same effect
-        effect_name = capability.effect.name
-        if effect_name not in names[capability.sensor]:
-            names[capability.sensor] += (effect_name,)
-    model = SensorModel(
-        names['accelerometer'], names['gyroscope'], temperature_ref_c=imu.temperature_ref_c
-    )
+    effects: dict[str, Any] = {}
+    for sensor in SENSORS:
+        names = [capability.effect.name for capability in affine.of(sensor, capabilities)]
+        effects[sensor] = tuple(dict.fromkeys(names))  # several may have the same effect
+    model = SensorModel(**effects, temperature_ref_c=imu.temperature_ref_c)
+
+    # Standard deviations are those of the priors; values in the file are weak.
     values, sd = model.prior()
     status = np.full(len(values), HELD, dtype=object)
     for effect in model.effects:
@@ -365,7 +376,7 @@ def _document(
         part = model.slices[effect.key]
         if capability is not None:
             values[part] = imu.value(capability).ravel()
-            in_file = np.full(effect.size, True)
+            in_file = True
             if capability.own_axis:
                 in_file = np.eye(3).ravel() > 0
             status[part] = np.where(in_file, WEAK, HELD)
