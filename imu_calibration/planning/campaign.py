@@ -341,8 +341,7 @@ class Campaign:
             if motion is not None:
                 return Decision(motion, 'the first motion is small and slow')
         decision = self._decide(position, elapsed)
-        is_end = decision.motion is None and not decision.diagnose
-        if is_end:
+        if decision.motion is None and not decision.diagnose:
             motion = self._unwind(position)
             if motion is not None:
                 why = f'{decision.why}; before the end, endless joints are unwound'

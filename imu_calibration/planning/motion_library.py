@@ -270,8 +270,6 @@ TOGETHER_PLACES = 2
 """Places for motions of each set of joints."""
 JOINT_FREQUENCIES = 0.5 * np.array([1.0, 1.4, 0.7, 1.7, 0.6, 1.2, 0.85, 1.55] * 2)
 """Frequencies of joints that swing together, Hz."""
-MotionParts = tuple[np.ndarray, tuple[Segment, ...], str]
-"""Place, segments and text of a PlannedMotion."""
 
 
 class MotionLibrary:
@@ -289,14 +287,14 @@ class MotionLibrary:
     def __init__(self, table: Table, limits: MotionLimits | None = None):
         self.table = table
         limits = limits or limits_of(table)
-        self.limits = MotionLimits(
-            lower=limits.lower,
-            upper=limits.upper,
+        self.limits = replace(
+            limits,
             speed=LIMIT_SHARE * limits.speed,
             acceleration=LIMIT_SHARE * limits.acceleration,
-            turns=limits.turns,
         )
         self.names = tuple(table.joint_names)
+        self._moving = np.flatnonzero(limits.upper > limits.lower)
+        """Joints that can move, indices."""
         self.spread = choose_places(table, self.limits)
         """Positions of the rests, with the largest differences in attitude first."""
         self.motions = [
@@ -330,50 +328,44 @@ class MotionLibrary:
 
     def _spins(self) -> Iterator[PlannedMotion]:
         """Yield turns of each rotating joint: whole ones if endless, otherwise sweeps."""
-        rotating = np.flatnonzero(self.limits.turns & (self.limits.upper > self.limits.lower))
-        for joint in rotating:
+        for joint in self._moving[self.limits.turns[self._moving]]:
             for place in self._subset(SPIN_PLACES, int(joint)):
                 for share in SPEEDS:
                     rates = np.zeros(len(self.names))
                     rates[joint] = share * self.limits.speed[joint]
                     if self.limits.endless[joint]:
                         for sense, seconds in product((1.0, -1.0), SPIN_TIME):
-                            turns = self._whole_turns(place, sense * rates, seconds)
-                            yield self._motion(MotionKind.SPIN, *turns)
+                            yield self._whole_turns(MotionKind.SPIN, place, sense * rates, seconds)
                         continue
                     sweep = self._sweep(place, rates)
                     if sweep is not None:
-                        yield self._motion(MotionKind.SPIN, *sweep)
+                        yield sweep
 
     def _swings(self) -> Iterator[PlannedMotion]:
         """Yield swings of each joint that can move."""
-        for joint in np.flatnonzero(self.limits.upper > self.limits.lower):
+        for joint in self._moving:
             swings = np.arange(len(self.names)) == joint
             for place in self._subset(SWING_PLACES, int(joint) + 1):
                 for frequency, seconds in product(SWING_FREQUENCIES, SWING_TIME):
-                    swing = self._swing(place, swings, frequency, seconds)
-                    yield self._motion(MotionKind.SWING, *swing)
+                    yield self._swing(MotionKind.SWING, place, swings, frequency, seconds)
 
     def _pairs(self) -> list[tuple[int, ...]]:
         """Return the pairs of joints that move together: the last ones, near the sensor."""
-        moving = np.flatnonzero(self.limits.upper > self.limits.lower)
-        pairs: list[tuple[int, ...]] = list(combinations(moving.tolist(), 2))
+        pairs: list[tuple[int, ...]] = list(combinations(self._moving.tolist(), 2))
         return pairs[-6:]
 
     def _swings_together(self) -> Iterator[PlannedMotion]:
         """Yield swings of pairs of joints, and of all joints, with different frequencies."""
-        moving = np.flatnonzero(self.limits.upper > self.limits.lower)
         sets = self._pairs()
-        if len(moving) > 2:
-            sets.append(tuple(moving))
+        if len(self._moving) > 2:
+            sets.append(tuple(self._moving))
         for number, joints in enumerate(sets):
             swings = np.isin(np.arange(len(self.names)), joints)
             frequency = np.full(len(self.names), 0.5)
             frequency[list(joints)] = JOINT_FREQUENCIES[: len(joints)]
             for place in self._subset(TOGETHER_PLACES, number + 2):
                 for seconds in SWING_TIME:
-                    swing = self._swing(place, swings, frequency, seconds)
-                    yield self._motion(MotionKind.TOGETHER, *swing)
+                    yield self._swing(MotionKind.TOGETHER, place, swings, frequency, seconds)
 
     def _spins_together(self) -> Iterator[PlannedMotion]:
         """Yield turns of two endless joints at equal speed, in equal and in opposite sense."""
@@ -386,7 +378,7 @@ class MotionLibrary:
                 for sense in (1.0, -1.0):
                     rates = np.zeros(len(self.names))
                     rates[joints] = speed * np.array([1.0, sense])
-                    yield self._motion(MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0))
+                    yield self._whole_turns(MotionKind.TOGETHER, place, rates, 4.0)
 
     def _subset(self, count: int, first: int) -> np.ndarray:
         """
@@ -403,7 +395,9 @@ class MotionLibrary:
         """Return a builder of segments that begin at a position."""
         return MotionBuilder(len(self.names), limits=self.limits, start=place)
 
-    def _whole_turns(self, place: np.ndarray, rates: np.ndarray, seconds: float) -> MotionParts:
+    def _whole_turns(
+        self, kind: MotionKind, place: np.ndarray, rates: np.ndarray, seconds: float
+    ) -> PlannedMotion:
         """
         Return a spin at constant rates that ends after whole turns, where it began.
 
@@ -423,9 +417,9 @@ class MotionLibrary:
         seconds_at_rate = (2 * np.pi * n_turns - ramp_angle) / speed
         noun = 'turn' if n_turns == 1 else 'turns'
         text = f'spin {self._rate_words(rates)} for {n_turns:.0f} whole {noun}'
-        return place, self._spun(place, rates, seconds_at_rate), text
+        return self._motion(kind, place, self._spun(place, rates, seconds_at_rate), text)
 
-    def _sweep(self, place: np.ndarray, rates: np.ndarray) -> MotionParts | None:
+    def _sweep(self, place: np.ndarray, rates: np.ndarray) -> PlannedMotion | None:
         """
         Return a turn of a limited joint at a constant rate through its range and back.
 
@@ -446,7 +440,7 @@ class MotionLibrary:
                 text = (
                     f'sweep {self._rate_words(share * rates)} for {seconds_at_rate:.1f} s and back'
                 )
-                return start, segments, text
+                return self._motion(MotionKind.SPIN, start, segments, text)
         return None
 
     def _longest_at_rate(self, start: np.ndarray, rates: np.ndarray, joint: int) -> float:
@@ -468,8 +462,13 @@ class MotionLibrary:
         return self._builder(place).spin(np.degrees(rates), seconds).segments
 
     def _swing(
-        self, place: np.ndarray, swings: np.ndarray, frequency: np.ndarray | float, seconds: float
-    ) -> MotionParts:
+        self,
+        kind: MotionKind,
+        place: np.ndarray,
+        swings: np.ndarray,
+        frequency: np.ndarray | float,
+        seconds: float,
+    ) -> PlannedMotion:
         """
         Return a swing with the largest amplitude within range, speed and acceleration.
 
@@ -504,7 +503,7 @@ class MotionLibrary:
             if self.limits.turns[k]:
                 size = f'{np.degrees(amplitude[k]):.0f}°'
             sizes.append(f'{self.names[k]} by {size} at {frequency[k]:.2g} Hz')
-        return middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s'
+        return self._motion(kind, middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s')
 
     def _rate_words(self, rates: np.ndarray) -> str:
         """Return the joints that turn and their rates (rad/s) as text."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,6 +50,16 @@ COMMON_SHARES = (0.5, 0.9)
 """Shares of the biases' covariance that are tried as common to a session in the lower bound."""
 ROUNDS_OF_LENGTH = 3
 """Lengths of session that are tried for each share."""
+
+
+class TimedWindows(NamedTuple):
+    """The windows of consecutive motions."""
+
+    windows: list[PlannedWindow]
+    middles: np.ndarray
+    """Their middles since the beginning, s, shape (k,)."""
+    seconds: float
+    """Total time of the motions, s."""
 
 
 class PlanningProblem:
@@ -256,7 +267,7 @@ class PlanningProblem:
         for share in shares:
             session = max(bound, bias_seconds)
             for _ in range(ROUNDS_OF_LENGTH):
-                value = self.relaxation(common=(share, session), factor=factor).seconds
+                value = self.relaxation(share=share, session=session, factor=factor).seconds
                 bound = max(bound, min(session, value))
                 # The best session has value(T) = T: the next one is the geometric mean of both, at
                 # most three times longer.
@@ -291,15 +302,14 @@ class PlanningProblem:
         return seconds
 
     def relaxation(
-        self, *, common: tuple[float, float] = (0.0, 0.0), factor: float = 1.0
+        self, *, share: float = 0.0, session: float = 0.0, factor: float = 1.0
     ) -> Relaxation:
         """
         Return the relaxed plan: fractional visits of motions and moves, with additive information.
 
-        `common`: (share of the biases' covariance that is common to a session, seconds of the
-        longest session); `factor`: on the variance of the noise within windows.
+        `share` of the biases' covariance is common to a session of at most `session` s; `factor`:
+        on the variance of the noise within windows.
         """
-        share, session = common
         moves = [key for key, windows in self.move_windows.items() if windows]
         motions = np.flatnonzero(self.seconds > 0)
         visits = [self.windows[number] for number in motions]
@@ -354,13 +364,9 @@ class PlanningProblem:
                 rows[np.abs(rows[:, place]) > 0.5] /= np.sqrt(max(tolerated, 1e-4))
         return prior, rows
 
-    def timed(
-        self, sequence: Sequence[int], start: int
-    ) -> tuple[list[PlannedWindow], np.ndarray, float]:
+    def timed(self, sequence: Sequence[int], start: int) -> TimedWindows:
         """
-        Return (windows, their middles since the beginning, total time) of consecutive motions.
-
-        From the place `start`, with the moves between the places of the motions; times in s.
+        Return the windows of consecutive motions from the place `start`, with the moves between.
         """
         windows = []
         middles = []
@@ -375,7 +381,7 @@ class PlanningProblem:
                 middles += [now + window.middle for window in new_windows]
                 now += seconds
             place = target
-        return windows, np.array(middles), float(now)
+        return TimedWindows(windows, np.array(middles), float(now))
 
     def covariance_after(
         self, sequence: Sequence[int], start: int, *, cautious: bool = False
