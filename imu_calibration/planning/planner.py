@@ -29,6 +29,7 @@ from imu_calibration.planning.posterior import Posterior
 from imu_calibration.references.gravity.advice import (
     HOLD_TIME,
     TURN_RATE,
+    NoiseOfMeans,
     foretold,
     knowledge_at_first,
 )
@@ -88,9 +89,9 @@ class CandidateMotions:
         self._goal = problem.goal
         self._posterior = posterior
         self._margin = margin
-        self._distance = float(problem.goal.distance(posterior.covariance_z[None], margin)[0])
+        self.distance = float(problem.goal.distance(posterior.covariance_z[None], margin)[0])
         """Distance to the goal before the motion."""
-        self.min_gain = MIN_PLAN_GAIN * min(1.0, self._distance)
+        self.min_gain = MIN_PLAN_GAIN * min(1.0, self.distance)
 
     @cached_property
     def distance_after(self) -> np.ndarray:
@@ -103,7 +104,7 @@ class CandidateMotions:
     @cached_property
     def gain(self) -> np.ndarray:
         """Reduction of the distance to the goal by each motion."""
-        return np.where(self.possible, self._distance - self.distance_after, 0.0)
+        return np.where(self.possible, self.distance - self.distance_after, 0.0)
 
     def is_hopeless(self, number: int) -> bool:
         """Return whether a motion has almost no gain and does not reach the goal."""
@@ -146,8 +147,7 @@ def greedy(
     first_distance = problem.goal.distance(posterior.covariance_z[None])[0]
     while len(chosen) < MAX_PLAN_MOTIONS and spent < longest:
         # More rests reduce the factor: the motions so far have more information.
-        windows, _, _ = problem.timed(chosen, start)
-        new_factor = problem.variance_factor(windows)
+        new_factor = problem.variance_factor(problem.timed(chosen, start).windows)
         if new_factor != factor:
             factor = new_factor
             posterior = problem.posterior()
@@ -319,7 +319,7 @@ class Planner:
         """After the motions so far, by prediction or by the last calibration."""
         self._visited: set[int] = set()
         """Places of the rests so far."""
-        self._first: list[int] | None = None if problem.known_information is None else []
+        self._first: list[int] | None = None
         """Mandatory next motions; None before they are chosen, from the first position."""
 
     def take(self, calibration: Calibration) -> None:
@@ -338,13 +338,8 @@ class Planner:
     def excess(self) -> dict[str, float]:
         """Standard deviation over tolerance of each requested parameter, estimated or predicted."""
         coordinates = self.problem.coordinates
-        return dict(
-            zip(
-                coordinates.names,
-                coordinates.excess(self._posterior.covariance_z).tolist(),
-                strict=True,
-            )
-        )
+        excess = coordinates.excess(self._posterior.covariance_z).tolist()
+        return dict(zip(coordinates.names, excess, strict=True))
 
     def next_motion(self, position: np.ndarray) -> Decision:
         """
@@ -352,24 +347,22 @@ class Planner:
 
         The gain is from where the joints are.
         """
-        missing = self.problem.goal.missing(self._posterior.covariance_z)
         place = self.problem.place_near(position)
         if self._first is None:
             # After an earlier calibration no motion is mandatory.
-            self._first = []
-            if self.problem.known_information is None:
-                self._first = self.problem.first_rests(place)
-        is_mandatory = bool(self._first)
-        covariance = self._posterior.covariance_z
-        if not is_mandatory and not self.problem.goal.distance(covariance[None])[0] > 0:
-            return Decision(why=STUCK if missing else GOAL_REACHED)
+            is_known = self.problem.known_information is not None
+            self._first = [] if is_known else self.problem.first_rests(place)
         candidates = CandidateMotions(self.problem, self._posterior, place)
-        if is_mandatory:
+        if self._first:
             number = self._first.pop(0)
             reason = 'a session begins with rests in many attitudes'
         else:
+            missing = self.problem.goal.missing(self._posterior.covariance_z)
+            if not candidates.distance > 0:
+                return Decision(why=STUCK if missing else GOAL_REACHED)
             number = candidates.best
             reason = f'it gains most per second for {", ".join(missing[:3])}'
+            # Without any rest so far the first motion is made in any case.
             if self._visited and candidates.is_hopeless(number):
                 return Decision(why=STUCK)
         self._posterior.take(candidates.information[number], float(candidates.seconds[number]))
@@ -458,21 +451,22 @@ class Planner:
         bound = float('nan')
         goal = problem.goal
         if with_bound and isinstance(goal, WithinTolerances):
-            windows, _, seconds = problem.timed(sequence, place)
-            factor = problem.variance_factor(windows)
+            timed = problem.timed(sequence, place)
+            factor = problem.variance_factor(timed.windows)
             relaxed = problem.relaxation(factor=factor)
             bound = problem.lower_bound(factor=factor, relaxed=relaxed)
             # A second search, in which the parameters that limit the relaxed plan count more.
-            if seconds > MAX_BOUND_RATIO * bound:
+            if timed.seconds > MAX_BOUND_RATIO * bound:
                 weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
                 problem.goal = WithinTolerances(problem.coordinates, weights)
                 second = self._sequence(place, first, longest)
                 problem.goal = goal
-                windows, _, second_seconds = problem.timed(second, place)
+                second_timed = problem.timed(second, place)
                 reaches_goal = remaining_distance(problem, second, place) == 0.0
-                if second_seconds < seconds and reaches_goal:
+                if second_timed.seconds < timed.seconds and reaches_goal:
                     sequence = second
-                    bound = problem.lower_bound(factor=problem.variance_factor(windows))
+                    factor = problem.variance_factor(second_timed.windows)
+                    bound = problem.lower_bound(factor=factor)
         return self._plan_of(sequence, start, place, bound)
 
     def _sequence(self, place: int, first: Sequence[int], longest: float) -> list[int]:
@@ -599,10 +593,12 @@ def plan_by_hand(
         Samples per second.
 
     """
-    force_sd = _mean_sd(noise['accelerometer'], HOLD_TIME * rate)
-    rate_sd = _mean_sd(noise['gyroscope'], HOLD_TIME * rate)
-    turn_sd = float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate))
-    knowledge = knowledge_at_first(model, tolerances, noise=(force_sd, rate_sd, turn_sd))
+    noise_of_means = NoiseOfMeans(
+        force=_mean_sd(noise['accelerometer'], HOLD_TIME * rate),
+        rate=_mean_sd(noise['gyroscope'], HOLD_TIME * rate),
+        turn=float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate)),
+    )
+    knowledge = knowledge_at_first(model, tolerances, noise=noise_of_means)
     steps = foretold(knowledge)
     history = [knowledge.sd(knowledge.information)]
     for step in steps:

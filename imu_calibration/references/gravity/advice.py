@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,9 +58,9 @@ class HandStep:
     @property
     def seconds(self) -> float:
         """Duration, s."""
-        return (
-            HOLD_TIME + TURN_BEGINS + (0.5 * np.pi if self.axis is None else self.angle) / TURN_RATE
-        )
+        # From anywhere a quarter turn is assumed.
+        angle = 0.5 * np.pi if self.axis is None else self.angle
+        return HOLD_TIME + TURN_BEGINS + angle / TURN_RATE
 
     @property
     def is_turn(self) -> bool:
@@ -368,29 +368,29 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     The recommended step is the next one of the common plan, shown in the picture, if it serves the
     sensor; otherwise the best step for the sensor.
     """
-    # Undetermined parameters: those of each sensor that need a motion, and those of each remedy.
     absent = hand.hand_model.absent
-    lacking: dict[str, dict[str, float]] = {}
-    remedies: dict[tuple[str, str], dict[str, float]] = {}
-    excesses = None if 'accelerometer' in absent else _Excesses.of_solution(hand)
-    for index, name in enumerate(hand.param_names):
-        sensor = name.partition('.')[0]
-        if hand.statuses[index] not in LACKING or sensor in absent:
-            continue
-        in_tolerances = float(hand.judged_sd[index] / hand.tolerances[index])
-        without_motion = ''
-        if excesses is not None:
-            without_motion = _without_motion(hand, index, excesses)
-        if without_motion:
-            remedies.setdefault((sensor, without_motion), {})[name] = in_tolerances
-        else:
-            lacking.setdefault(sensor, {})[name] = in_tolerances
+    undetermined = {}  # name -> sd over tolerance
+    for name, status, sd, tolerance in zip(
+        hand.param_names, hand.statuses, hand.judged_sd, hand.tolerances
+    ):
+        if status in LACKING and name.partition('.')[0] not in absent:
+            undetermined[name] = float(sd / tolerance)
+    if not undetermined:
+        return ()
     # No motion determines more without gravity in the readings.
     if 'accelerometer' in absent:
-        return tuple(
-            {'parameters': names, 'needs': 'record the accelerometer of the same board as well'}
-            for names in lacking.values()
-        )
+        needs = 'record the accelerometer of the same board as well'
+        return ({'parameters': undetermined, 'needs': needs},)
+
+    # Those of each sensor that need a motion, and those of each remedy.
+    excesses = _Excesses.of_solution(hand)
+    lacking: dict[str, dict[str, float]] = {}
+    remedies: dict[tuple[str, str], dict[str, float]] = {}
+    for name, in_tolerances in undetermined.items():
+        sensor = name.partition('.')[0]
+        text = _without_motion(hand, hand.param_names.index(name), excesses)
+        group = remedies.setdefault((sensor, text), {}) if text else lacking.setdefault(sensor, {})
+        group[name] = in_tolerances
     knowledge = knowledge_after(hand)
     plan = foretold(knowledge)[:1] if lacking else []
 
@@ -429,13 +429,12 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
             return ALL_MOTIONS[effect.motion[0]]
 
     # The bias of the gyroscope is determined at rest, its other parameters by turns.
-    bias = hand.model.part('gyroscope', Role.OFFSET)
-    of_turns = hand.param_names[index].startswith('gyroscope') and index not in range(
-        bias.start, bias.stop
-    )
+    name = hand.param_names[index]
+    is_bias = hand.model.mask(lambda effect: effect.role is Role.OFFSET)[index]
+    of_turns = name.startswith('gyroscope') and not is_bias
     # A turn is compared with the directions of gravity before and after it, so that a moved
     # accelerometer spoils it as well.
-    used_sensors = SENSORS if of_turns else (hand.param_names[index].partition('.')[0],)
+    used_sensors = SENSORS if of_turns else (name.partition('.')[0],)
     if motions_at_rest(hand.statistics, used_sensors):
         return MOVED_REMEDY
 
@@ -447,7 +446,7 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
     # A parameter that the attitudes do not determine needs other attitudes for any scatter.
     if hand.judged_sd[index] > UNKNOWN_SHARE * hand.hand_model.priors[index]:
         return ''
-    if hand.param_names[index].startswith('accelerometer'):
+    if name.startswith('accelerometer'):
         excess = excesses.pose
     elif of_turns:
         # Poses in error also spoil the directions before and after a turn.
@@ -493,11 +492,22 @@ class _Excesses:
         )
 
 
+class NoiseOfMeans(NamedTuple):
+    """Standard deviations from the noise of the samples."""
+
+    force: float = 0.0
+    """Of the mean force of a pose, m/s^2."""
+    rate: float = 0.0
+    """Of its mean rate, rad/s."""
+    turn: float = 0.0
+    """Of the angle of a turn, rad."""
+
+
 def knowledge_at_first(
     model: HandModel,
     tolerances: np.ndarray,
     *,
-    noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    noise: NoiseOfMeans = NoiseOfMeans(),
     poses: Poses | None = None,
 ) -> HandKnowledge:
     """
@@ -509,9 +519,7 @@ def knowledge_at_first(
     ----------
     model : HandModel
     tolerances : ndarray, shape (n,)
-    noise : tuple
-        Sd from the sensor noise of the mean force of a pose (m/s^2), of its mean rate (rad/s) and
-        of the angle of a turn (rad).
+    noise : NoiseOfMeans
     poses : Poses, optional
         Poses so far.
 

@@ -1,7 +1,7 @@
 """Drift of biases within the recording, estimated from the poses together with all parameters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import fdtrc
@@ -145,18 +145,6 @@ def _is_significant(square_before: float, square_after: float, n_added: int, spa
     """
     ratio = (square_before - square_after) / max(n_added, 1) / max(square_after / spare, 1e-300)
     return bool(n_added > 0 and fdtrc(n_added, spare, max(ratio, 0.0)) < DRIFT_P_VALUE)
-
-
-def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Poses:
-    """
-    Return the poses with the accelerometer's bias at its mean.
-
-    The gyroscope's bias is estimated in each pose.
-    """
-    movement = movements.get('accelerometer')
-    if movement is None:
-        return poses
-    return replace(poses, force=poses.force - movement.course)
 
 
 def with_movement(

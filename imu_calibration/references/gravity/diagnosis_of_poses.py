@@ -40,15 +40,15 @@ def traces_of_poses(baseline: HandCalibration, hand: HandCalibration) -> Traces:
     poses = hand.poses
     count = len(poses)
     return Traces(
-        poses.time,
-        np.full(count, 'static'),
-        np.zeros((count, 0)),
-        hand.gravity * hand.state.up,
-        np.zeros((count, 3)),
-        poses.temperature_c,
-        _errors(baseline),
-        _errors(hand),
-        (poses.stop - poses.start).astype(float),
+        time=poses.time,
+        kind=np.full(count, 'static'),
+        position=np.zeros((count, 0)),
+        force_s=hand.gravity * hand.state.up,
+        rate_s=np.zeros((count, 3)),
+        temperature_c=poses.temperature_c,
+        before=_errors(baseline),
+        after=_errors(hand),
+        samples=(poses.stop - poses.start).astype(float),
         dead_reckoning=None,
     )
 
@@ -61,7 +61,6 @@ def diagnosis_by_hand(search: HandInvestigation, hand: HandCalibration) -> Diagn
     """
     problem = search.problem
     named = list(search.named)
-    before = _with_residuals(search.baseline)
     after = _with_residuals(hand)
 
     def gain_of(place: int) -> Gain:
@@ -88,13 +87,13 @@ def diagnosis_by_hand(search: HandInvestigation, hand: HandCalibration) -> Diagn
         gain = gain_by_hand(search, [], after=named, sensor=named[0].sensor)
     count = len(search.baseline.poses)
     return Diagnosis(
-        tuple(findings),
-        search.unexplained,
-        candidates_of(problem.search, named),
-        tuple(search.not_testable),
-        before,
-        after,
-        gain,
-        count,
-        count if named else 0,
+        findings=tuple(findings),
+        unexplained=search.unexplained,
+        candidates=candidates_of(problem.search, named),
+        not_testable=tuple(search.not_testable),
+        baseline=_with_residuals(search.baseline),
+        solution=after,
+        gain=gain,
+        windows=count,
+        locked=count if named else 0,
     )

@@ -4,8 +4,9 @@ Calibration without a table.
 Gravity is the reference, poses held still and the turns between them are the data.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,9 +32,9 @@ from imu_calibration.estimation.solution import (
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import (
+    BiasMovement,
     bias_movements,
     with_movement,
-    without_movement,
 )
 from imu_calibration.references.gravity.equations import (
     COMPONENTS,
@@ -112,6 +113,17 @@ of the poses.
 """
 
 
+class GyroscopeParameters(NamedTuple):
+    """Bias, matrix and g-sensitivity of the gyroscope."""
+
+    bias: np.ndarray
+    """Bias, rad/s, shape (3,)."""
+    matrix: np.ndarray
+    """Matrix, shape (3, 3)."""
+    g_sensitivity: np.ndarray
+    """Response to specific force, (rad/s)/(m/s^2), shape (3, 3); zeros if the model has none."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HandCalibration(Solution):
     """
@@ -173,17 +185,13 @@ class HandCalibration(Solution):
         return self.hand_model.linear(self.values)[:2]
 
     @property
-    def gyroscope(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """
-        (bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity.
-        """
-        effect = self.model.find('gyroscope', Role.CROSS)
-        response = (
-            np.zeros((3, 3))
-            if effect is None
-            else self.values[self.model.slices[effect.key]].reshape(3, 3)
-        )
-        return *self.hand_model.linear(self.values)[2:], response
+    def gyroscope(self) -> GyroscopeParameters:
+        """Bias, matrix and g-sensitivity of the gyroscope."""
+        linear = self.hand_model.linear(self.values)
+        g_sensitivity = self.model.value('gyroscope', Role.CROSS, self.values)
+        if g_sensitivity is None:
+            g_sensitivity = np.zeros((3, 3))
+        return GyroscopeParameters(linear.gyro_bias, linear.gyro_matrix, g_sensitivity)
 
     def compensate(
         self,
@@ -295,14 +303,15 @@ def gather_by_hand(
             key='table',
             code='too_few_attitudes',
         )
+    statistics = {'attitudes': attitudes, 'turns_dropped': {}, **noise_statistics(poses)}
     if imu.absent:
         # A turn relates both sensors.
-        statistics = {'attitudes': attitudes, 'turns_dropped': {}, **noise_statistics(poses)}
         return HandData(without_sensors(poses, imu.absent), [], statistics, imu.absent)
-    turns, dropped = collect_turns(time, imu, poses=poses, temperature_c=temperature_c)
+    turns, statistics['turns_dropped'] = collect_turns(
+        time, imu, poses=poses, temperature_c=temperature_c
+    )
     for turn in known_turns:
         turns.append(known_turn_data(time, imu, turn, poses=poses, temperature_c=temperature_c))
-    statistics = {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)}
     return HandData(poses, turns, statistics)
 
 
@@ -371,7 +380,7 @@ def _turn_error(hand: HandCalibration, turn: TurnData) -> float:
     """Return the angle between rotated and measured gravity after a turn, rad."""
     force, _ = hand.compensate(hand.poses.force, hand.poses.rate, **hand.poses.conditions)
     state = replace(hand.state, up=unit_rows(force))
-    return missed_angle(state, hand.poses, turn, matrix=hand.gyroscope[1])
+    return missed_angle(state, hand.poses, turn, matrix=hand.gyroscope.matrix)
 
 
 def _solve(
@@ -381,10 +390,8 @@ def _solve(
     poses = data.poses
 
     # 1. Model. The g-sensitivity relates both sensors, so that it needs both.
-    default = BASE
-    evidence = dict(NO_EVIDENCE)
-    if not data.absent:
-        default, evidence = default_gyroscope(poses)
+    evidence = dict(NO_EVIDENCE) if data.absent else g_sensitivity_evidence(poses)
+    default = G_SENSITIVE if shown(evidence) else BASE
     sensors = _requested_effects(options, poses, default_gyroscope=default)
     model = HandModel(sensors, options.gravity, held_terms=held_terms, absent=data.absent)
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
@@ -415,38 +422,25 @@ def _solve(
         if model.model.relinearised:
             integrated_turns = {}  # they belong to the columns of the previous linearisation
         model = model.at(estimate.state.values)
-        poses, turns, n_outliers = without_outlying_poses(
+        inliers = without_outlying_poses(
             model, estimate, poses=poses, turns=turns, integrated=integrated_turns
         )
-        for kind, count in n_outliers.items():
+        poses = inliers.poses
+        turns = inliers.turns
+        for kind, count in inliers.n_outliers.items():
             key = f'outlying {kind}'
             n_excluded[key] = n_excluded.get(key, 0) + count
-        if settled and not n_outliers:
+        if settled and not inliers.n_outliers:
             break
 
     # 5. Drift of the biases. That of the accelerometer is subtracted from the poses; that of the
     #    gyroscope is a nuisance of every pose already.
     drifts = bias_movements(model, estimate.state.values, poses)
     if 'accelerometer' in drifts:
-        poses = without_movement(poses, drifts)
+        poses = replace(poses, force=poses.force - drifts['accelerometer'].course)
         estimate, _ = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd)
 
-    # 6. Covariance: drift, errors common to all rests, and errors common to those of a placement.
-    covariance = total(estimate.terms)
-    drift_covariance = with_movement(covariance, model, drifts) - covariance
-    terms = with_term(estimate.terms, DRIFT, drift_covariance)
-    terms = with_term(terms, DRIFT, _hidden_covariance(model, poses))
-    rows = GravityRows(model, poses, turns).linearise(estimate.state)
-    placement_covariance = covariance_of_placements(rows, estimate)
-    if placement_covariance.any():
-        # Errors of placements also scatter the parameters between parts of the recording, which is
-        # in the terms already: only the excess over them is added.
-        free = np.flatnonzero(estimate.free)
-        expected = (of_fit(estimate.terms) + placement_covariance)[np.ix_(free, free)]
-        terms[PLACEMENTS] = excess(expected, total(terms), free)
-    terms = bounded_by_prior(terms, estimate.held, model.priors)
-
-    # 7. Statistics, of all poses: also of the excluded and drifting ones.
+    # 6. Statistics, of all poses: also of the excluded and drifting ones.
     goals = tolerances_of(model.model, options.tolerances)
     bias_moved = {sensor: float(np.linalg.norm(drift.size)) for sensor, drift in drifts.items()}
     statistics = {
@@ -473,7 +467,7 @@ def _solve(
     return HandCalibration(
         model=model.model,
         values=estimate.state.values,
-        terms=terms,
+        terms=_with_common_errors(GravityRows(model, poses, turns), estimate, drifts),
         held=estimate.held,
         noise=noise,
         residual_rms={},
@@ -496,12 +490,11 @@ def _requested_effects(
     reference_c = 25.0
     if poses.temperature_c is not None:
         reference_c = float(np.round(np.mean(poses.temperature_c)))
-    sensors = SensorModel(
-        options.accelerometer or BASE,
-        options.gyroscope or default_gyroscope,
+    sensors = replace(
+        options.model,
+        gyroscope=options.gyroscope or default_gyroscope,
         temperature_ref_c=reference_c,
         point=options.point,
-        catalogue=options.catalogue,
     )
     for sensor, name in options.added:
         if (sensor, name) not in sensors.slices:
@@ -526,6 +519,30 @@ def _best_time_constant(
         trials.append(trial)
         variances.append(estimate.scatter.variance[component])
     return trials[int(np.argmin(variances))]
+
+
+def _with_common_errors(
+    reference: GravityRows, estimate: RowEstimate, drifts: Mapping[str, BiasMovement]
+) -> dict[str, np.ndarray]:
+    """
+    Return the terms of the covariance of an estimate, with those of errors that rests share.
+
+    They are the drift of the biases, errors common to all rests, and those common to the rests of
+    a placement.
+    """
+    model = reference.model
+    covariance = total(estimate.terms)
+    drift_covariance = with_movement(covariance, model, drifts) - covariance
+    terms = with_term(estimate.terms, DRIFT, drift_covariance)
+    terms = with_term(terms, DRIFT, _hidden_covariance(model, reference.poses))
+    placement_covariance = covariance_of_placements(reference.linearise(estimate.state), estimate)
+    if placement_covariance.any():
+        # Errors of placements also scatter the parameters between parts of the recording, which is
+        # in the terms already: only the excess over them is added.
+        free = np.flatnonzero(estimate.free)
+        expected = (of_fit(estimate.terms) + placement_covariance)[np.ix_(free, free)]
+        terms[PLACEMENTS] = excess(expected, total(terms), free)
+    return bounded_by_prior(terms, estimate.held, model.priors)
 
 
 def _hidden_covariance(model: HandModel, poses: Poses) -> np.ndarray:
@@ -567,14 +584,6 @@ def without_sensors(poses: Poses, absent: Sequence[str]) -> Poses:
         no_weight = np.full_like(poses.rate_sem, ABSENT_SD)
         poses = replace(poses, rate=no_rate, rate_sem=no_weight)
     return poses
-
-
-def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
-    """
-    Return (default effects of the gyroscope, `g_sensitivity_evidence` that decides on them).
-    """
-    evidence = g_sensitivity_evidence(poses)
-    return G_SENSITIVE if shown(evidence) else BASE, evidence
 
 
 def _statistics(

@@ -16,7 +16,7 @@ from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.forward_equations import output_of_effects
-from imu_calibration.effects.sensor_model import SensorModel, linear_names, parse_effects
+from imu_calibration.effects.sensor_model import BASE, SensorModel, linear_names, parse_effects
 from imu_calibration.kinematics.rotations import Reference
 
 UPPER_TERMS = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
@@ -148,19 +148,19 @@ class HandModel:
 
     def base_index(self, sensor: str) -> np.ndarray:
         """Return the indices of the estimated parameters of bias and matrix of one sensor."""
-        every = np.arange(self.size)
-        bias = every[self.model.part(sensor, Role.OFFSET)]
-        matrix = every[self.model.part(sensor, Role.LINEAR)]
+        all_indices = np.arange(self.size)
+        bias = all_indices[self.model.part(sensor, Role.OFFSET)]
+        matrix = all_indices[self.model.part(sensor, Role.LINEAR)]
         index = np.concatenate([bias, matrix])
         return index[~self.fixed[index]]
 
     def extra_index(self, sensor: str) -> np.ndarray:
         """Return the indices of the parameters of the further effects of one sensor."""
-        every = np.arange(self.size)
+        all_indices = np.arange(self.size)
         indices = [np.zeros(0, int)]
         for effect in self.extras:
             if effect.sensor == sensor:
-                indices.append(every[self.model.slices[effect.key]])
+                indices.append(all_indices[self.model.slices[effect.key]])
         return np.concatenate(indices)
 
     def linear(self, values: np.ndarray) -> LinearParameters:
@@ -373,6 +373,13 @@ class HandOptions:
     """Effect -> values at which its columns are first computed."""
     catalogue: Catalogue = CATALOGUE
     """Declarations of the effects."""
+
+    @property
+    def model(self) -> SensorModel:
+        """The requested effects, by default bias and matrix; without those of `added`."""
+        return SensorModel(
+            self.accelerometer or BASE, self.gyroscope or BASE, catalogue=self.catalogue
+        )
 
 
 def hand_options(options: CalibrationOptions) -> HandOptions:

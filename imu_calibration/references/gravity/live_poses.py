@@ -38,7 +38,7 @@ from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.outcome import parameter_count
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import (
     COMMON_SCALE,
     GRAVITY,
@@ -103,7 +103,7 @@ class PoseScan:
     """Sensors without readings."""
 
 
-EMPTY_SCAN = PoseScan([], None, 0, 0, {}, 0.0)
+EMPTY_SCAN = PoseScan(rests=[], poses=None, attitudes=0, turns=0, dropped={}, resting=0.0)
 
 
 def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> PoseScan:
@@ -253,12 +253,7 @@ def knowledge_of(scan: PoseScan, result: HandResult | None, options: HandOptions
     """
     if result is not None:
         return knowledge_after(result.applied)
-    model = HandModel(
-        SensorModel(
-            options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue
-        ),
-        options.gravity,
-    )
+    model = HandModel(options.model, options.gravity)
     return knowledge_at_first(
         model, tolerances_of(model.model, options.tolerances), poses=scan.poses
     )
@@ -390,12 +385,7 @@ class LiveByHand(LiveSession):
     @property
     def model(self) -> SensorModel:
         """The requested model; effects that a solution adds are not in it."""
-        requested = self._first_options
-        return SensorModel(
-            requested.accelerometer or BASE,
-            requested.gyroscope or BASE,
-            catalogue=requested.catalogue,
-        )
+        return self._first_options.model
 
     observations = PoseObservations.unit
     needs_joints = False
@@ -565,9 +555,8 @@ class LiveByHand(LiveSession):
         gravity_s = true_force * (hand.gravity / np.linalg.norm(true_force, axis=1))[:, None]
         # The matrices convert errors of true values to errors of readings.
         _, force_matrix = hand.accelerometer
-        _, rate_matrix, _ = hand.gyroscope
         force_residual = (true_force - gravity_s) @ force_matrix.T
-        rate_residual = true_rate @ rate_matrix.T
+        rate_residual = true_rate @ hand.gyroscope.matrix.T
         if 'accelerometer' in self.result.calibration.absent:
             force_residual = np.full_like(true_force, np.nan)
         if 'gyroscope' in self.result.calibration.absent:

@@ -7,7 +7,7 @@ The search of a diagnosis, on poses and turns instead of windows on a table.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,16 @@ MIN_SPARE_POSES = 3
 """Least number of poses beyond the nine parameters of the accelerometer."""
 MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 """With fewer poses none can be held out."""
+
+
+class ExtendedBaseline(NamedTuple):
+    """The model of a baseline with further effects, and its parameters."""
+
+    model: HandModel
+    values: np.ndarray
+    """Parameters, shape (n,)."""
+    earth_rate: float
+    """The Earth's rate about the vertical, rad/s."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,14 +121,11 @@ class HandInvestigation(SelectedEffects):
                 point[question.name] = np.append(amplitudes, self.constants[number])
         return point
 
-    def extended(
-        self, problem: RowProblem, chosen: Sequence[Question]
-    ) -> tuple[HandModel, np.ndarray, float]:
+    def extended(self, problem: RowProblem, chosen: Sequence[Question]) -> ExtendedBaseline:
         """
-        Return (model of the baseline and the chosen effects, its parameters, Earth's rate).
+        Return the model of the baseline and the chosen effects, with its parameters.
 
-        The Earth's rate is that about the vertical, rad/s. `problem` has the rows for the estimate,
-        those of this investigation or fewer.
+        `problem` has the rows for the estimate, those of this investigation or fewer.
         """
         hand = self.baseline
         point = self.point(problem, chosen)
@@ -134,7 +141,7 @@ class HandInvestigation(SelectedEffects):
         for question in chosen:
             if question.name not in point:  # warm-ups start at the point
                 values[extended.slices[question.effect.key]] = fit[list(question.parameters)]
-        return model, values, fit[n_baseline]
+        return ExtendedBaseline(model, values, fit[n_baseline])
 
 
 def investigate_by_hand(
@@ -168,12 +175,13 @@ def investigate_by_hand(
         raise too_few_poses(len(poses))
     accelerometer = options.accelerometer or BASE
     gyroscope = options.gyroscope or BASE
-    requested = replace(options, accelerometer=accelerometer, gyroscope=gyroscope)
     baseline = solved
     # The given solution may have an added g-sensitivity, or other effects.
-    if baseline is None:
-        baseline = solve_by_hand(data, requested)
-    elif (baseline.model.accelerometer, baseline.model.gyroscope) != (accelerometer, gyroscope):
+    if baseline is None or (baseline.model.accelerometer, baseline.model.gyroscope) != (
+        accelerometer,
+        gyroscope,
+    ):
+        requested = replace(options, accelerometer=accelerometer, gyroscope=gyroscope)
         baseline = solve_by_hand(data, requested)
     follows_gravity = shown(g_sensitivity_evidence(poses))
     effects, not_testable = sort_effects(
@@ -183,7 +191,15 @@ def investigate_by_hand(
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     # Including fixed parameters and the Earth's rate: their uncertainty is no finding.
     base = tuple(range(baseline.hand_model.size + 1))
-    questions = _questions(effects, blocks, space, base, not_testable)
+    questions = _questions(effects, blocks, space, base)
+    for name in sorted({effect.name for effect in effects} - {each.name for each in questions}):
+        not_testable.append(
+            {
+                'effect': name,
+                'why': 'in these poses bias and matrix imitate it',
+                'needs': 'more poses, in steps of 30 degrees about each axis',
+            }
+        )
     problem = RowProblem(blocks, space.prior_sd, questions, baseline=base)
     chosen = choose_effects(problem)
     return HandInvestigation(
@@ -249,13 +265,11 @@ def _questions(
     blocks: Sequence[Rows],
     space: SearchParameters,
     base: Sequence[int],
-    not_testable: list[dict[str, str]],
 ) -> list[Question]:
     """
     Return a question for each effect, of a warm-up for each time constant.
 
-    An effect that is collinear with the parameters `base` in these poses has none: it is added to
-    `not_testable`.
+    An effect that is collinear with the parameters `base` in these poses has none.
     """
     by_name = {effect.name: effect for effect in effects}
     questions = []
@@ -268,12 +282,4 @@ def _questions(
             # The time constant of a warm-up is a further degree of freedom.
             freedom = rank + ('@' in label)
             questions.append(Question(by_name[name], parameters, freedom, label))
-    for name in sorted(by_name.keys() - {question.name for question in questions}):
-        not_testable.append(
-            {
-                'effect': name,
-                'why': 'in these poses bias and matrix imitate it',
-                'needs': 'more poses, in steps of 30 degrees about each axis',
-            }
-        )
     return questions

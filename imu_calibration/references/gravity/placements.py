@@ -137,11 +137,10 @@ def _variance_of_means(rows: Rows, estimate: RowEstimate, weights: np.ndarray) -
     )
 
     fallback = np.array([SCATTER_SD[0] ** 2])
-    # Of these only the variance is read, as the start.
-    variances = GroupVariances(variance=fallback, dof=np.zeros(1), upper=fallback)
+    start = fallback
     for _ in range(VARIANCE_STEPS):
-        before = variances.variance
-        variances = estimate_group_variances(transformed_rows, start=before, fallback=fallback)
-        if np.allclose(variances.variance, before, rtol=0.01):
+        variances = estimate_group_variances(transformed_rows, start=start, fallback=fallback)
+        if np.allclose(variances.variance, start, rtol=0.01):
             break
+        start = variances.variance
     return variances

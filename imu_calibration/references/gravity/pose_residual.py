@@ -1,7 +1,7 @@
 """Residual of a calibration by hand that no effect explains, and where it is largest."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -34,6 +34,18 @@ TURN_RESIDUAL_UNIT = 'rad/turn'
 """Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
 
 
+@dataclass(frozen=True)
+class _Excess:
+    """Excess of a residual over the expectation from noise."""
+
+    sigma: float = -np.inf
+    """Excess of chi^2, in standard deviations."""
+    rms: float = 0.0
+    """Its root mean square, in the unit of a reading, of turns rad."""
+    is_of_turns: bool = False
+    """Whether it is the residual of turns."""
+
+
 def unexplained_by_hand(
     hand: HandCalibration,
     blocks: Sequence[Rows],
@@ -64,48 +76,42 @@ def unexplained_by_hand(
 
     """
     residuals = evidence.residuals(used)
-    sigma = -np.inf
-    rms = 0.0
-    largest = None
+    largest = _Excess()
     for block, residual in zip(blocks, residuals):
         if block.sensor != sensor:
             continue
         spare = residual.size - np.linalg.matrix_rank(flat(block.equations)[:, used])
-        if spare < 3:
+        if spare < 3:  # too few degrees of freedom for a normal distribution of chi^2
             continue
-        sigma_of_block = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
-        if not sigma_of_block > sigma:
-            continue
-        if block.name != 'poses' and not sigma_of_block > SIGNIFICANT_SDS:
-            continue
-        # Rows of turns are angles over their duration, and their rms is one of angles.
-        square_unit = 1.0 if block.duration is None else block.duration[:, None] ** 2
-        noise_square = np.mean(block.floor * square_unit)
-        excess_square = np.sum(residual**2 * square_unit) / spare - noise_square
-        sigma = sigma_of_block
-        rms = float(np.sqrt(max(excess_square, 0.0)))
-        largest = block
+        sigma = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
+        if sigma > largest.sigma and (block.name == 'poses' or sigma > SIGNIFICANT_SDS):
+            # Rows of turns are angles over their duration, and their rms is one of angles.
+            square_unit = 1.0 if block.duration is None else block.duration[:, None] ** 2
+            noise_square = np.mean(block.floor * square_unit)
+            excess_square = np.sum(residual**2 * square_unit) / spare - noise_square
+            rms = float(np.sqrt(max(excess_square, 0.0)))
+            largest = _Excess(sigma, rms, is_of_turns=block.duration is not None)
 
     at_rest = next(k for k, block in enumerate(blocks) if block.sensor == sensor)
     noise_sd = np.sqrt(blocks[at_rest].floor)
-    significant = bool(sigma > SIGNIFICANT_SDS and len(hand.poses) >= MIN_EXPLAINED_WINDOWS)
+    significant = bool(largest.sigma > SIGNIFICANT_SDS and len(hand.poses) >= MIN_EXPLAINED_WINDOWS)
     unexplained = Unexplained(
         significant=significant,
-        rms=rms,
+        rms=largest.rms,
         # Minus infinity, which no document holds, where no block has enough rows.
-        sigma=float(max(sigma, -99.0)),
+        sigma=float(max(largest.sigma, -99.0)),
         correlates_with=None,
         share=0.0,
         residual=residuals[at_rest],
         noise_sd=noise_sd,
-        unit=None if largest is None or largest.duration is None else TURN_RESIDUAL_UNIT,
+        unit=TURN_RESIDUAL_UNIT if largest.is_of_turns else None,
     )
     if not significant:
         return unexplained
 
     # Where it is largest: the variable, the axes, and ranges of the variables.
     name, share = correlate(_explanations(hand), residuals[at_rest], noise_sd)
-    if largest is not None and largest.name == 'turns' and name is None:
+    if largest.is_of_turns and name is None:
         name = 'motion (turns between poses)'
     heldout = evidence.heldout_residuals(used)[at_rest]
     excess = ((heldout / noise_sd) ** 2 - 1.0).sum(axis=0)
@@ -120,17 +126,17 @@ def _explanations(hand: HandCalibration) -> Iterator[tuple[str, np.ndarray, np.n
     """Yield (name, columns (k, m), mask of the poses (k,)) of the variables for `correlate`."""
     poses = hand.poses
     up = hand.state.up
-    every = np.ones(len(up), bool)
+    all_poses = np.ones(len(up), bool)
     temperature_c = poses.temperature_c
     if temperature_c is None:
         temperature_c = np.full(len(up), np.nan)
     yield from slow_explanations(poses.time, temperature_c)
-    yield 'direction of gravity', up, every
+    yield 'direction of gravity', up, all_poses
 
     # Polynomials of the second degree on the sphere.
     x, y, z = up.T
     second_degree = np.stack([x**2 - y**2, z**2, x * y, y * z, x * z], axis=1)
-    yield 'direction of gravity', second_degree, every
+    yield 'direction of gravity', second_degree, all_poses
 
 
 def regimes_by_hand(

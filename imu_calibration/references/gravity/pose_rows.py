@@ -84,18 +84,11 @@ def build_rows(
     # Derivatives of the outputs in the poses. The last parameter of a warm-up, its time constant,
     # is fixed and has no column.
     true_force = hand.gravity * hand.state.up
-    zero_rate = np.zeros_like(true_force)
     at_rest: dict[str, dict[str, np.ndarray]] = {sensor: {} for sensor in SENSORS}
     for group in groups:
         if group.effect.sensor in at_rest:
             columns = _columns(
-                hand,
-                group.effect,
-                tau=group.time_constant,
-                force=true_force,
-                rate=zero_rate,
-                time=hand.poses.time,
-                temperature_c=hand.poses.temperature_c,
+                hand, group.effect, true_force, tau=group.time_constant, **hand.poses.conditions
             )
             at_rest[group.effect.sensor][group.label] = columns[:, :, : group.size]
 
@@ -146,27 +139,23 @@ def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
 def _columns(
     hand: HandCalibration,
     effect: Effect,
-    *,
-    tau: float | None,
     force: np.ndarray,
-    rate: np.ndarray,
-    time: np.ndarray,
-    temperature_c: np.ndarray | None,
+    *,
+    tau: float | None = None,
+    **inputs: np.ndarray | None,
 ) -> np.ndarray:
     """
     Return the derivative of a sensor's output by the parameters of an effect, shape (m, 3, p).
 
-    It is computed at the baseline's solution, for true forces and rates of shape (m, 3); `tau`: the
-    time constant of a warm-up, s.
+    It is computed at the baseline's solution, for the true force, shape (m, 3), and the further
+    inputs of `HandModel.further_output`; `tau`: the time constant of a warm-up, s.
     """
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     sensors = replace(hand.model, accelerometer=BASE, gyroscope=BASE, point=point)
     sensors = sensors.with_effect(effect.sensor, effect.name)
     model = HandModel(sensors, hand.gravity)
     values = model.model.start_from(hand.model, hand.values)
-    _, columns = model.further_output(
-        effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c
-    )
+    _, columns = model.further_output(effect.sensor, values, force, **inputs)
     return columns
 
 
@@ -255,10 +244,10 @@ def _turn_block(
     rad^2, and the standard errors s of the two means.
     """
     bias_f, matrix_f = hand.accelerometer
-    matrix = hand.gyroscope[1]
+    matrix = hand.gyroscope.matrix
     across = tangent(hand.state.up)
-    rows = []
-    variances = []
+    rows = []  # of each turn, shape (2, q + 1), the last column is the residual
+    variances = []  # shape (2,)
     durations = []
     for turn in turns:
         # True inputs during the turn, and the columns of further effects less those at rest.
@@ -269,13 +258,7 @@ def _turn_block(
         further = [np.zeros((len(force), 3, 0))]
         for effect in effects:
             columns = _columns(
-                hand,
-                effect,
-                tau=None,
-                force=force,
-                rate=rate,
-                time=turn.time,
-                temperature_c=turn.temperature_c,
+                hand, effect, force, rate=rate, time=turn.time, temperature_c=turn.temperature_c
             )
             columns_at_rest = at_rest[effect.name]
             further.append(columns - 0.5 * (columns_at_rest[i] + columns_at_rest[j]))

@@ -289,6 +289,18 @@ def possible_turns(
     return kept, len(turns) - len(kept)
 
 
+@dataclass(frozen=True, eq=False)
+class Inliers:
+    """Poses and turns without outliers."""
+
+    poses: Poses
+    """All poses; outlying ones have negligible weight."""
+    turns: list[TurnData]
+    """Turns that are no outliers."""
+    n_outliers: dict[str, int]
+    """Kind (`COMPONENTS`) -> number of outliers; kinds without any are omitted."""
+
+
 def without_outlying_poses(
     model: HandModel,
     estimate: RowEstimate,
@@ -296,13 +308,12 @@ def without_outlying_poses(
     poses: Poses,
     turns: list[TurnData],
     integrated: dict | None = None,
-) -> tuple[Poses, list[TurnData], dict[str, int]]:
+) -> Inliers:
     """
-    Return (poses, turns, {kind: number of outliers}) without outliers.
+    Return the poses and turns without outliers, each compared with the other ones of its kind.
 
-    Kinds are the `COMPONENTS`. Each pose or turn of a kind is compared with the other ones of the
-    kind (F tests with Bonferroni correction). Outlying poses keep their place, with negligible
-    weight; outlying turns are omitted. `integrated`: the turns at the estimate, from `solve_joint`.
+    The comparisons are F tests with Bonferroni correction. `integrated`: the turns at the estimate,
+    from `solve_joint`.
     """
     rows = GravityRows(model, poses, turns, integrated or {}).linearise(estimate.state)
     residual, basis = _whitened(rows, estimate)
@@ -330,7 +341,7 @@ def without_outlying_poses(
     if of_drifts in outliers:
         poses = replace(poses, rate_sem=_loosened(poses.rate_sem, outliers[of_drifts]))
     turns = [turn for index, turn in enumerate(turns) if index not in outliers.get(of_turns, ())]
-    return poses, turns, {kind: len(numbers) for kind, numbers in outliers.items()}
+    return Inliers(poses, turns, {kind: len(numbers) for kind, numbers in outliers.items()})
 
 
 def _whitened(rows: Rows, estimate: RowEstimate) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ All samples up to a limit, then the least informative are discarded first.
 import io
 from collections.abc import Iterable, Sequence
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
@@ -67,16 +68,7 @@ class HandStore:
         for epoch, samples in accepted:
             if not len(samples):
                 continue
-            moved = self._stamps.moved(epoch, samples)
-            self._parts.append(
-                ImuSamples(
-                    moved.stamp_ns,
-                    moved.force_s,
-                    moved.rate_s,
-                    moved.frame_id,
-                    absent=moved.absent,
-                )
-            )
+            self._parts.append(replace(self._stamps.moved(epoch, samples), corrected=None))
 
     def samples(self) -> ImuSamples | None:
         """Return all samples, or None without any."""
