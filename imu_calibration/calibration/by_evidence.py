@@ -96,10 +96,11 @@ def _with_significant(
 
         # Findings of other recordings first: they may be collinear with those of the largest one,
         # which can become significant without them.
-        significant = []
-        for finding in other_findings:
-            if not _is_insignificant(solved.solution, finding, main_search.settings):
-                significant.append(finding)
+        significant = [
+            finding
+            for finding in other_findings
+            if not _is_insignificant(solved.solution, finding, main_search.settings)
+        ]
         if len(significant) < len(other_findings):
             other_findings = significant
             continue
@@ -188,8 +189,7 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
     for limit in first.limits:
         with_limit = first.baseline_model.with_role(limit.sensor, Role.LIMIT)
         added_names.append(with_limit.effect_of(limit.sensor, Role.LIMIT).name)
-    for _, name in added:
-        added_names.append(name)
+    added_names += [name for _, name in added]
 
     unexplained = {}
     for search in reversed(searches):
@@ -197,17 +197,14 @@ def _changes(searches: Sequence[SelectedEffects], added: Sequence[tuple[str, str
             if residual.significant:
                 unexplained[sensor] = residual.entry
     # The first recording with a change of parameters.
-    changed_at = None
-    for search in searches:
-        if changed_at is None:
-            changed_at = search.changed_at
+    change_times = [search.changed_at for search in searches if search.changed_at is not None]
     return ModelChanges(
         added=tuple(added_names),
         unstable=tuple(question.name for question in first.unstable),
         implausible=_implausible_shares(searches),
         unexplained=unexplained,
         stamp_jitter=dict(first.jitter_entry),
-        changed_at=changed_at,
+        changed_at=change_times[0] if change_times else None,
     )
 
 

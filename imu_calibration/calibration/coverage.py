@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -81,11 +82,11 @@ class GroupState:
 def group_states(result: CalibrationResult) -> list[GroupState]:
     """Return the GroupState of every effect of the present sensors, in the order of the model."""
     calibration = result.calibration
-    states = []
-    for effect in calibration.model.effects:
-        if effect.sensor not in calibration.absent:
-            states.append(_group_state(result, effect))
-    return states
+    return [
+        _group_state(result, effect)
+        for effect in calibration.model.effects
+        if effect.sensor not in calibration.absent
+    ]
 
 
 def _group_state(result: CalibrationResult, effect: Effect) -> GroupState:
@@ -93,10 +94,11 @@ def _group_state(result: CalibrationResult, effect: Effect) -> GroupState:
     calibration = result.calibration
     names = calibration.param_names
     sd = calibration.own_sd
-    part = calibration.model.slices[effect.key]
-    worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
+    parameters = calibration.model.slices[effect.key]
+    sd_over_tolerance = sd[parameters] / result.tolerances[parameters]
+    worst = parameters.start + int(np.argmax(sd_over_tolerance))
 
-    statuses = calibration.status[part]
+    statuses = calibration.status[parameters]
     progress = Progress.DETERMINED
     if Progress.WEAK in statuses:
         progress = Progress.WEAK
@@ -107,7 +109,7 @@ def _group_state(result: CalibrationResult, effect: Effect) -> GroupState:
     needs = ''
     predicted_sd = float('nan')
     if progress != Progress.DETERMINED:
-        for name in (names[worst], *names[part]):
+        for name in (names[worst], *names[parameters]):
             if name in result.needed:
                 needs, predicted_sd = result.needed[name]
                 break
@@ -118,10 +120,10 @@ def _group_state(result: CalibrationResult, effect: Effect) -> GroupState:
         parameter=names[worst],
         sd=float(sd[worst]),
         tolerance=float(result.tolerances[worst]),
-        unit=effect.unit_of(worst - part.start),
+        unit=effect.unit_of(worst - parameters.start),
         needs=needs,
         predicted_sd=predicted_sd,
-        counts=any(name in calibration.requested for name in names[part]),
+        counts=any(name in calibration.requested for name in names[parameters]),
     )
 
 
@@ -219,9 +221,39 @@ SEEN_DIAMETER = 0.03
 """Diameter of the mark of an earlier up direction, m."""
 
 
-def sphere_cells(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...], float]]:
+Colour = tuple[float, ...]
+"""Red, green and blue, 0 to 1."""
+
+
+class Balls(NamedTuple):
+    """One or more balls of the picture."""
+
+    place: np.ndarray
+    """Middle, m in the sensor frame, shape (3,), or (k, 3) of k balls."""
+    colour: Colour
+    diameter: float
+
+
+class Arrow(NamedTuple):
+    """An arrow of the picture, m in the sensor frame."""
+
+    name: str
+    start: np.ndarray
+    end: np.ndarray
+    colour: Colour
+
+
+class Label(NamedTuple):
+    """A line of text of the picture."""
+
+    place: np.ndarray
+    colour: Colour
+    text: str
+
+
+def sphere_cells(coverage: Coverage) -> Iterator[Balls]:
     """
-    Yield (place, colour, diameter) of each of `DIRECTIONS`.
+    Yield the ball of each of `DIRECTIONS`.
 
     A cell is orange and large where a rest still has a gain, green and small elsewhere.
     """
@@ -231,14 +263,12 @@ def sphere_cells(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, 
         colour = []
         for wanted, done in zip(WANTED, DONE_COLOUR, strict=True):
             colour.append(share * wanted + (1 - share) * done)
-        yield RADIUS * direction, tuple(colour), 0.06 + 0.1 * share
+        yield Balls(RADIUS * direction, tuple(colour), diameter=0.06 + 0.1 * share)
 
 
-def arrows_of(
-    coverage: Coverage,
-) -> Iterator[tuple[str, np.ndarray, np.ndarray, tuple[float, ...]]]:
+def arrows_of(coverage: Coverage) -> Iterator[Arrow]:
     """
-    Yield (name, start, end, colour) of each arrow, m in the sensor frame.
+    Yield the arrows of the picture.
 
     They are the up direction now, the direction or axis of the next motion, and arms that are not
     zero.
@@ -246,29 +276,29 @@ def arrows_of(
     step = coverage.next
     centre = np.zeros(3)
     if coverage.up is not None:
-        yield 'up now', centre, 0.85 * RADIUS * coverage.up, NOW
+        yield Arrow('up now', centre, 0.85 * RADIUS * coverage.up, NOW)
     if step.up is not None:
-        yield 'next', centre, 1.25 * RADIUS * step.up, ARROW
+        yield Arrow('next', centre, 1.25 * RADIUS * step.up, ARROW)
     elif step.axis is not None:
-        yield 'next', -1.25 * RADIUS * step.axis, 1.25 * RADIUS * step.axis, ARROW
+        yield Arrow('next', -1.25 * RADIUS * step.axis, 1.25 * RADIUS * step.axis, ARROW)
     if coverage.arms is None:
         return
     for colour, arm in zip(0.9 * np.eye(3), coverage.arms, strict=False):
         if arm.any():
-            yield 'arms', centre, ARMS_TIMES * arm, tuple(colour)
+            yield Arrow('arms', centre, ARMS_TIMES * arm, tuple(colour))
 
 
-def seen_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], float]:
-    """Return (places, colour, diameter) of the earlier up directions."""
-    return 1.1 * RADIUS * coverage.seen, VISITED, SEEN_DIAMETER
+def seen_of(coverage: Coverage) -> Balls:
+    """Return the balls of the earlier up directions."""
+    return Balls(1.1 * RADIUS * coverage.seen, VISITED, SEEN_DIAMETER)
 
 
-def label_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], str]:
-    """Return (place, colour, line of text) of the label above the sphere."""
+def label_of(coverage: Coverage) -> Label:
+    """Return the label above the sphere."""
     place = np.array([0.0, 0.0, 1.6 * RADIUS])
     if coverage.done:
-        return place, DONE_COLOUR, 'all parameters are determined: save the calibration'
+        return Label(place, DONE_COLOUR, 'all parameters are determined: save the calibration')
     line = coverage.next.text or 'go on'
     if coverage.seconds and not np.isnan(coverage.seconds):
         line += f', about {coverage.seconds:.0f} s left'
-    return place, TEXT_COLOUR, line
+    return Label(place, TEXT_COLOUR, line)

@@ -13,9 +13,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.proof_entry import Proof
-from imu_calibration.document.statistics import (
-    SensorEntry,
-)
+from imu_calibration.document.statistics import SensorEntry
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import judged
 from imu_calibration.effects.forward_equations import centred
@@ -138,12 +136,12 @@ def document(
     undetermined: tuple[dict, ...],
     statistics: dict,
     provenance: dict | None,
-    proof: Proof | None,
+    proof: Proof,
     changes: ModelChanges,
     uncorrected: Uncorrected,
-    tested: Collection[str] = (),
-    absent: tuple[str, ...] = (),
-    readings: RawReadings | None = None,
+    tested: Collection[str],
+    absent: tuple[str, ...],
+    readings: RawReadings | None,
 ) -> Calibration:
     """
     Return the Calibration for a solution, with statuses and the verdict.
@@ -162,11 +160,11 @@ def document(
     uncorrected : Uncorrected
         Effects in time that compensation does not correct; their centres are included in the
         values.
-    tested : names, optional
+    tested : names
         Parameters that are replaced by a likelihood-ratio test.
-    absent : sensors, optional
+    absent : sensors
         Sensors without readings.
-    readings : RawReadings, optional
+    readings : RawReadings or None
         Units and axes of the recording; None: SI, axes not stated.
 
     """
@@ -195,7 +193,7 @@ def document(
         statistics=all_statistics,
         conditions=conditions(gathered, gravity),
         provenance={'software': imu_calibration.__version__, **(provenance or {})},
-        proof=proof or {},
+        proof=proof,
         covariance_terms={name: np.diag(term) for name, term in terms.items()},
         held_reason=reasons_held(
             solution.held, solution.param_names, solution.replaced, tested=tested

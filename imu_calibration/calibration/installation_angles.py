@@ -6,6 +6,7 @@ They are in the units of the papers as well.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -151,13 +152,22 @@ def _between_sd(
     return float(np.sqrt(slope @ covariance @ slope) / sine)
 
 
+class PaperValues(NamedTuple):
+    """Three values of a sensor in the unit of the source papers."""
+
+    quantity: str
+    unit: str
+    values: np.ndarray
+    """Shape (3,)."""
+    sds: np.ndarray
+    """Standard deviations of the values, shape (3,)."""
+
+
 def in_paper_units(
     derived: Derived, nominal: RawReadings | Mapping | None = None
-) -> tuple[tuple[str, str, np.ndarray, np.ndarray], ...]:
+) -> tuple[PaperValues, ...]:
     """
     Return scale factors and biases in the units of the source papers.
-
-    As (quantity, unit, values (3,), sds (3,)).
 
     Accelerometers: V/g and V for a recording in volts (`nominal` given), else g/g and mg.
     Gyroscopes: V/(deg/s) and V, else the plain ratio and deg/s.
@@ -175,21 +185,19 @@ def in_paper_units(
     if nominal is None:
         bias_factor, unit = (1e3 / STANDARD_GRAVITY, 'mg') if accelerometer else (1 / DEG, 'deg/s')
         return (
-            ('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd),
-            ('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor),
+            PaperValues('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd),
+            PaperValues('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor),
         )
     nominal = nominal if isinstance(nominal, RawReadings) else RawReadings.of_scales(**nominal)
-    stated = nominal.gyroscope
-    if accelerometer:
-        stated = nominal.accelerometer
+    stated = nominal.accelerometer if accelerometer else nominal.gyroscope
     offset = np.asarray(stated.offset)
     per_si = np.asarray(stated.scale)
     return (
-        (
+        PaperValues(
             'scale factor',
             f'V/{name}',
             derived.scale * per_si * size,
             derived.scale_sd * abs(per_si) * size,
         ),
-        ('bias', 'V', offset + derived.bias * per_si, derived.bias_sd * abs(per_si)),
+        PaperValues('bias', 'V', offset + derived.bias * per_si, derived.bias_sd * abs(per_si)),
     )

@@ -9,7 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.diagnosis_result import residual_mapping
+from imu_calibration.calibration.diagnosis.diagnosis_result import (
+    ParameterEstimate,
+    residual_mapping,
+)
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import beyond_lines
 from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
@@ -248,6 +251,7 @@ def test_rounding_replaces_nothing_and_neither_does_what_makes_another_lag_negat
 @pytest.mark.parametrize('after, words', [(1.0, 'falls by 50 %'), (1.9998, 'falls by 0.01 %')])
 def test_a_small_gain_is_not_told_as_none(after, words):
     gain = Gain('accelerometer', 'samples', 2.0, after, (0.0, 0.6), 5)
-    assert sentence(
-        FIRST.effect, {'accelerometer.accel_quadratic.x': (1e-5, 1e-6, '(m/s^2)^-1')}, gain
-    ).endswith(f'{words}.')
+    estimate = ParameterEstimate(1e-5, 1e-6, '(m/s^2)^-1')
+    assert sentence(FIRST.effect, {'accelerometer.accel_quadratic.x': estimate}, gain).endswith(
+        f'{words}.'
+    )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from papers import zhang2017 as zhang
 
+from imu_calibration.calibration.diagnosis.diagnosis_result import ParameterEstimate
 from imu_calibration.calibration.diagnosis.findings import sentence
 from imu_calibration.calibration.installation_angles import (
     AXIS_PAIRS,
@@ -140,8 +141,9 @@ def test_the_unit_of_a_parameter_depends_on_its_sensor():
         tolerance=1e-5,
         text='Scale by force.',
     )
+    estimate = ParameterEstimate(1e-3, 1e-5, '(m/s^2)^-1')
     for text in (
-        sentence(force, {'gyroscope.scale_by_force.x': (1e-3, 1e-5, '(m/s^2)^-1')}, None),
+        sentence(force, {'gyroscope.scale_by_force.x': estimate}, None),
         people(1e-3, 1e-5, '(m/s^2)^-1', quantity='gyroscope.scale_by_force.x')[2],
     ):
         assert '% per g' in text and 'mg' not in text

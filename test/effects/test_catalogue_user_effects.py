@@ -16,6 +16,7 @@ import pytest
 from refusal import refused
 
 from imu_calibration.api.calibrate import calibrate_recordings
+from imu_calibration.calibration.diagnosis.diagnosis_result import ParameterEstimate
 from imu_calibration.calibration.diagnosis.findings import sentence
 from imu_calibration.cli.main import main
 from imu_calibration.core import documents
@@ -162,7 +163,9 @@ def test_what_is_said_of_it_is_a_sentence(text, shown):
         'mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text=text
     )
     assert (
-        sentence(effect, {'gyroscope.mine.x': (2.7902e-4, 3.1e-7, 'strange')}, None)
+        sentence(
+            effect, {'gyroscope.mine.x': ParameterEstimate(2.7902e-4, 3.1e-7, 'strange')}, None
+        )
         == f'{shown} Its size is 0.00027902 +- 0.00000031 strange.'
     )
 
@@ -182,7 +185,7 @@ def test_what_cannot_be_told_from_another_is_no_size(z_of_y, said):
     """
     effect = term('mine', sensor='gyroscope', column='w_x', unit='1', tolerance=1e-6, text='Mine.')
     values = {
-        f'gyroscope.mine.{axis}': (value, sd, 'strange')
+        f'gyroscope.mine.{axis}': ParameterEstimate(value, sd, 'strange')
         for axis, value, sd in zip('xyz', (40.0, z_of_y, 0.1), (90.0, 1.0, 3.0))
     }
     assert said in sentence(effect, values, None)

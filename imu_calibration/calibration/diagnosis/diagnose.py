@@ -145,11 +145,12 @@ def helpful_formulas(
         if after.after > CLEARLY_BETTER * before.after:
             continue
         # A formula of one motion may harm in another one.
-        is_larger_in_a_regime = False
-        for name, errors in after.regimes.items():
-            if name in before.regimes and errors.after > HARM * before.regimes[name].after:
-                is_larger_in_a_regime = True
-        if not is_larger_in_a_regime:
+        harmed_regimes = [
+            name
+            for name, errors in after.regimes.items()
+            if name in before.regimes and errors.after > HARM * before.regimes[name].after
+        ]
+        if not harmed_regimes:
             helpful.append(effect)
     return helpful
 
@@ -195,12 +196,10 @@ def _with_proposals(
 
     # A formula determines changes of the output, not its zero: the biases of the affected axes may
     # still contain the residual, and keep this uncertainty.
-    bias_changes = []
-    for change in biases_off(model, extension.diagnosis.unexplained):
-        bias_changes.append((change, 1.0))
-    widened = ModelExtension(moves=tuple(bias_changes)).applied(solved.solution)
+    bias_changes = biases_off(model, extension.diagnosis.unexplained)
+    widened = ModelExtension(moves=tuple((change, 1.0) for change in bias_changes))
     return conclude(
-        replace(solved, solution=widened),
+        replace(solved, solution=widened.applied(solved.solution)),
         options,
         provenance=extension.provenance,
         under_test={effect.sensor for effect in effects},

@@ -1,7 +1,7 @@
 """Result of a diagnosis: findings, candidates, solutions, residuals."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,14 @@ from imu_calibration.selection.stamp_jitter import NO_JITTER, StampJitter
 from imu_calibration.selection.unexplained import Unexplained
 
 
+class ParameterEstimate(NamedTuple):
+    """Estimate of one parameter, SI."""
+
+    value: float
+    sd: float
+    unit: str
+
+
 @dataclass(frozen=True, eq=False)
 class Finding:
     """One effect that is missing in the model."""
@@ -24,8 +32,8 @@ class Finding:
     """'accelerometer', 'gyroscope' or 'reference'."""
     explanation: str
     """One sentence for a test engineer, with the size."""
-    parameters: dict
-    """Parameter name -> (value, sd, unit), SI, from all windows."""
+    parameters: dict[str, ParameterEstimate]
+    """Parameter name -> its estimate from all windows."""
     p_value: float
     """
     Probability of such a decrease of the misfit from noise, times the number of effects under test.
@@ -125,17 +133,15 @@ class Diagnosis:
         return self.solution.model.at(self.solution.values)
 
 
-def parameters_of(
-    solution: Solution, sensor: str, effect: str
-) -> dict[str, tuple[float, float, str]]:
-    """Return parameter name -> (value, sd, unit) of one effect."""
+def parameters_of(solution: Solution, sensor: str, effect: str) -> dict[str, ParameterEstimate]:
+    """Return parameter name -> its estimate, of one effect."""
     declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
     part = solution.model.slices[sensor, effect]
     values = solution.values[part]
     sds = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
     parameters = {}
     for k, name in enumerate(declared.param_names()):
-        parameters[name] = (float(values[k]), float(sds[k]), declared.unit_of(k))
+        parameters[name] = ParameterEstimate(float(values[k]), float(sds[k]), declared.unit_of(k))
     return parameters
 
 
@@ -206,9 +212,7 @@ def _baseline(solution: Solution, sensor: str) -> dict[str, Any]:
 
 def _finding(finding: Finding) -> dict[str, Any]:
     """Return a finding as plain data."""
-    parameters = {}
-    for name, (value, sd, unit) in finding.parameters.items():
-        parameters[name] = {'value': value, 'sd': sd, 'unit': unit}
+    parameters = {name: entry._asdict() for name, entry in finding.parameters.items()}
     sizes_of_mates: dict[str, dict[str, Any]] = {}
     for mate, sizes in finding.sizes_of_mates.items():
         sizes_of_mates[mate] = {}

@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
     Finding,
+    ParameterEstimate,
     parameters_of,
 )
 from imu_calibration.core.units import for_people, with_sd
@@ -44,7 +45,7 @@ UNCERTAIN = 'refused: none of its coefficients is significant in the calibration
 
 def sentence(
     effect: Effect,
-    parameters: dict[str, tuple[float, float, str]],
+    parameters: dict[str, ParameterEstimate],
     gain: Gain | None,
     *,
     n_clipped: int | None = None,
@@ -56,21 +57,22 @@ def sentence(
     ----------
     effect : Effect
     parameters : dict
-        Name -> (value, sd, unit).
+        Name -> estimate; the moment or the time constant comes last.
     gain : Gain or None
     n_clipped : int, optional
         Samples at a limit.
 
     """
-    # (name, value, sd, unit) of each parameter, the moment or time constant last.
-    entries = [(name.split('.')[-1], *entry) for name, entry in parameters.items()]
-    amplitudes = effect.amplitudes(entries)
+    amplitudes = effect.amplitudes(list(parameters))  # names
     # The largest is the size. A parameter that is collinear with another, such as the bias, is not.
-    significant = [entry for entry in amplitudes if abs(entry[1]) > 2 * entry[2]]
-    label, value, sd, unit = max(significant or amplitudes, key=lambda entry: abs(entry[1]))
+    significant = [
+        name for name in amplitudes if abs(parameters[name].value) > 2 * parameters[name].sd
+    ]
+    largest = max(significant or amplitudes, key=lambda name: abs(parameters[name].value))
+    value, sd, unit = parameters[largest]
     factor, unit = for_people(unit, effect.sensor)
     size = _with_unit(' +- '.join(with_sd(value * factor, sd * factor)), unit)
-    if not significant and len(entries) > 1:
+    if not significant and len(parameters) > 1:
         size = f'known here in combinations only, none of its values by itself: {size}'
     if n_clipped is not None:
         limit = _with_unit(f'{value * factor:.4g}', unit)
@@ -78,8 +80,9 @@ def sentence(
             f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and neighbouring'
             ' samples were excluded.'
         )
-    which = '' if len(amplitudes) == 1 else f' (largest: {label})'
-    when = f' at {entries[-1][1]:.1f} s' if effect.located else ''
+    which = '' if len(amplitudes) == 1 else f' (largest: {largest.split(".")[-1]})'
+    *_, last = parameters.values()
+    when = f' at {last.value:.1f} s' if effect.located else ''
     text = f'{effect.explanation} Its size is {size}{which}{when}.'
     if gain is not None and gain.reduction > 0:
         text += (
@@ -259,11 +262,10 @@ def finding(
             mates.append(mate)
     sizes_of_mates = {}
     for mate in mates:
-        sizes = {}
         estimates = fitted(search, with_exchanged(named, place, mate), mate)
-        for name, (value, _, unit) in estimates.items():
-            sizes[name] = (value, unit)
-        sizes_of_mates[mate.name] = sizes
+        sizes_of_mates[mate.name] = {
+            name: (estimate.value, estimate.unit) for name, estimate in estimates.items()
+        }
     return Finding(
         question.name,
         question.sensor,
@@ -283,12 +285,12 @@ def finding(
 
 def fitted(
     search: Search, named: Sequence[Question], question: Question
-) -> dict[str, tuple[float, float, str]]:
-    """
-    Return parameter name -> (value, sd, unit) of an effect, fitted with the choice `named`.
-    """
+) -> dict[str, ParameterEstimate]:
+    """Return parameter name -> its estimate, of an effect, fitted with the choice `named`."""
     values, sds = search.estimate(named, question)
     parameters = {}
     for k, name in enumerate(question.effect.param_names()[: len(values)]):
-        parameters[name] = (float(values[k]), float(sds[k]), question.effect.unit_of(k))
+        parameters[name] = ParameterEstimate(
+            float(values[k]), float(sds[k]), question.effect.unit_of(k)
+        )
     return parameters

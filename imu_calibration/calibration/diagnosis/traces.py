@@ -6,6 +6,7 @@ Residuals over short blocks, segments, residual power and dead reckoning.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,30 @@ LOWEST_DECADE, HIGHEST_DECADE = -2, 5
 BAND_EDGES = 10.0 ** np.linspace(
     LOWEST_DECADE, HIGHEST_DECADE, (HIGHEST_DECADE - LOWEST_DECADE) * PER_DECADE + 1
 )
+
+
+class BandResidual(NamedTuple):
+    """Residual of one sensor in a frequency band, m/s^2 or rad/s."""
+
+    name: str
+    rms: np.ndarray
+    """
+    Beyond noise, before and after: ``sqrt(max(mean square of the residual - mean square of the
+    noise, 0))``, shape (2, 3).
+    """
+    noise: np.ndarray
+    """Rms of the noise, shape (3,)."""
+
+
+class Spectrum(NamedTuple):
+    """Amplitude densities of one sensor, per sqrt(Hz)."""
+
+    frequency: np.ndarray
+    """Middles of the bands, Hz, shape (k,)."""
+    residual: np.ndarray
+    """Density of the residual before and after, shape (2, k, 3)."""
+    noise: np.ndarray
+    """Density of the noise, shape (k, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +69,13 @@ class Distance:
     gains: dict[str, Gain]
     """Measure of a held-out gain -> the same gain on all windows, all axes and noise included."""
 
-    def bands(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    def bands(self) -> list[BandResidual]:
         """
-        Return (band, rms beyond noise, rms of the noise) of the window means and of each decade.
+        Return the residual of the window means, and of each decade.
 
-        The rms beyond noise, before and after, is ``sqrt(max(mean square of the residual - mean
-        square of the noise, 0))``, shape (2, 3); that of the noise has the shape (3,), both in
-        m/s^2 or rad/s. Decades end at the last edge below the Nyquist frequency.
+        Decades end at the last edge below the Nyquist frequency.
         """
-        mean_squares = [('window means', self.means, self.means_noise)]
+        bands = [_band_residual('window means', self.means, self.means_noise)]
         decade = np.floor(np.log10(self.edges[:-1]) + 1e-9).astype(int)
         for exponent in np.unique(decade):
             in_decade = decade == exponent
@@ -61,26 +84,23 @@ class Distance:
                 highest = self.edges[1:][in_decade].max()
                 power = self.power[:, in_decade].sum(axis=1)
                 noise = self.noise[in_decade].sum(axis=0)
-                mean_squares.append((f'{10.0**exponent:g} to {highest:.3g} Hz', power, noise))
-        return [
-            (name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise))
-            for name, power, noise in mean_squares
-        ]
+                name = f'{10.0**exponent:g} to {highest:.3g} Hz'
+                bands.append(_band_residual(name, power, noise))
+        return bands
 
-    def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def density(self) -> Spectrum:
         """
-        Return (frequency, amplitude density of the residual, amplitude density of the noise).
+        Return the amplitude densities of residual and noise.
 
-        The shapes are (k,), (2, k, 3) and (k, 3). The densities are per sqrt(Hz). Bands without
-        data and the last one, within which the Nyquist frequency is, are omitted.
+        Bands without data and the last one, within which the Nyquist frequency is, are omitted.
         """
         is_used = self.power[0].any(axis=1)
         is_used[-1] = False
         width = np.diff(self.edges)[is_used, None]
-        return (
-            np.sqrt(self.edges[:-1] * self.edges[1:])[is_used],
-            np.sqrt(self.power[:, is_used] / width),
-            np.sqrt(self.noise[is_used] / width),
+        return Spectrum(
+            frequency=np.sqrt(self.edges[:-1] * self.edges[1:])[is_used],
+            residual=np.sqrt(self.power[:, is_used] / width),
+            noise=np.sqrt(self.noise[is_used] / width),
         )
 
     def to_mapping(self) -> dict:
@@ -103,6 +123,22 @@ class Distance:
         return {'bands': bands, 'reduction': reduction}
 
 
+def _band_residual(name: str, power: np.ndarray, noise: np.ndarray) -> BandResidual:
+    """Return the residual of a band from mean squares of residual, (2, 3), and noise, (3,)."""
+    return BandResidual(name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise))
+
+
+class _WindowSquares(NamedTuple):
+    """Squares of the residual of one sensor in one window, before and after."""
+
+    n_samples: int
+    at_rest: bool
+    within: np.ndarray
+    """Sum of squares without the mean, shape (2,)."""
+    mean: np.ndarray
+    """Square of the mean, shape (2,)."""
+
+
 class DistanceSums:
     """Accumulates the residual power of windows; memory does not grow with the recording."""
 
@@ -116,9 +152,7 @@ class DistanceSums:
         self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
         # Sums of the noise variance of window means.
         self._noise = {sensor: np.zeros(3) for sensor in SENSORS}
-        # For each window: number of samples, whether it is at rest, then before and after the sum
-        # of squares within it and the square of its mean.
-        self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
+        self._windows: dict[str, list[_WindowSquares]] = {sensor: [] for sensor in SENSORS}
         # Degrees of freedom by band, of all windows and of windows at rest.
         self._freedom = np.zeros((2, count))
         self._n_samples = 0
@@ -152,7 +186,7 @@ class DistanceSums:
         self._n_windows += 1
         for sensor, sensor_noise in noise.items():
             self._noise[sensor] += sensor_noise.low_variance / n
-            row = [n, at_rest]
+            of_window = _WindowSquares(n, at_rest, within=np.zeros(2), mean=np.zeros(2))
             for k, residual_of in enumerate(residuals):  # before, after
                 residual = residual_of[sensor]
                 mean = residual.mean(axis=0)
@@ -162,18 +196,19 @@ class DistanceSums:
                 )
                 self._power[sensor][k] += power
                 self._means[sensor][k] += mean**2
-                row += [power.sum(), mean @ mean]
+                of_window.within[k] = power.sum()
+                of_window.mean[k] = mean @ mean
                 if at_rest and k == len(residuals) - 1:
                     self._rest_power[sensor] += power
-            self._rows[sensor].append(row)
+            self._windows[sensor].append(of_window)
 
     def distances(self) -> dict[str, Distance]:
         """Return sensor -> Distance of the windows up to now."""
         # Up to the upper edge of the highest band with data.
         n_edges = int(np.max(np.flatnonzero(self._freedom[0]), initial=0)) + 2
         distances = {}
-        for sensor, rows in self._rows.items():
-            if rows:
+        for sensor, windows in self._windows.items():
+            if windows:
                 distances[sensor] = self._distance(sensor, n_edges)
         return distances
 
@@ -198,15 +233,18 @@ class DistanceSums:
 
     def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
         """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
-        n, at_rest, *squares = np.array(self._rows[sensor]).T
-        is_at_rest = at_rest > 0
+        windows = self._windows[sensor]
+        n = np.array([window.n_samples for window in windows], float)
+        at_rest = np.array([window.at_rest for window in windows])
         # For before and after: (sums of squares, numbers of values) of each window.
         samples, means, within_windows, means_at_rest = [], [], [], []
-        for within, mean in (squares[:2], squares[2:]):
+        for k in range(2):
+            within = np.array([window.within[k] for window in windows])
+            mean = np.array([window.mean[k] for window in windows])
             samples.append((within + n * mean, 3 * n))
-            means.append((mean, 0 * n + 3))
+            means.append((mean, np.full(len(n), 3.0)))
             within_windows.append((within, 3 * (n - 1)))
-            means_at_rest.append((mean[is_at_rest], 3 + 0 * mean[is_at_rest]))
+            means_at_rest.append((mean[at_rest], np.full(at_rest.sum(), 3.0)))
         gains = {}
         for measure, pair in zip(MEASURES, (samples, means, within_windows, means_at_rest)):
             gains[measure] = gain_of(sensor, measure, pair, of=of)
