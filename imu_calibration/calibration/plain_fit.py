@@ -190,13 +190,13 @@ def plan_of(solution: Solution, sensor: str, reference: np.ndarray) -> PlainEsti
     fitted = np.zeros(len(reference), bool)
     dropped = []
     for effect in model.effects:
-        part = model.slices[effect.key]
+        parameters = model.slices[effect.key]
         if effect.sensor != sensor:
             continue
         if effect.role in FITTED:
-            replaced[part] = fitted[part] = True
+            replaced[parameters] = fitted[parameters] = True
         elif effect.role is not Role.LIMIT and not is_of_reference(effect):
-            replaced[part] = True
+            replaced[parameters] = True
             dropped.append(effect.name)
     # Entries without information keep their values; weak ones at their prior are estimated.
     uninformed = solution.held & ~np.isin(solution.param_names, solution.replaced)

@@ -350,8 +350,10 @@ def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     for effect in calibration.model.effects:
         if effect.sensor in calibration.absent:
             continue
-        part = calibration.model.slices[effect.key]
-        for k, index in enumerate(range(part.start, part.stop)):  # of the effect, of the model
+        parameters = calibration.model.slices[effect.key]
+        for k, index in enumerate(
+            range(parameters.start, parameters.stop)
+        ):  # of the effect, of the model
             factor, unit = for_people(effect.unit_of(k), calibration.param_names[index])
             value, sd = with_sd(
                 calibration.values[index] * factor, calibration.own_sd[index] * factor
@@ -392,11 +394,11 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     status = [calibration.status[index] for index in indices]
     for effect in reduced.effects:
         if effect.sensor in sensors and effect.role is not Role.LIMIT:
-            part = reduced.slices[effect.key]
-            values[part] = effect.prior_values()
-            status[part] = [HELD] * effect.size
-            covariance[part, :] = covariance[:, part] = 0.0
-            covariance[part, part] = np.diag(effect.prior_sds() ** 2)
+            parameters = reduced.slices[effect.key]
+            values[parameters] = effect.prior_values()
+            status[parameters] = [HELD] * effect.size
+            covariance[parameters, :] = covariance[:, parameters] = 0.0
+            covariance[parameters, parameters] = np.diag(effect.prior_sds() ** 2)
     return replace(
         calibration,
         model=reduced,

@@ -458,11 +458,11 @@ def _section(calibration: Calibration, section: str) -> dict[str, Any]:
     effects = [effect for effect in calibration.model.effects if effect.section == section]
     entries: dict[str, Any] = {'effects': [effect.name for effect in effects]}
     for effect in effects:
-        part = calibration.model.slices[effect.key]
-        status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)
+        parameters = calibration.model.slices[effect.key]
+        status = np.array(calibration.status, dtype=object)[parameters].reshape(effect.shape)
         entry: dict[str, Any] = {
-            'value': plain(calibration.values[part].reshape(effect.shape)),
-            'sd': plain(calibration.own_sd[part].reshape(effect.shape)),
+            'value': plain(calibration.values[parameters].reshape(effect.shape)),
+            'sd': plain(calibration.own_sd[parameters].reshape(effect.shape)),
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit),
             'status': status.tolist(),
         }

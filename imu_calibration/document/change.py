@@ -102,7 +102,7 @@ def changes_since(stored: Proof, proof: Proof) -> tuple[RegimeChange, ...]:
             if not earlier.after > 0.0 or not errors.after > 0.0:
                 continue
             ratio = errors.after / earlier.after
-            spread = np.exp(QUANTILE * np.hypot(_log_sd(earlier), _log_sd(errors)))
+            interval_factor = np.exp(QUANTILE * np.hypot(_log_sd(earlier), _log_sd(errors)))
             changes.append(
                 RegimeChange(
                     sensor,
@@ -110,8 +110,8 @@ def changes_since(stored: Proof, proof: Proof) -> tuple[RegimeChange, ...]:
                     errors.unit,
                     stored=earlier.after,
                     now=errors.after,
-                    low=float(ratio / spread),
-                    high=float(ratio * spread),
+                    low=float(ratio / interval_factor),
+                    high=float(ratio * interval_factor),
                 )
             )
     return tuple(changes)

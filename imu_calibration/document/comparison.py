@@ -39,6 +39,14 @@ class Group(NamedTuple):
     p_value: float
     """Probability of such a distance by chance."""
 
+    @property
+    def text(self) -> str:
+        """The size of the difference."""
+        return (
+            f'{self.name}: differs by {np.sqrt(self.chi2 / self.dof):.1f} combined sd'
+            f' (rms of {self.dof}), chance {self.p_value:.1g}'
+        )
+
 
 @dataclass(frozen=True)
 class Row:
@@ -204,13 +212,13 @@ def _in_other_readings(calibration: Calibration, mat_ts: np.ndarray) -> Calibrat
     for effect in calibration.model.effects:
         if effect.sensor not in SENSORS:
             continue
-        part = calibration.model.slices[effect.key]
+        parameters = calibration.model.slices[effect.key]
         if effect.role is Role.OFFSET:
-            slope[part, part] = mat_ts
+            slope[parameters, parameters] = mat_ts
         elif effect.role in (Role.LINEAR, Role.CROSS):
-            slope[part, part] = np.kron(mat_ts, mat_ts)
+            slope[parameters, parameters] = np.kron(mat_ts, mat_ts)
         elif effect.role is Role.ARMS:
-            slope[part, part] = np.kron(np.abs(mat_ts), mat_ts)
+            slope[parameters, parameters] = np.kron(np.abs(mat_ts), mat_ts)
         else:
             raise InputError(
                 'calibrations with further effects are compared for readings in the same axes,'
@@ -235,12 +243,12 @@ def _turned(model: SensorModel, values: np.ndarray) -> np.ndarray:
     matrix = model.matrix('accelerometer', values)
     _, rotation = lower_times_rotation(matrix)
     for effect in model.effects:
-        part = model.slices[effect.key]
+        parameters = model.slices[effect.key]
         if effect.role is Role.ARMS:
-            arms = values[part].reshape(3, 3)
-            turned[part] = ((arms - arms.mean(axis=0)) @ rotation.T).ravel()
+            arms = values[parameters].reshape(3, 3)
+            turned[parameters] = ((arms - arms.mean(axis=0)) @ rotation.T).ravel()
         elif not effect.input_places:
-            turned[part] = effect.in_other_axes(values[part], rotation)
+            turned[parameters] = effect.in_other_axes(values[parameters], rotation)
     return turned
 
 
@@ -271,10 +279,10 @@ def _with_parts_turned(calibration: Calibration, turn: np.ndarray) -> Calibratio
     slope = np.eye(len(calibration.values))
     for effect in calibration.model.effects:
         if effect.input_places:
-            part = calibration.model.slices[effect.key]
+            parameters = calibration.model.slices[effect.key]
             # The map is linear: its columns are the images of the unit vectors.
             columns = [effect.in_other_axes(unit, turn) for unit in np.eye(effect.size)]
-            slope[part, part] = np.transpose(columns)
+            slope[parameters, parameters] = np.transpose(columns)
     return replace(
         calibration,
         values=slope @ calibration.values,
@@ -336,9 +344,12 @@ def _compared(
     sd = np.sqrt(np.diag(covariance))
 
     # 2. Parameters that are not compared: not estimated in one of both, or in other axes.
-    not_estimated = np.zeros(len(common), bool)
-    for k, (i, j) in enumerate(zip(index_first, index_second)):
-        not_estimated[k] = first.status[i] in (HELD, FIXED) or second.status[j] in (HELD, FIXED)
+    not_estimated = np.array(
+        [
+            first.status[i] in (HELD, FIXED) or second.status[j] in (HELD, FIXED)
+            for i, j in zip(index_first, index_second)
+        ]
+    )
     in_other_axes = np.array([errors.get(name, 0.0) for name in common]) > sd
     excluded = not_estimated | in_other_axes
 
@@ -376,15 +387,10 @@ def _compared(
     lines = list(notes)
     differences = []
     for group in groups:
-        if group.name not in rejected | rejected_reference:
-            continue
-        text = (
-            f'{group.name}: differs by {np.sqrt(group.chi2 / group.dof):.1f} combined sd'
-            f' (rms of {group.dof}), chance {group.p_value:.1g}'
-        )
-        lines.append(text)
+        if group.name in rejected | rejected_reference:
+            lines.append(group.text)
         if group.name in rejected:
-            differences.append(text)
+            differences.append(group.text)
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
     if rejected & linear and MOUNT_AXES in (first.gauge.get('axes'), second.gauge.get('axes')):
         lines.append(

@@ -171,8 +171,8 @@ def _imitating_sizes(
 
 def _indices(model: SensorModel, key: tuple[str, str]) -> np.ndarray:
     """Return the indexes of the parameters of an effect in its model."""
-    part = model.slices[key]
-    return np.arange(part.start, part.stop)
+    parameters = model.slices[key]
+    return np.arange(parameters.start, parameters.stop)
 
 
 def _places(coordinates: Coordinates, key: tuple[str, str]) -> np.ndarray:

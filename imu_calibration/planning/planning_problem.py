@@ -350,14 +350,16 @@ class PlanningProblem:
             biases = coordinates.model.part(sensor, Role.OFFSET)
             for parameter in range(*biases.indices(n_params)):
                 place = int(np.argmax(np.abs(coordinates.basis[parameter])))
-                bias = 1.0 / prior[place, place]
-                offset = (
+                bias_variance = 1.0 / prior[place, place]
+                offset_variance = (
                     share
                     * common_variance(self.noise[sensor], session)
                     / coordinates.units[parameter] ** 2
                 )
-                total = bias + offset
-                tolerated = (1.0 - bias * offset / total) * (total / bias) ** 2
+                total = bias_variance + offset_variance
+                tolerated = (1.0 - bias_variance * offset_variance / total) * (
+                    total / bias_variance
+                ) ** 2
                 prior[place, place] = 1.0 / total
                 # Without any margin a small number is used: the value of the relaxation then
                 # exceeds any session of interest.

@@ -136,9 +136,9 @@ class Diagnosis:
 def parameters_of(solution: Solution, sensor: str, effect: str) -> dict[str, ParameterEstimate]:
     """Return parameter name -> its estimate, of one effect."""
     declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
-    part = solution.model.slices[sensor, effect]
-    values = solution.values[part]
-    sds = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
+    indices = solution.model.slices[sensor, effect]
+    values = solution.values[indices]
+    sds = np.sqrt(np.maximum(np.diag(solution.covariance)[indices], 0.0))
     parameters = {}
     for k, name in enumerate(declared.param_names()):
         parameters[name] = ParameterEstimate(float(values[k]), float(sds[k]), declared.unit_of(k))

@@ -217,10 +217,12 @@ class DistanceSums:
         n_bands = n_edges - 1
         # Noise of a band: its power per degree of freedom at rest, in the nearest band with data.
         noise = np.zeros((n_bands, 3))
-        known = np.flatnonzero(self._freedom[1])
-        if len(known):
-            density = self._rest_power[sensor][known] / self._freedom[1][known, None]
-            nearest = np.abs(np.arange(n_bands)[:, None] - known).argmin(axis=1)
+        bands_at_rest = np.flatnonzero(self._freedom[1])
+        if len(bands_at_rest):
+            density = (
+                self._rest_power[sensor][bands_at_rest] / self._freedom[1][bands_at_rest, None]
+            )
+            nearest = np.abs(np.arange(n_bands)[:, None] - bands_at_rest).argmin(axis=1)
             noise = density[nearest] * self._freedom[0][:n_bands, None]
         return Distance(
             edges=BAND_EDGES[:n_edges],

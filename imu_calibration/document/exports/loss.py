@@ -373,13 +373,13 @@ def _imported(
     status = np.full(len(values), HELD, dtype=object)
     for effect in model.effects:
         capability = affine.capability_of(effect, holds)
-        part = model.slices[effect.key]
+        parameters = model.slices[effect.key]
         if capability is not None:
-            values[part] = imu.value(capability).ravel()
+            values[parameters] = imu.value(capability).ravel()
             in_file = True
             if capability.own_axis:
                 in_file = np.eye(3).ravel() > 0
-            status[part] = np.where(in_file, WEAK, HELD)
+            status[parameters] = np.where(in_file, WEAK, HELD)
     name = getattr(path, 'name', str(path))
     reason = (
         f'imported from {target.title} ({name}) without uncertainties, its error was not measured'

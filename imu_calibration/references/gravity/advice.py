@@ -164,9 +164,11 @@ def _rotation_slopes(axis: np.ndarray, angle: float) -> np.ndarray:
 
         psi = -integral C(angle - t) dM a dt = -(integral of C from 0 to angle) dM a
     """
-    along = np.outer(axis, axis)
+    projector = np.outer(axis, axis)
     integral = (
-        angle * along + np.sin(angle) * (np.eye(3) - along) - (1 - np.cos(angle)) * skew(axis)
+        angle * projector
+        + np.sin(angle) * (np.eye(3) - projector)
+        - (1 - np.cos(angle)) * skew(axis)
     )
     return -np.einsum('ip,q->ipq', integral, axis).reshape(3, 9)
 
@@ -558,8 +560,8 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     statistics = hand.statistics
     poses = hand.poses
     noise_sd = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
-    known = noise_sd < UNKNOWN_SHARE * model.priors
-    sd_factor = max(1.0, float(np.max(np.where(known, hand.judged_sd / noise_sd, 0.0))))
+    is_determined = noise_sd < UNKNOWN_SHARE * model.priors
+    sd_factor = max(1.0, float(np.max(np.where(is_determined, hand.judged_sd / noise_sd, 0.0))))
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
     turn_sd = max(statistics['turn_scatter_sd'], 1e-4)

@@ -8,13 +8,12 @@ from imu_calibration.calibration.diagnosis.applied_gain import compensated_findi
 from imu_calibration.document.trust import judged_from_of, latest_settling, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.rows import Rows
-from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.held_out_poses import (
     corrected_with,
     end_by_hand,
     turn_errors,
 )
-from imu_calibration.references.gravity.model_selection import HandInvestigation
+from imu_calibration.references.gravity.model_selection import ExtendedBaseline, HandInvestigation
 from imu_calibration.references.rows.row_search import gain_of_groups
 from imu_calibration.selection.gain import APPLIED, Gain
 from imu_calibration.selection.questions import Question
@@ -45,14 +44,15 @@ def gain_by_hand(
     # Each part of the recording is predicted by a fit to the other parts.
     settled_from = 0.0
     for part in search.held_out:
-        is_held_out = np.isin(block.group, part.groups)
+        rows = np.flatnonzero(np.isin(block.group, part.groups))
         for errors, chosen in (
             (errors_before, compensated.before),
             (errors_after, compensated.after),
         ):
             additional = part.named_in(chosen)
-            model, values, earth = search.extended(part.problem, additional)
-            linearised = model.model.at(values)
+            extended = search.extended(part.problem, additional)
+            values = extended.values
+            linearised = extended.model.model.at(values)
             sd = sd_of_chosen(part.problem.search, linearised, additional)
             latest = latest_settling(linearised, values, sd)
             settled_from = max(settled_from, judged_from_of(latest, end))
@@ -62,8 +62,7 @@ def gain_by_hand(
                 linearised, values, poses.time, end=end, latest=latest
             )
             applied = applied_values(linearised, values, uncorrected.centre)
-            rows = np.flatnonzero(is_held_out)
-            errors[is_held_out] = _pose_errors(search, block, rows, model, applied, earth)
+            errors[rows] = _pose_errors(search, block, rows, extended._replace(values=applied))
 
     # Only rows after the effects of both choices have settled.
     settled = block.time >= settled_from
@@ -72,19 +71,16 @@ def gain_by_hand(
 
 
 def _pose_errors(
-    search: HandInvestigation,
-    block: Rows,
-    rows: np.ndarray,
-    model: HandModel,
-    values: np.ndarray,
-    earth: float,
+    search: HandInvestigation, block: Rows, rows: np.ndarray, extended: ExtendedBaseline
 ) -> np.ndarray:
     """
-    Return the errors of rows of a block after correction with the parameters `values` of a model.
+    Return the errors of rows of a block after correction with the parameters of a model.
 
-    They are those of poses in m/s^2 or rad/s, with the Earth's rate `earth` about the vertical, of
-    turns the angle over the duration in rad/s. `rows`: indices, shape (m,).
+    They are those of poses in m/s^2 or rad/s, with the Earth's rate about the vertical, of turns
+    the angle over the duration in rad/s. `rows`: indices, shape (m,).
     """
+    model = extended.model
+    values = extended.values
     poses = search.baseline.poses
     if block.duration is not None:
         angles = turn_errors(model, values, poses, turns=[search.turns[row] for row in rows])
@@ -97,4 +93,4 @@ def _pose_errors(
     norm = np.linalg.norm(corrected.force, axis=1, keepdims=True)
     if block.sensor == 'accelerometer':
         return norm - search.baseline.gravity
-    return corrected.rate - earth * corrected.force / norm
+    return corrected.rate - extended.earth_rate * corrected.force / norm

@@ -73,7 +73,7 @@ def _powers(time: np.ndarray, freedom: int) -> np.ndarray:
 
 
 def _movement_of_norms(
-    time: np.ndarray, residual: np.ndarray, base: np.ndarray
+    time: np.ndarray, residual: np.ndarray, linear_columns: np.ndarray
 ) -> BiasMovement | None:
     """
     Return the drift of the accelerometer's bias, or None where it is not significant.
@@ -87,17 +87,17 @@ def _movement_of_norms(
         Times of the poses, in units of the time from the first to the last.
     residual : array, shape (k,)
         ``|true force| - gravity``, m/s^2.
-    base : array, shape (k, n_base)
+    linear_columns : array, shape (k, n_linear)
         Columns of bias (first three) and matrix.
 
     """
-    n_base = base.shape[1]
-    powers = _powers(time, len(time) - n_base - 3)
-    drift_columns = [power[:, None] * base[:, 0:3] for power in powers.T]
-    columns = np.hstack([base, *drift_columns])
+    n_linear = linear_columns.shape[1]
+    powers = _powers(time, len(time) - n_linear - 3)
+    drift_columns = [power[:, None] * linear_columns[:, 0:3] for power in powers.T]
+    columns = np.hstack([linear_columns, *drift_columns])
 
     # F test of the drift, on the columns that are independent.
-    basis_before = orthonormal_basis(base)
+    basis_before = orthonormal_basis(linear_columns)
     basis_after = orthonormal_basis(columns)
     spare = len(time) - basis_after.shape[1]
     square_before = np.sum((residual - basis_before @ (basis_before.T @ residual)) ** 2)
@@ -109,9 +109,9 @@ def _movement_of_norms(
         return None
 
     # Growth of the sds of bias and matrix when the drift is estimated too.
-    drift = np.linalg.lstsq(columns, residual, rcond=1e-9)[0][n_base:].reshape(-1, 3)
-    variance_before = np.diag(np.linalg.pinv(base.T @ base))
-    variance_after = np.diag(np.linalg.pinv(columns.T @ columns))[:n_base]
+    drift = np.linalg.lstsq(columns, residual, rcond=1e-9)[0][n_linear:].reshape(-1, 3)
+    variance_before = np.diag(np.linalg.pinv(linear_columns.T @ linear_columns))
+    variance_after = np.diag(np.linalg.pinv(columns.T @ columns))[:n_linear]
     growth = variance_after / np.maximum(variance_before, 1e-300)
     return BiasMovement(powers @ drift, np.sqrt(np.maximum(growth, 1.0)))
 

@@ -136,8 +136,8 @@ class State:
 def tangent(up: np.ndarray) -> np.ndarray:
     """Return two unit vectors orthogonal to each row of `up`, shape (k, 3, 2)."""
     helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
-    one = unit_rows(cross(up.T, helper.T).T)
-    return np.stack([one, cross(up.T, one.T).T], axis=2)
+    first = unit_rows(cross(up.T, helper.T).T)
+    return np.stack([first, cross(up.T, first.T).T], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -249,8 +249,10 @@ def values_without(
         is_held_out = np.append(out, False)
         is_out = is_held_out[system.group] | is_held_out[system.end_group]
         factor = triangular_of_band(rows[~is_out])[system.n_nuisances :, system.n_nuisances :]
-        kept = np.concatenate([factor, prior])
-        values_of_folds.append(after_one_step(hand.values, kept[:, :-1], kept[:, -1], free=free))
+        remaining = np.concatenate([factor, prior])
+        values_of_folds.append(
+            after_one_step(hand.values, remaining[:, :-1], remaining[:, -1], free=free)
+        )
     return values_of_folds
 
 

@@ -174,11 +174,13 @@ def _norm_block(
     """
     poses = hand.poses
     count = len(poses)
-    residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
+    residual, baseline_columns = hand.hand_model.norm_rows(
+        hand.values, poses.force, **poses.conditions
+    )
     # The derivative of the norm by the reading is, but for the sign, the column of the bias.
-    by_reading = base[:, 0:3]
+    by_reading = baseline_columns[:, 0:3]
     rows = np.zeros((count, space.size + 1))
-    rows[:, : base.shape[1]] = base
+    rows[:, : baseline_columns.shape[1]] = baseline_columns
     rows[:, -1] = residual
     for label, columns in at_rest.items():
         rows[:, space.parts[label]] = np.einsum('ki,kip->kp', by_reading, columns)
@@ -205,10 +207,10 @@ def _rest_block(
     """
     poses = hand.poses
     count = len(poses)
-    residual, base = hand.rate_rows()
-    earth = base.shape[2]
+    residual, baseline_columns = hand.rate_rows()
+    earth = baseline_columns.shape[2]
     rows = np.zeros((count, 3, space.size + 1))
-    rows[:, :, :earth] = base
+    rows[:, :, :earth] = baseline_columns
     rows[:, :, earth] = hand.state.up
     rows[:, :, -1] = residual
     for label, columns in at_rest.items():

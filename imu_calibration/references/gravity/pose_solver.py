@@ -72,7 +72,7 @@ def solve_joint(
         GravityRows(model, poses, turns),
         first_state(model, poses),
         fallback=np.square(SCATTER_SD),
-        withheld=model.held,
+        always_held=model.held,
     )
     # Its memory has the turns as integrated at the estimate, none from earlier steps.
     reference = GravityRows(model, poses, turns)
@@ -279,14 +279,14 @@ def possible_turns(
 
     If the recorder paused during a turn, the integrated rates miss a part of it.
     """
-    kept = []
+    matching = []
     for turn in turns:
         if turn.rotation is None:
             missed = missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3))
             if missed >= CONTRADICTED:
                 continue
-        kept.append(turn)
-    return kept, len(turns) - len(kept)
+        matching.append(turn)
+    return matching, len(turns) - len(matching)
 
 
 @dataclass(frozen=True, eq=False)

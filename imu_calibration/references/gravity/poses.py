@@ -205,7 +205,7 @@ def distinct_attitudes(force: np.ndarray) -> int:
     """
     distinct = []
     for direction in unit_rows(force):
-        angles = [np.arccos(np.clip(direction @ known, -1, 1)) for known in distinct]
+        angles = [np.arccos(np.clip(direction @ other, -1, 1)) for other in distinct]
         if all(angle > ATTITUDES_APART for angle in angles):
             distinct.append(direction)
     return len(distinct)
@@ -347,13 +347,14 @@ def _at_end(signed: Callable, axes: np.ndarray, is_new: np.ndarray) -> np.ndarra
         False for repeated readings.
 
     """
+    # The largest readings of all axes, and the step of the converter: their smallest difference.
     largest = np.concatenate([_largest(signed, axis, is_new) for axis in axes])
     largest = np.sort(largest)[-MAX_RANGE_READINGS:]
     extreme = largest[-1]
     step = np.diff(largest)
     step = step[step > 1e-9 * np.abs(extreme)].min(initial=np.inf)
 
-    # Two's complement: one end is larger by a step.
+    # Readings at the extreme. Two's complement: one end is larger by a step.
     margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step
     margin = min(margin, 1e-4 * np.abs(extreme))
     at_extreme = np.logical_or.reduce([signed(axis) >= extreme - margin for axis in axes])
@@ -361,6 +362,7 @@ def _at_end(signed: Callable, axes: np.ndarray, is_new: np.ndarray) -> np.ndarra
     if len(below) < TOP:
         return np.zeros(len(is_new), bool)
 
+    # Readings expected there by chance, and the ones that are there.
     n_by_chance = 0.0
     if np.isfinite(step):
         n_by_chance = TOP * (margin + 0.5 * step) / (extreme - below[0])
@@ -408,8 +410,8 @@ def known_turn_data(
     error of the axis times the angle.
     """
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
-    along = np.outer(axis, axis)
-    cov = KNOWN_TURN_SD**2 * along + (turn.angle * KNOWN_TURN_SD) ** 2 * (np.eye(3) - along)
+    projector = np.outer(axis, axis)
+    cov = KNOWN_TURN_SD**2 * projector + (turn.angle * KNOWN_TURN_SD) ** 2 * (np.eye(3) - projector)
     piece = slice(turn.start, turn.stop)
     density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
     noise_variance = density * (time[piece][-1] - time[piece][0])
@@ -514,9 +516,9 @@ def rising(time: np.ndarray) -> np.ndarray:
         return time
     number = np.arange(len(time))
     is_later = np.concatenate([[True], np.diff(time) > 0])
-    spread = np.interp(number, np.flatnonzero(is_later), time[is_later])
+    even = np.interp(number, np.flatnonzero(is_later), time[is_later])
     # Equal stamps at the end have no following step: each sample is a nanosecond later.
-    return spread + 1e-9 * number
+    return even + 1e-9 * number
 
 
 def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> float:

@@ -57,7 +57,7 @@ class RowReference(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RowEstimate:
-    """Joint estimate."""
+    """Joint estimate of parameters, nuisances and scatter from rows."""
 
     state: Any
     """Parameters and nuisances."""
@@ -80,12 +80,10 @@ def estimate_rows(
     state: Any,
     *,
     fallback: np.ndarray,
-    withheld: np.ndarray | None = None,
+    always_held: np.ndarray | None = None,
 ) -> RowEstimate:
     """
-    Estimate all parameters, the scatter of the components and the nuisances.
-
-    The estimates are from the rows of a reference.
+    Estimate parameters, nuisances and the scatter of the components from the rows of a reference.
 
     Parameters
     ----------
@@ -94,13 +92,13 @@ def estimate_rows(
         Where the first step begins.
     fallback : array, shape (n_components,)
         Variances of the components where the data are too few to estimate them.
-    withheld : array of bool, shape (n,), optional
-        Parameters to hold at their prior in any case.
+    always_held : array of bool, shape (n,), optional
+        Parameters to hold at their prior even if the data determine them; default none.
 
     """
-    adjustable = ~reference.fixed
-    held = np.zeros(len(adjustable), bool) if withheld is None else withheld & adjustable
-    problem = _RowProblem(reference, fallback, held, adjustable, reference.priors)
+    if always_held is None:
+        always_held = np.zeros(len(reference.fixed), bool)
+    problem = _RowProblem(reference, fallback, always_held & ~reference.fixed)
     joint = estimate(problem, _Iterated(state, _known_scatter(fallback)))
     last = joint.state
     return RowEstimate(
@@ -139,16 +137,22 @@ class _RowProblem:
     """Linearises its equations at a state."""
     fallback: np.ndarray
     """Variances of the components where the data are too few, shape (n_components,)."""
-    withheld: np.ndarray
-    """True where a parameter is held in any case, shape (n,)."""
-    adjustable: np.ndarray
-    """False where a convention fixes a parameter, shape (n,)."""
-    prior_sd: np.ndarray
-    """Standard deviations of the parameters before any data, shape (n,)."""
+    always_held: np.ndarray
+    """True where a parameter is held even if the data determine it, shape (n,)."""
+
+    @property
+    def adjustable(self) -> np.ndarray:
+        """False where a convention fixes a parameter, shape (n,)."""
+        return ~self.reference.fixed
+
+    @property
+    def prior_sd(self) -> np.ndarray:
+        """Standard deviations of the parameters before any data, shape (n,)."""
+        return self.reference.priors
 
     def fitted(self, state: _Iterated) -> _Iterated:
         """Return the values of least cost with the priors, and the scatter of the components."""
-        return self._solved(state, self.withheld, self.prior_sd)
+        return self._solved(state, self.always_held, self.prior_sd)
 
     def _solved(self, state: _Iterated, held: np.ndarray, prior_sd: np.ndarray) -> _Iterated:
         """
@@ -163,9 +167,7 @@ class _RowProblem:
         """Return a mask of the parameters that the data alone do not determine."""
         flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * self.prior_sd))
         rows = np.vstack([self.weighted(state).design, flat_prior])
-        return undetermined_parameters(
-            rows, self.prior_sd, free=self.adjustable, held=self.withheld
-        )
+        return undetermined_parameters(rows, self.prior_sd, free=self.adjustable, held=self.always_held)
 
     def holding(self, state: _Iterated, held: np.ndarray) -> _Iterated:
         """Return the values from the data almost without priors, the held ones nominal."""
@@ -216,7 +218,6 @@ class _RowSquares:
     def step(self, at: _Iterated) -> _RowStep:
         """Return the Gauss-Newton step from a state, with the scatter estimated at that state."""
         free = self.free
-        fallback = self.fallback
         # Rows of the reference, of nuisances and free parameters, and rows of the priors.
         distance = self.reference.nominal - at.state.values
         rows = self.reference.linearise(at.state).of_parameters(free)
@@ -226,7 +227,7 @@ class _RowSquares:
         scatter = at.scatter
         before = scatter.variance
         if at.n_steps >= FIRST_STEPS:
-            scatter = estimate_group_variances(rows, start=before, fallback=fallback)
+            scatter = estimate_group_variances(rows, start=before, fallback=self.fallback)
 
         # Weighted least squares: R x = q, from the triangular factor of [design | residual]; |q|
         # is the length of the step.
@@ -236,7 +237,8 @@ class _RowSquares:
         change = np.zeros(rows.n_nuisances + len(free))
         moving = np.append(np.ones(rows.n_nuisances, bool), free)
         change[moving] = scipy.linalg.solve_triangular(factor[:, :-1], right)
-        settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
+        negligible = 1e-4 * np.min(self.fallback)
+        settled = np.allclose(scatter.variance, before, rtol=0.01, atol=negligible)
         return _RowStep(change, float(np.linalg.norm(right)), scatter, settled)
 
     def moved(self, at: _Iterated, step: _RowStep) -> _Iterated:

@@ -205,11 +205,13 @@ class RowEvidence(Evidence):
         With the orthonormal bases N of the added columns and K of `smaller`, the singular values of
         ``N - K K'N`` are the sines of the angles between the two spaces.
         """
-        known = self._basis_of(tuple(smaller))
-        new = orthonormal_basis(np.concatenate(self._white)[:, list(added)], MIN_COLUMN_DIFFERENCE)
-        if not new.shape[1]:
+        basis_of_smaller = self._basis_of(tuple(smaller))
+        added_columns = np.concatenate(self._white)[:, list(added)]
+        basis_of_added = orthonormal_basis(added_columns, MIN_COLUMN_DIFFERENCE)
+        if not basis_of_added.shape[1]:
             return 0
-        sines = np.linalg.svd(new - known @ (known.T @ new), compute_uv=False)
+        imitated = basis_of_smaller @ (basis_of_smaller.T @ basis_of_added)
+        sines = np.linalg.svd(basis_of_added - imitated, compute_uv=False)
         return int(np.sum(sines > MIN_COLUMN_SINE))
 
     def _basis_of(self, used: tuple[int, ...]) -> np.ndarray:

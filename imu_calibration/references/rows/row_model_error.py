@@ -10,7 +10,7 @@ from imu_calibration.references.rows.row_estimate import RowEstimate
 
 
 def model_error_of_rows(
-    rows: Rows, found: RowEstimate, model: SensorModel, *, block: np.ndarray
+    rows: Rows, estimate: RowEstimate, model: SensorModel, *, block: np.ndarray
 ) -> ModelError:
     """
     Return the model error from shifts of the parameters between blocks of rows.
@@ -22,7 +22,7 @@ def model_error_of_rows(
     ----------
     rows : Rows
         At the estimate.
-    found : RowEstimate
+    estimate : RowEstimate
         The estimate from these rows.
     model : SensorModel
         Its parameters are those of the rows.
@@ -31,7 +31,7 @@ def model_error_of_rows(
 
     """
     # Rows of unit variance; F is a basis of the nuisances, and the design has no part along it.
-    white = flat(rows.with_scatter(found.scatter.variance).white())
+    white = flat(rows.with_scatter(estimate.scatter.variance).white())
     nuisances, design, residual = np.split(white, [rows.n_nuisances, white.shape[1] - 1], axis=1)
     basis = scipy.linalg.qr(nuisances, mode='economic')[0]
     design = design - basis @ (basis.T @ design)
@@ -47,8 +47,8 @@ def model_error_of_rows(
     waves = waves_of_blocks(
         np.array(information),
         np.array(gradient),
-        np.zeros((0, len(found.free))),
-        free=found.free,
+        np.zeros((0, len(estimate.free))),
+        free=estimate.free,
         shared=np.array(shared),
     )
     return errors_of_waves(waves, model)[0]

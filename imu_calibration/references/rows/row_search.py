@@ -141,8 +141,8 @@ def choose_effects(problem: RowProblem) -> RowChoice:
 
     """
     tests = RowTests(problem)
-    found = select_findings(tests, problem.search.run())
-    return RowChoice(found.named, found.unstable, tests.held_out)
+    findings = select_findings(tests, problem.search.run())
+    return RowChoice(findings.named, findings.unstable, tests.held_out)
 
 
 @dataclass(eq=False)
