@@ -445,6 +445,7 @@ class Planner:
         problem = self.problem
         start = problem.library.spread[0] if position is None else np.asarray(position, float)
         place = problem.place_near(start)
+        # After an earlier calibration no motion is mandatory.
         first = () if problem.known_information is not None else problem.first_rests(place)
         self.drop_inseparable(longest)
         sequence = self._sequence(place, first, longest)

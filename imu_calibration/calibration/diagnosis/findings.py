@@ -145,7 +145,7 @@ def candidates_of(
             continue
         in_addition = None if name in finding_names else search.score(named, question)
         verdict = _verdict_of(name, alone, in_addition, finding_names=finding_names, mates=mates)
-        if verdict == LEAVES_MOST:
+        if verdict == LEAVES_MOST:  # significant, and no finding: the best known reason
             if name in replaced_names:
                 verdict = REPLACED
             elif agree is not None and not agree([*named, question], question):

@@ -373,8 +373,8 @@ def holds_in_words(target: Target) -> str:
         else:
             name = capability.effect.heading
         name = name.split(' (')[0].split(':')[0]  # without explanations
-        for sensor in SENSORS:  # a heading may begin with its sensor
-            name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
+        # A heading may begin with its sensor.
+        name = name.removeprefix('accel ').removeprefix('gyro ')
         sensors_of.setdefault(name, []).append(capability.sensor)
     parts = []
     for name, sensors in sensors_of.items():

@@ -317,31 +317,37 @@ def without_outlying_poses(
     """
     rows = GravityRows(model, poses, turns, integrated or {}).linearise(estimate.state)
     residual, basis = _whitened(rows, estimate)
-    pose = rows.group
-    # Pose -> number of the turn that begins in it; each has at most one.
-    turn_of = {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
-
     of_poses, of_drifts, of_turns = COMPONENTS
-    outliers: dict[str, tuple[int, ...]] = {}  # kind -> numbers of poses or turns
+    # Kind -> numbers of the poses; a turn has that of the pose in which it begins.
+    outliers: dict[str, tuple[int, ...]] = {}
     for component, kind in enumerate(COMPONENTS):
         of_kind = rows.component == component
-        misfit_of_kind = _misfit(residual[of_kind], basis[of_kind], LEAST_SHARE_OF_KIND)
-        p_values = {}
-        for number in np.unique(pose[of_kind]).tolist():
-            tested = of_kind & (pose == number)
-            misfit = _misfit(residual[tested], basis[tested], LEAST_ERROR_SHARE)
-            outlier = turn_of[number] if kind == of_turns else number
-            p_values[outlier] = _p_value(misfit, misfit_of_kind)
-        most = max(1, int(MAX_POSE_OUTLIERS * len(p_values)))
-        outlying = find_outliers(p_values, n_tests=len(p_values), most=most).numbers
+        outlying = _outlying(residual[of_kind], basis[of_kind], rows.group[of_kind])
         if outlying:
             outliers[kind] = outlying
     if of_poses in outliers:
         poses = replace(poses, force_sem=_loosened(poses.force_sem, outliers[of_poses]))
     if of_drifts in outliers:
         poses = replace(poses, rate_sem=_loosened(poses.rate_sem, outliers[of_drifts]))
-    turns = [turn for index, turn in enumerate(turns) if index not in outliers.get(of_turns, ())]
+    begins = outliers.get(of_turns, ())
+    turns = [turn for turn in turns if turn.rotation is not None or turn.first not in begins]
     return Inliers(poses, turns, {kind: len(numbers) for kind, numbers in outliers.items()})
+
+
+def _outlying(residual: np.ndarray, basis: np.ndarray, pose: np.ndarray) -> tuple[int, ...]:
+    """
+    Return the poses whose rows are outliers among all rows of a kind.
+
+    `residual`, `basis`: of the rows of the kind, as from `_whitened`; `pose`: their poses, (m,).
+    """
+    misfit_of_kind = _misfit(residual, basis, LEAST_SHARE_OF_KIND)
+    p_values = {}
+    for number in np.unique(pose).tolist():
+        tested = pose == number
+        misfit = _misfit(residual[tested], basis[tested], LEAST_ERROR_SHARE)
+        p_values[number] = _p_value(misfit, misfit_of_kind)
+    most = max(1, int(MAX_POSE_OUTLIERS * len(p_values)))
+    return find_outliers(p_values, n_tests=len(p_values), most=most).numbers
 
 
 def _whitened(rows: Rows, estimate: RowEstimate) -> tuple[np.ndarray, np.ndarray]:

@@ -458,14 +458,15 @@ def _clock_times(stamps: np.ndarray, period: float) -> np.ndarray:
     They are the stamps if the mean stamps of pieces depart from the clock by 0.6 periods or more:
     samples were lost unnoticed.
     """
-    # Number of each sample: counted, and with lost samples in steps of several periods. The better
+    # Numbers of the samples: counted, or with lost samples in steps of several periods. The better
     # line is used, because long steps of a rebuilt clock need not be lost samples.
-    numbers = [np.arange(float(len(stamps)))]
+    counted = np.arange(float(len(stamps)))
     step = np.diff(stamps) / period
     lost = (step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE)
+    numbers = [counted]
     if lost.any():
         n_periods = np.where(lost, np.rint(step), 1.0)
-        numbers.insert(0, np.concatenate([[0.0], np.cumsum(n_periods)]))
+        numbers = [np.concatenate([[0.0], np.cumsum(n_periods)]), counted]
     n_lines = max(1, int(period * len(stamps) / LINE))
     lines = [_clock_line(number, stamps, n_lines) for number in numbers]
     line = min(lines, key=lambda line: np.sum((stamps - line) ** 2))
