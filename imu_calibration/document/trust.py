@@ -183,9 +183,7 @@ def uncorrected_size(effect: Effect, rms: np.ndarray, at_end: bool) -> dict[str,
 
 def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:
     """
-    Return a line for each effect that compensation replaces by a constant.
-
-    From the statistics of a document.
+    Return a line for each effect of the statistics that compensation replaces by a constant.
     """
     lines = []
     for entry in statistics.get('uncorrected') or ():

@@ -109,8 +109,8 @@ class Coordinates:
         """
         Return the information about z that a calibration adds to the prior, shape (n, n).
 
-        ``basis' C^-1 basis - prior_information``, with C the covariance in units, without negative
-        eigenvalues.
+        It is ``basis' C^-1 basis - prior_information``, with C the covariance in units; negative
+        eigenvalues of the difference are set to zero.
 
         Parameters
         ----------
@@ -180,7 +180,7 @@ class WithinTolerances:
         """
         Return the distance to the goal for covariances of z, (k, n, n); 0 where it is reached.
 
-        The weighted sum of the logarithms of the excess; `margin` is a factor on the sd.
+        It is the weighted sum of the logarithms of the excess; `margin` is a factor on the sd.
         """
         log_excess = np.log(margin * self.coordinates.excess(covariance))
         return (self.weights * np.maximum(log_excess, 0.0)).sum(axis=1)
@@ -273,8 +273,8 @@ class ToldApart:
         """
         Return the distance to the goal for covariances of z, (k, n, n); 0 where it is reached.
 
-        Half the sum of the logarithms of (sufficient / present noncentrality) of the reachable
-        pairs, with the worst weighted three times; `margin` is a factor on the sd.
+        It is half the sum of the logarithms of (sufficient / present noncentrality) of the
+        reachable pairs, with the worst weighted three times; `margin` is a factor on the sd.
         """
         ratios = self.noncentrality(covariance)[:, self.reachable]
         shortfall = np.maximum(-0.5 * np.log(ratios / margin**2), 0.0)
@@ -314,10 +314,10 @@ def sufficient_noncentrality(n_params: int, n_candidates: int) -> float:
     """
     Return the noncentrality with which an effect is found and preferred to another one.
 
-    Each with SEPARATION_PROBABILITY. Found: its chi-square with `n_params` parameters exceeds the
-    threshold of a search among `n_candidates` effects. Preferred: of two models of which one is
-    right the logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance
-    ``lambda``; it must exceed the search's TIE.
+    Both have the probability SEPARATION_PROBABILITY. Found: its chi-square with `n_params`
+    parameters exceeds the threshold of a search among `n_candidates` effects. Preferred: of two
+    models of which one is right the logarithm of the likelihood ratio is normal with mean ``lambda
+    / 2`` and variance ``lambda``; it must exceed the search's TIE.
     """
     from scipy.stats import ncx2  # here, because its import is slow
 

@@ -92,9 +92,7 @@ class PlannedMotion:
 
     def points(self, position: np.ndarray) -> TrajectoryPoints:
         """
-        Return the trajectory from where the joints rest.
-
-        Positions, velocities and accelerations, at rest at the end.
+        Return the trajectory from the position where the joints rest to the end of the motion.
         """
         return trajectory(self.joint_names, self.from_position(position))
 
@@ -170,9 +168,9 @@ the tilt only.
 
 def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the ends within which places are chosen.
+    Return the (lower, upper) ends within which places are chosen, each of shape (n_joints,).
 
-    Of joints that turn, at most one turn about the middle of the range.
+    For a joint that turns by more than one turn they are half a turn from the middle of its range.
     """
     is_wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
     # 0 without ends.
@@ -218,9 +216,7 @@ def candidates(limits: MotionLimits) -> np.ndarray:
 
 def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
     """
-    Return positions whose attitudes have the largest distances, the first at home.
-
-    Shape (n, n_joints).
+    Return positions with widely different attitudes, the first at home, shape (n, n_joints).
 
     Each next position has the attitude furthest from those of the chosen positions; of equally
     distant attitudes the position nearest to zero is chosen, by the order of `candidates`. Fewer
@@ -447,7 +443,7 @@ class MotionLibrary:
         """
         Return how long a joint can turn at a rate if it moves through 96 % of its range, s.
 
-        Both ramps are in this range too.
+        The ramps before and after are within these 96 % too.
 
         `rates`: of all joints on the way out and back, shape (2, n_joints).
         """

@@ -324,9 +324,7 @@ class Planner:
 
     def take(self, calibration: Calibration) -> None:
         """
-        Replace the prediction by the covariance of a calibration.
-
-        For the parameters that the model shares with it.
+        Replace the predicted covariance of the parameters that a calibration shares by its own.
         """
         names = {name: k for k, name in enumerate(calibration.param_names)}
         self.problem.known_information = self.problem.coordinates.information_from(
@@ -343,9 +341,9 @@ class Planner:
 
     def next_motion(self, position: np.ndarray) -> Decision:
         """
-        Return the motion with the largest gain per second, and count on it.
+        Return the motion with the largest gain per second from where the joints are.
 
-        The gain is from where the joints are.
+        Its predicted information is added to that of the motions so far.
         """
         place = self.problem.place_near(position)
         if self._first is None:
@@ -402,8 +400,8 @@ class Planner:
         """
         Return the move that turns wound joints back to the middle of their range, None for none.
 
-        Endless joints of the table to which the present limits give a range, more than half a turn
-        from its middle.
+        A joint is wound if the table has no end for it, the present limits have, and it is more
+        than half a turn from the middle between them.
         """
         library = self.problem.library
         limits = library.limits
@@ -582,7 +580,7 @@ def plan_by_hand(
     """
     Return the poses and turns that bring every parameter within its tolerance.
 
-    Each is the best per second at its time.
+    Each of them has the largest gain per second of all that could be next.
 
     Parameters
     ----------
@@ -672,9 +670,7 @@ def _mean_sd(noise: NoiseModel, n_samples: float) -> float:
 
 def trajectory_to_mapping(points: TrajectoryPoints) -> dict[str, Any]:
     """
-    Return a trajectory as the fields of trajectory_msgs/JointTrajectory.
-
-    As ``ros2 topic pub`` reads them.
+    Return the fields of trajectory_msgs/JointTrajectory as ``ros2 topic pub`` reads them.
     """
     columns = {
         'positions': points.position,

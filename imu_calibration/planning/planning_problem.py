@@ -208,8 +208,8 @@ class PlanningProblem:
         """
         Return a factor that (estimated / true noise variance) exceeds on none of six axes.
 
-        With probability P = PROBABILITY. The variance is estimated from the windows at rest, with
-        BATCH_DOF degrees of freedom each::
+        That holds with the probability P = PROBABILITY. The variance is estimated from the windows
+        at rest, with BATCH_DOF degrees of freedom each::
 
             factor = chi2_isf((1 - P) / 6, nu) / nu
             nu     = BATCH_DOF * n_rests,  n_rests = (sum samples)^2 / sum samples^2
@@ -280,7 +280,8 @@ class PlanningProblem:
         """
         Return the least time of continuous observation from which each bias meets its tolerance, s.
 
-        Infinite if one does not. `factor`: on the variance of the noise within windows.
+        It is infinite if one bias never does. `factor`: on the variance of the noise within
+        windows.
         """
         coordinates = self.coordinates
         lengths = np.geomspace(0.01, MAX_REACHABLE_SECONDS, 2000)
@@ -404,11 +405,10 @@ class PlanningProblem:
 
     def best_covariance(self, seconds: float) -> np.ndarray:
         """
-        Return a lower bound of the covariance of z of all plans in this time.
+        Return a lower bound of the covariance of z after any plan of these motions in a time, s.
 
-        The plans consist of these motions and their moves.
-
-        Every motion fills the whole time at once, and the biases are independent between windows.
+        For the bound every motion fills the whole time, all at once, and the biases are independent
+        between windows.
         """
         visits = list(zip(self.windows, self.seconds.tolist(), strict=True))
         for key, windows in self.move_windows.items():
@@ -426,7 +426,7 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
     """
     Return sensor -> NoiseModel of the samples of a simulated IMU.
 
-    White noise, and a bias that wanders by its instability.
+    A model has white noise, and a bias that wanders by the instability of the sensor.
 
     Parameters
     ----------

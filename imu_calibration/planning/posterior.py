@@ -293,9 +293,10 @@ class WindowPredictor:
         """
         Return (eigenvalues, eigenvectors) of the covariance of the bias in a half of a window.
 
-        Of its changes since the middle of the window, at the later half of `count` instants in
-        `seconds`, shapes (count // 2,) and (count // 2, count // 2). Given the bias in the middle,
-        the changes before are independent of those after, with the mirrored covariance.
+        The covariance is that of the changes since the middle of a window of `seconds`, at the
+        later half of `count` instants: shapes (count // 2,) and (count // 2, count // 2). Given the
+        bias in the middle, the changes before it are independent of those after it, and have the
+        mirrored covariance.
         """
         half = count // 2
         after_middle = ((np.arange(count - half, count) + 0.5) / count - 0.5) * seconds
@@ -460,9 +461,10 @@ def exact_information(
     factor: float = 1.0,
 ) -> np.ndarray:
     """
-    Return the information about z in all windows of a plan, with the weights of the calibration.
+    Return the information about z in all windows of a plan, shape (n, n).
 
-    Shape (n, n). The biases at the middles of the windows are correlated by their processes.
+    The windows have the weights of the calibration: the biases at their middles are correlated by
+    the bias processes.
 
     Parameters
     ----------
@@ -497,8 +499,8 @@ def additive_bound(
     """
     Return an upper bound of the information about z that a window adds in any plan, (n, n).
 
-    With `share` of the covariance of the bias processes, whose remainder is that of an offset
-    common to the session (`common_variance`); `factor` as in `exact_information`.
+    The biases have a `share` of the covariance of their processes; the remainder is that of an
+    offset common to the session (`common_variance`). `factor` as in `exact_information`.
 
     The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an
     Ornstein-Uhlenbeck process seen at the middles of the windows, whose inverse is tridiagonal. Its
@@ -539,7 +541,8 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
     """
     Return the least variance of a constant bias, estimated from continuous observation.
 
-    With white noise and the bias processes, for each length T in `seconds`, shape (k,).
+    The observation of length T, one for each of `seconds`, has white noise and the bias processes;
+    the result has the shape (k,).
 
     For one process, ``integral(S exp(-|t - s| / time) h(s)) + white h(t) = 1`` is solved by ``h = a
     + b cosh(k (t - T / 2))`` with ``k^2 = 1 / time^2 + 2 S / (time white)``, and the variance is

@@ -115,9 +115,9 @@ class DiagnosisResult:
     @property
     def notes(self) -> list[str]:
         """
-        Residuals above the noise at rest, and biases that step or wander on every axis.
+        Notes on residuals above the noise at rest, and on biases that step or wander on every axis.
 
-        Both are for sensors without an unexplained residual. An onset explains them all.
+        They are on sensors without an unexplained residual. An onset explains them all.
         """
         if self.diagnosis.onset is not None:
             return []
