@@ -167,7 +167,9 @@ class _RowProblem:
         """Return a mask of the parameters that the data alone do not determine."""
         flat_prior = np.diag(1 / (FLAT_PRIOR_FACTOR * self.prior_sd))
         rows = np.vstack([self.weighted(state).design, flat_prior])
-        return undetermined_parameters(rows, self.prior_sd, free=self.adjustable, held=self.always_held)
+        return undetermined_parameters(
+            rows, self.prior_sd, free=self.adjustable, held=self.always_held
+        )
 
     def holding(self, state: _Iterated, held: np.ndarray) -> _Iterated:
         """Return the values from the data almost without priors, the held ones nominal."""
