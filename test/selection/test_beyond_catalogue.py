@@ -36,7 +36,7 @@ from imu_calibration.references.turntable.selection.investigation import investi
 from imu_calibration.selection.gain import APPLIED, SAMPLES
 
 from worlds import physics
-from worlds.beyond_catalogue import row_of
+from worlds.beyond_catalogue import judged, row_of
 from worlds.candidates import with_candidates
 from worlds.diagnosing import diagnose
 from worlds.hiding import record
@@ -49,6 +49,8 @@ FEW = (
     'accel_thermal_bias_2+gyro_thermal_bias_2+gyro_thermal_scale+time_offset+'
     'load_compliance'
 )
+OF_MOTION = 'gyro_g_sensitivity+gyro_quadratic+gyro_thermal_scale+load_compliance'
+"""Candidates beside a formula that is looked for."""
 OF_RATES = 'gyro_g_sensitivity+gyro_quadratic+gyro_thermal_scale'
 """Candidates beside a formula that is known."""
 
@@ -66,7 +68,9 @@ def looked(kind=None, seed=5):
     """Return (examination, sensor -> blocks, cause) of a session."""
     recording, cause = recorded(kind, seed)
     found = ResidualAnalysis.of(
-        investigate(recording.windows, recording.table, with_candidates(recording.model, FEW))
+        investigate(
+            recording.windows, recording.table, with_candidates(recording.model, OF_MOTION)
+        ),
     )
     return found, found.blocks, cause
 
@@ -175,7 +179,7 @@ def test_blocks_of_a_recording_that_hides_nothing_are_noise():
     [
         ('scale_under_load', 'f_'),
         ('gyro_cubic', '** 3'),
-        pytest.param('stray_field_accel', 'sin(', marks=pytest.mark.long),
+        ('stray_field_accel', 'sin('),
     ],
 )
 def test_a_formula_is_found_and_judged_on_windows_that_took_no_part(kind, text):
@@ -300,7 +304,7 @@ def test_a_mount_that_bends_is_named_in_both_sensors():
         profile='quick',
         **COARSE,
     )
-    found = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
+    found = diagnose(recording.windows, recording.table, recording.model, candidates=OF_MOTION)
     assert [finding.effect for finding in found.findings] == ['load_compliance']
     assert not any(rest.significant for rest in found.unexplained.values())
 
@@ -337,7 +341,7 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
             '--output',
             str(tmp_path / 'out'),
             '--candidates',
-            FEW,
+            OF_RATES,
         ]
     ) in (
         0,
@@ -397,6 +401,8 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
                 *table,
                 '--profile',
                 'quick',
+                '--imu-rate',
+                '50',
                 '--output',
                 str(tmp_path / 'bag2'),
             ]
@@ -417,6 +423,12 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
     ) in (0, 3)
 
 
+def diagnosed(seed, cause, candidates):
+    """Return the diagnosis of a session with a cause."""
+    recording = record(seed, None, 'realistic', through_bag=False, cause=cause, **COARSE)
+    return diagnose(recording.windows, recording.table, recording.model, candidates=candidates)
+
+
 @pytest.mark.long
 def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_there_stays():
     """
@@ -425,11 +437,12 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
     What is there stays beside another cause.
     """
     settling = Beyond('gyro_scale_settling', 141)
-    row, _ = row_of(141, 'gyro_scale_settling', 'realistic', settling, candidates=FEW, **COARSE)
-    assert row['found'] == [] and row['family'], row
+    found = diagnosed(141, settling, 'gyro_thermal_scale')
+    assert not found.findings and judged(found, settling)['family']
     warm = Beyond('sticks_when_warm', 81013)
-    row, _ = row_of(81013, 'sticks_when_warm', 'realistic', warm, candidates=FEW, **COARSE)
-    assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.999, (
+    found = diagnosed(81013, warm, 'accel_thermal_bias+accel_thermal_bias_2')
+    row = judged(found, warm)
+    assert not found.findings and row['flagged'] and row['axis'] and row['f1'] > 0.999, (
         'a step when it is warm looks like a curve of the temperature'
     )
     recording = record(
@@ -440,13 +453,12 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
         profile='quick',
         **COARSE,
     )
-    found = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
+    found = diagnose(recording.windows, recording.table, recording.model, candidates=OF_RATES)
     assert [finding.effect for finding in found.findings] == [
         'gyro_g_sensitivity'
     ] and found.unexplained['gyroscope'].proposal is not None
 
 
-@pytest.mark.long
 def test_a_formula_of_the_session_is_not_written_into_a_model_for_other_sessions(tmp_path, capsys):
     session = physics.make_session(
         5,
@@ -461,7 +473,8 @@ def test_a_formula_of_the_session_is_not_written_into_a_model_for_other_sessions
 
     (tmp_path / 'table.yaml').write_text(documents.to_text(session.table))
     options = ['--table', str(tmp_path / 'table.yaml'), '--output', str(tmp_path / 'out')]
-    assert main(['diagnose', str(tmp_path / 'bag'), *options, '--candidates', FEW]) in (0, 3)
+    arguments = ['diagnose', str(tmp_path / 'bag'), *options, '--candidates', 'gyro_thermal_scale']
+    assert main(arguments) in (0, 3)
     document = json.loads((tmp_path / 'out' / 'diagnosis.json').read_text())
     terms = [
         term['definition']['column']

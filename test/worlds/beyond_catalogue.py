@@ -58,7 +58,7 @@ def row_of(seed, kind, noise, cause=None, *, candidates=None, **options):
             for column in rest.proposal.columns
         ],
     }
-    return row if cause is None else row | _judged(found, cause), _known(found, recording)
+    return row if cause is None else row | judged(found, cause), _known(found, recording)
 
 
 def _known(found, recording):
@@ -88,7 +88,8 @@ def _known(found, recording):
     return {name: (float(solution.values[k]), float(sd[k])) for name, k in places.items()}
 
 
-def _judged(found, cause):
+def judged(found, cause):
+    """Return whether what is told of the rest is right about the cause, as a row."""
     kind, rest = cause.kind, found.unexplained[cause.kind.sensor]
     proposal, told = rest.proposal, set(rest.axes)
     # A change at one moment is the place in time after it, and in temperature where one is passed.
