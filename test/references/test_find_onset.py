@@ -21,9 +21,9 @@ MOMENTS = 'time_offset+encoder_zero'
 SEED = 6
 
 
-def investigated(cause, candidates=MOMENTS):
-    rates = {'imu_rate': 50.0, 'joint_rate': 50.0}
-    recording = record(SEED, None, 'realistic', through_bag=False, cause=cause, **rates)
+def investigated(cause, candidates=MOMENTS, profile='quick'):
+    options = {'profile': profile, 'imu_rate': 50.0, 'joint_rate': 50.0}
+    recording = record(SEED, None, 'realistic', through_bag=False, cause=cause, **options)
     model = with_candidates(recording.model, candidates)
     return recording, investigate(recording.windows, recording.table, model)
 
@@ -46,7 +46,8 @@ def moment_of(recording, share):
     ],
 )
 def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
-    recording, found = investigated(Moment(kind))
+    # Exchanged axes leave little to find in the shortest session.
+    recording, found = investigated(Moment(kind), profile='random' if kind == 'axes' else 'quick')
     onset = found.onset
     assert (
         onset.what == what

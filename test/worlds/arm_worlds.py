@@ -269,13 +269,14 @@ def calibrated(world):
     return calibrated_on_table([[world.block]], world.table).calibration
 
 
-def deviations(world):
+def deviations(world, calibration=None):
     """
     Return {parameter: error in standard deviations}, and the calibration.
 
-    The errors are of a calibration of the world.
+    The errors are of a calibration of the world, by default of `calibrated`.
     """
-    calibration = calibrated(world)
+    if calibration is None:
+        calibration = calibrated(world)
     found = dict(
         zip(
             calibration.param_names,
