@@ -119,6 +119,12 @@ UNREACHABLE = {
         'diagnose': 'no calibration is estimated',
         'inspect': 'no calibration is estimated',
         'temperature_topic': 'no recording is replayed',
+        'frame_id': 'no recording is read',
+        'exclude': 'no recording is read',
+        'columns': 'no recording is read',
+        'where': 'no recording is read',
+        'jobs': 'no recording is read',
+        'scheduler': 'no recording is read',
         'up': 'of transforms in a bag',
     },
     'simulator_node': {

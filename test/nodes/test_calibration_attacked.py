@@ -239,7 +239,9 @@ def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, t
     live = node.worker.live
     whole, live.push = live.push, lambda block: 1 / 0
     send(bench, *(samples.select(slice(0, 200)) for samples in session))
-    bench.until(lambda: bench.heard('take', 'ZeroDivisionError', level='error'), 'the fault')
+    bench.until(
+        lambda: bench.heard('process messages', 'ZeroDivisionError', level='error'), 'the fault'
+    )
     answer = bench.call('/calibration_node/save')
     assert not answer.success and not list(tmp_path.iterdir())
     live.push = whole

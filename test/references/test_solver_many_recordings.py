@@ -2,6 +2,7 @@
 Several recordings of one IMU in one system: a bias of its own for each when the data ask for it.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,15 +71,13 @@ def recordings(motion, values, steps, rng):
                 for s in SENSORS
             ]
             measured = Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]})
-            part.add(
-                *reduce_windows(
-                    [measured],
-                    MODEL,
-                    TABLE,
-                    session=session,
-                    column_function=lambda references, sensor, known=designs: known[sensor],
-                )
+            [reduced] = reduce_windows(
+                [measured],
+                MODEL,
+                TABLE,
+                column_function=lambda references, sensor, known=designs: known[sensor],
             )
+            part.add(replace(reduced, session=session))
         total.merge(part)
     return total
 
