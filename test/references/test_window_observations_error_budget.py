@@ -19,12 +19,14 @@ from imu_calibration.references.turntable.error_budget_of_windows import (
     JOINT_POSITION_SD,
     _faster,
     _heavier,
+    _sources,
     _tilted,
     _turned,
     error_budget,
     parameter_shifts,
 )
 from imu_calibration.references.turntable.estimation.solver import solve
+from imu_calibration.references.turntable.session_data import merge
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
@@ -173,3 +175,14 @@ def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording,
     assert stated - exact == pytest.approx(1e-8 * result.solution.values[scales] ** 2, rel=1e-3)
     at_place = error_budget(place, result.data.gathered, result.solution)
     assert at_place.causes['gravity'][scales] == pytest.approx(1e-4, rel=0.02)
+
+
+def test_windows_of_a_second_recording_share_no_bias_with_the_first(recording, result):
+    step = GatherStep(TABLE, result.model)
+    gathered = merge([step.gather([recording], session) for session in (0, 1)])
+    sessions = {'static': [], 'moving': []}
+    for source in _sources(gathered):
+        sessions['static' if source.kind == 'static' else 'moving'].append(source.session)
+    for of_kind in sessions.values():
+        n = len(of_kind) // 2
+        assert n > 0 and of_kind == [0] * n + [1] * n

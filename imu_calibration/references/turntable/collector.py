@@ -522,6 +522,7 @@ class Collector:
             n_samples = sum(len(w.time) for w in kept) + len(window.time)
             if n_samples <= KEPT_SAMPLES:
                 kept.append(window)
+                self.gathered.sessions_of_kept.append(self.session)
         if self.step.keep_for_search:
             self.gathered.for_search[0].add(owned_window(window))
 
@@ -591,6 +592,7 @@ class LiveCollector(Collector):
             held_out=gathered.held_out.copy(),
             poses=list(gathered.poses),
             kept=[],
+            sessions_of_kept=[],
             counts=dict(gathered.counts),
             for_search=[kept.copy() for kept in gathered.for_search],
         )

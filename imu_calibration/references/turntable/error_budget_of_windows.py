@@ -258,12 +258,12 @@ def _sources(gathered: SessionData) -> Iterator[_Source]:
             temperature_c=None,
         )
     stride = max(1, int(np.ceil(sum(len(w) for w in gathered.kept) / MOVING_SAMPLES)))
-    for window in gathered.kept:
+    for window, session in zip(gathered.kept, gathered.sessions_of_kept):
         used = slice(None, None, stride)
         yield _Source(
             kind=window.kind,
             time=float(window.time.mean()),
-            session=0,
+            session=session,
             samples=len(window),
             stride=stride,
             motion=window.motion.select(used),

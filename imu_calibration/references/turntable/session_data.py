@@ -450,6 +450,8 @@ class SessionData(GatheredData):
     """
     poses: list[tuple[float, int, np.ndarray]] = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
+    sessions_of_kept: list[int] = field(default_factory=list)
+    """Number of the recording of each window of `kept`."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
@@ -498,7 +500,9 @@ def merge(parts: Sequence[SessionData]) -> SessionData:
         # The first windows, up to KEPT_SAMPLES samples.
         windows = total.kept + part.kept
         ends = np.cumsum([len(window.time) for window in windows])
-        total.kept = windows[: int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))]
+        n_kept = int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))
+        total.kept = windows[:n_kept]
+        total.sessions_of_kept = (total.sessions_of_kept + part.sessions_of_kept)[:n_kept]
 
         largest_first = sorted(total.for_search + part.for_search, key=lambda kept: -kept.n_samples)
         total.for_search = largest_first[:MAX_SEARCHED]
