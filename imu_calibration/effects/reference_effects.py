@@ -201,7 +201,7 @@ def _changed_table(
     return change(table, np.array(values))
 
 
-def _of_table(
+def _warp_of_table(
     change: Callable[[Table, np.ndarray], Table],
     table: Table,
     motion: JointMotion,
@@ -246,24 +246,24 @@ def _harmonics(table: Table, motion: JointMotion, values: np.ndarray) -> tuple[T
     return table, motion
 
 
-def _elapsed(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _growing(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the factor of a delay that grows with time: a clock with another rate."""
     return time
 
 
-def _after(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _after_step(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the factor of a delay that begins at the time ``values[1]``: 0, then 1."""
     return time >= values[1]
 
 
-def _earth(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+def _earth_rate_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
     """Return the coefficients M_ij earth_k of the attitude columns C_jk in output i."""
     matrix = values['matrix'].reshape(3, 3)
     block = matrix[:, :, None] * values['earth_rate'][None, None, :]
     return {ATTITUDE.name: block.reshape(3, 9).T}
 
 
-def _earth_known(table: Table) -> tuple[str, str] | None:
+def _moot_earth_rate(table: Table) -> tuple[str, str] | None:
     """
     Return (why the Earth's rate is not estimated, remedy) if the reference includes it, or None.
 
@@ -278,7 +278,7 @@ def _earth_known(table: Table) -> tuple[str, str] | None:
     )
 
 
-def _bent(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+def _load_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
     """
     Return the coefficients of a mount that turns by theta = K f with the force f, to first order.
 
@@ -331,7 +331,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             prior_sd=2e-3,
             plausible=('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),
             motion=('turn_about_vertical',),
-            warp=partial(_of_table, tilt),
+            warp=partial(_warp_of_table, tilt),
             derivative=_tilt_derivative,
             acts_on=('accelerometer',),
             needs=('joints',),
@@ -346,7 +346,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             prior_sd=names.angle_sd or 0.01,
             plausible=('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),
             motion=('two_axis', 'static_dense'),
-            warp=partial(_of_table, with_axis_angles),
+            warp=partial(_warp_of_table, with_axis_angles),
             needs=('joints', 'two_joints'),
         ),
         Effect(
@@ -374,7 +374,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             prior_sd=names.place_sd or 1e-3,
             plausible=('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'),
             motion=('two_axis', 'three_speeds'),
-            warp=partial(_of_table, with_axis_places),
+            warp=partial(_warp_of_table, with_axis_places),
             acts_on=('accelerometer',),
             needs=('joints', 'two_joints', 'dynamic'),
         ),
@@ -414,7 +414,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
                 'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft',
             ),
             motion=('static_dense', 'two_axis'),
-            warp=partial(_of_table, with_sag),
+            warp=partial(_warp_of_table, with_sag),
             needs=('joints', 'two_joints'),
         ),
         Effect(
@@ -433,7 +433,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             prior_sd=2e-3,
             plausible=('bench', 3e-3, 'field catalogue 6.3: arcsec; 10 arcmin of a worn bearing'),
             motion=('slow_turn', 'two_axis'),
-            warp=partial(_of_table, with_wobble),
+            warp=partial(_warp_of_table, with_wobble),
             needs=('joints',),
         ),
         Effect(
@@ -457,7 +457,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             motion=('static_dense', 'two_axis'),
             groups=tuple(LOAD.values()),
             group_sensors=tuple(LOAD),
-            coefficients=_bent,
+            coefficients=_load_coefficients,
             needs=('joints',),
         ),
         Effect(
@@ -499,7 +499,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             plausible=('bench', 5e-4, 'crystal oscillators: 10-100 ppm over temperature'),
             motion=('oscillate_fast', 'two_axis'),
             compensation='none',
-            warp=Lag(factor=_elapsed),
+            warp=Lag(factor=_growing),
             needs=('joints', 'dynamic'),
             step=1e-6,
         ),
@@ -522,7 +522,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             located=True,
             motion=('oscillate_fast', 'two_axis'),
             compensation='none',
-            warp=Lag(factor=_after),
+            warp=Lag(factor=_after_step),
             needs=('joints', 'dynamic'),
             step=2e-4,
         ),
@@ -535,7 +535,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             nuisance=True,
             title='Earth rate in the level frame',
             known_size=True,
-            moot=_earth_known,
+            moot=_moot_earth_rate,
             explanation="The gyroscopes measure the Earth's rotation, which the model omits.",
             tolerance=2e-6,
             tolerance_reason="3 % of the Earth's rotation",
@@ -544,7 +544,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             motion=('turn_about_vertical', 'static_poses'),
             compensation='none',
             groups=(ATTITUDE,),
-            coefficients=_earth,
+            coefficients=_earth_rate_coefficients,
             acts_on=('gyroscope',),
             needs=('joints',),
         ),
