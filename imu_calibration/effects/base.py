@@ -413,7 +413,7 @@ _VECTOR = {'accelerometer': ('f_x', 'f_y', 'f_z'), 'gyroscope': ('w_x', 'w_y', '
 """Sensor -> names of the components of its true input in the text of a column."""
 
 
-def _of_input(
+def _input_groups(
     ending: str, texts: Callable[[Sequence[str]], Iterable[str]]
 ) -> dict[str, ColumnGroup]:
     """
@@ -437,12 +437,12 @@ def _products(axes_of_factors: Sequence[tuple[int, ...]], names: Sequence[str]) 
 
 CONSTANT = ColumnGroup('one', ('1',))
 TIME = ColumnGroup('time', ('time',))
-TRUE_INPUT = _of_input('', lambda v: v)
-SQUARES = _of_input('_squares', partial(_products, PRODUCT_PAIRS))
-CUBES = _of_input('_cubes', partial(_products, TRIPLES))
-SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi, vj in product(v, v)])
+TRUE_INPUT = _input_groups('', lambda v: v)
+SQUARES = _input_groups('_squares', partial(_products, PRODUCT_PAIRS))
+CUBES = _input_groups('_cubes', partial(_products, TRIPLES))
+SIGNED = _input_groups('_signed', lambda v: [f'sign({vi}) * {vj}' for vi, vj in product(v, v)])
 """Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
-THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({TEMPERATURE_RISE})' for vi in v])
+THERMAL = _input_groups('_temperature', lambda v: [f'{vi} * ({TEMPERATURE_RISE})' for vi in v])
 TEMPERATURE = ColumnGroup('temperature', (TEMPERATURE_RISE,))
 TEMPERATURE_SQUARED = ColumnGroup('temperature_squared', (f'({TEMPERATURE_RISE}) ** 2',))
 VIBRATION = ColumnGroup('vibration', tuple(f'vibration_{a}' for a in AXES))

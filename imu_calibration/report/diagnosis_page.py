@@ -332,11 +332,18 @@ def overlay_section(
     """
     against = {label: values for label, (_, values) in variables(traces, joint_names).items()}
     return [
-        _sensor(traces, sensor, against, causes.get(sensor, 'time, s')) for sensor in traces.before
+        _sensor_section(traces, sensor, against, causes.get(sensor, 'time, s'))
+        for sensor in traces.before
     ]
 
 
-def _sensor(
+def _row(title: str, chart: Callable[[int], dict[str, Any]], **options: Any) -> dict[str, Any]:
+    """Return a row of three charts, ``chart(axis)`` each, with further content of the template."""
+    charts = [json.dumps(chart(axis)) for axis in range(3)]
+    return {'title': title, 'charts': charts, 'variables': '', 'labels': (), **options}
+
+
+def _sensor_section(
     traces: Traces, sensor: str, against: Mapping[str, np.ndarray], first: str
 ) -> dict[str, Any]:
     """
@@ -346,22 +353,9 @@ def _sensor(
     """
     factor, unit = for_people(UNITS[sensor])
     rows: list[dict[str, Any]] = []
-
-    def row(title: str, chart: Callable[[int], dict[str, Any]], **more: Any) -> None:
-        """Add a row of three charts, ``chart(axis)`` each, to `rows`."""
-        rows.append(
-            {
-                'title': title,
-                'charts': [json.dumps(chart(axis)) for axis in range(3)],
-                'variables': '',
-                'labels': (),
-                **more,
-            }
-        )
-
     segments = traces.segments.get(sensor)
     if segments:
-        row(
+        signals = _row(
             f'Measured and simulated on the segment with the largest difference, {unit}',
             lambda k: _chart(
                 f'{sensor} {AXES[k]}',
@@ -370,7 +364,7 @@ def _sensor(
                 {name: signal * factor for name, signal in segments[k].signals.items()},
             ),
         )
-        row(
+        differences = _row(
             f'Measured minus simulated on that segment, {unit}',
             lambda k: _chart(
                 f'{sensor} {AXES[k]}',
@@ -379,13 +373,14 @@ def _sensor(
                 {when: segments[k].difference(f'simulated {when}') * factor for when in WHEN},
             ),
         )
+        rows += [signals, differences]
 
     def residuals(axis: int, points: slice = slice(None)) -> dict[str, np.ndarray]:
         """Return 'before', 'after' -> residual of an axis in the units of the page."""
         return {when: getattr(traces, when)[sensor][points, axis] * factor for when in WHEN}
 
     drawn = slice(None, None, -(-len(traces.time) // MOST_POINTS))
-    row(
+    against_variable = _row(
         f'Residual, {unit}, against',
         lambda k: _chart(
             f'{sensor} {AXES[k]}', first, against[first][drawn], residuals(k, drawn), kind='points'
@@ -394,9 +389,10 @@ def _sensor(
         first=first,
         labels=list(against),
     )
+    rows.append(against_variable)
     if sensor in traces.distances:
         frequency, density, noise = traces.distances[sensor].density()
-        row(
+        spectrum = _row(
             f'Spectrum of the residual, {unit}/√Hz, with the noise at rest',
             lambda k: _chart(
                 f'{sensor} {AXES[k]}',
@@ -409,10 +405,12 @@ def _sensor(
                 kind='log',
             ),
         )
-    row(
+        rows.append(spectrum)
+    histograms = _row(
         f'Histogram of the residual, {unit}',
         lambda k: _histogram(f'{sensor} {AXES[k]}', unit, residuals(k)),
     )
+    rows.append(histograms)
     bands = []
     if sensor in traces.distances:
         for name, rms, noise in traces.distances[sensor].bands():
