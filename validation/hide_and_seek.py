@@ -90,7 +90,7 @@ def main(arguments=None):
         processes=1,
     )
     options = parser.parse_args(arguments)
-    part_of_it = (
+    is_partial = (
         options.from_record
         or options.effects
         or options.minutes
@@ -99,12 +99,12 @@ def main(arguments=None):
         or set(options.parts) != set(PARTS)
         or len(options.grades) < len(GRADES)
     )
-    docs = options.docs or (options.record.parent if part_of_it else ROOT / 'docs')
-    rows = (
-        [row for path in options.from_record for row in record_kept.read(path)]
-        if options.from_record
-        else _work(tasks_of(options), options)
-    )
+    docs = options.docs or (options.record.parent if is_partial else ROOT / 'docs')
+    rows = []
+    for path in options.from_record or ():
+        rows += record_kept.read(path)
+    if not options.from_record:
+        rows = _work(tasks_of(options), options)
     report(rows, docs)
     write_figures(rows, docs)
     kept = record_kept.read()
@@ -123,28 +123,36 @@ def main(arguments=None):
 def _work(tasks, options):
     """Return the rows of all tasks, or of those that were done when the run was stopped."""
     options.record.parent.mkdir(parents=True, exist_ok=True)
-    rows, start, done = [], time.time(), 0
+    rows = []
+    n_done = 0
+    waiting = list(tasks)
+    running = {}  # future -> its task
+    start = time.time()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    pool, waiting, running = ProcessPoolExecutor(options.processes), list(tasks), {}
+    pool = ProcessPoolExecutor(options.processes)
     with options.record.open('w') as record_file:
         try:
             while waiting or running:
+                # As many tasks as processes at a time, so that none begins after the last minute.
                 in_time = options.minutes is None or time.time() - start < 60 * options.minutes
                 while waiting and in_time and len(running) < options.processes:
                     task = waiting.pop(0)
                     running[pool.submit(run, task)] = task
                 if not running:
                     break
-                for future in wait(running, return_when=FIRST_COMPLETED)[0]:
-                    new, done = _result(future, running.pop(future)), done + 1
-                    rows += new
-                    record_file.writelines(json.dumps(row) + '\n' for row in new)
+                completed, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in completed:
+                    task_rows = _result(future, running.pop(future))
+                    n_done += 1
+                    rows += task_rows
+                    record_file.writelines(json.dumps(row) + '\n' for row in task_rows)
+                    # After the death of a process the pool accepts no further task.
                     if isinstance(future.exception(), BrokenExecutor) and not running:
                         pool = ProcessPoolExecutor(options.processes)
                 record_file.flush()
+                minutes = (time.time() - start) / 60
                 print(
-                    f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions,'
-                    f' {(time.time() - start) / 60:.1f} min',
+                    f'\r{n_done}/{len(tasks)} tasks, {len(rows)} sessions, {minutes:.1f} min',
                     end='',
                     file=sys.stderr,
                     flush=True,
@@ -160,11 +168,9 @@ def _work(tasks, options):
 def _result(future, task):
     """Return the rows of a task; a process that died with it, for lack of memory, is a row."""
     problem = future.exception()
-    return (
-        future.result()
-        if problem is None
-        else [failed(f'{task[0].__name__}{task[1][:2]}', problem)]
-    )
+    if problem is None:
+        return future.result()
+    return [failed(f'{task[0].__name__}{task[1][:2]}', problem)]
 
 
 if __name__ == '__main__':
