@@ -77,9 +77,12 @@ SMALLEST = Length(
     '',
     separations=0,
     planned_seconds=20.0,
-    models={'accelerometer_model': 'bias+matrix', 'gyroscope_model': 'bias+matrix'},
+    models={
+        'accelerometer_model': 'bias+matrix+accel_size_effect',
+        'gyroscope_model': 'bias+matrix',
+    },
 )
-"""The same nodes and steps without a fault and its diagnosis, with fewer parameters."""
+"""The same nodes and steps without a fault and a diagnosis, with the parameters of that IMU."""
 START = 1_800_000_000.0
 PATIENCE = 240.0
 
@@ -214,7 +217,7 @@ def run(domain_id, folder, output, *, length=COMPLETE):
             {
                 'table_file': TABLE,
                 'save_file': folder / 'live.yaml',
-                'diagnosis_period': 3600.0,
+                'diagnosis_period': 3600.0 if length.separations else 0.0,
                 **length.models,
             },
         )
