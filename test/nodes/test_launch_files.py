@@ -5,6 +5,7 @@ Launch files: every argument that is used is declared, every parameter exists.
 """
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -71,6 +72,20 @@ def described(path, context):
     for made in [r for r in Recorded.made if type(r).__name__ == 'OpaqueFunction']:
         made.kwargs['function'](context)
     return module
+
+
+def test_the_pages_start_launch_files_with_arguments_that_they_declare(launch):
+    pages = ''.join((ROOT / name).read_text() for name in ('README.md', 'docs/ros.md'))
+    commands = re.findall(
+        r'^ros2 launch imu_calibration (\S+)(.*)', pages.replace('\\\n', ' '), re.MULTILINE
+    )
+    assert len(commands) >= 5
+    for name, words in commands:
+        Recorded.made = []
+        described(ROOT / 'launch' / name, {})
+        declared = [r.args[0] for r in Recorded.made if type(r).__name__ == 'DeclareLaunchArgument']
+        given = re.findall(r'(\S+):=', words.split('  #')[0])
+        assert given and set(given) <= set(declared), (name, given)
 
 
 @pytest.mark.parametrize(
