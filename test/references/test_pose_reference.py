@@ -18,7 +18,7 @@ MATRIX = np.array([[1.02, 0.004, -0.002], [0.003, 0.97, 0.005], [-0.004, 0.001, 
 BIAS = np.array([0.02, -0.01, 0.005])
 
 
-def walk(seed, quadratic=0.0, duration=40.0, rate_hz=50.0):
+def walk(seed, quadratic=0.0, duration=25.0, rate_hz=50.0):
     """Return readings and poses of an irregular motion, exact but for white noise."""
     rng = np.random.default_rng(seed)
     fine = np.arange(0.0, duration, 0.1 / rate_hz)

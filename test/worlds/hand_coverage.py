@@ -9,11 +9,12 @@ from argparse import ArgumentParser
 
 import numpy as np
 
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD_PRIORS, of_fit
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 
-from worlds.hand_sessions import PARAM_NAMES
+from worlds.hand_sessions import GRAVITY, PARAM_NAMES
 from worlds.physics_hand import hold_and_turn, warmed_up
 from worlds.searched_by_hand import searched
 
@@ -59,14 +60,14 @@ def session(world, seed, n_poses=24):
     return gather_by_hand(imu), truth, moved
 
 
-def errors(world, seed, **options):
+def errors(world, seed, asked=CalibrationOptions(gravity=GRAVITY), **options):
     """
     Return group -> (errors, reported sds, factor of the sds).
 
     The factor is the ratio to the sds that only noise and scatter give.
     """
     data, truth, moved = session(world, seed, **options)
-    hand, truth = searched(data).solution, truth.copy()
+    hand, truth = searched(data, asked).solution, truth.copy()
     for sensor, part in zip(SENSORS, (slice(0, 3), slice(9, 12)), strict=True):
         # A bias beside a drift is that of the start, else a mean.
         if not any(
