@@ -63,6 +63,7 @@ def bags(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_bag_through_both_nodes(bags, tmp_path):
     """Without a search for effects, which the next test has."""
     with Station() as station:
@@ -170,7 +171,7 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     Diagnostics say so, as the verb does of the same bag, and the calibration is the verb's.
     """
     session = physics.make_session(
-        3, {'accel_quadratic': None}, profile='quick', imu_rate=50.0, joint_rate=50.0
+        3, {'accel_quadratic': None}, profile='quick', imu_rate=SAMPLE_RATE, joint_rate=SAMPLE_RATE
     )
     physics.write_bag(session, tmp_path / 'bag')
     (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
@@ -187,7 +188,8 @@ def test_a_hidden_effect_is_named_live(tmp_path):
         station.calibration_node(
             tmp_path,
             table_file=tmp_path / 'table.yaml',
-            diagnosis_period=60.0,
+            diagnosis_period=600.0,
+            solve_share=0.02,
             candidates=CANDIDATES,
         )
         station.until(
