@@ -257,17 +257,10 @@ def press_ctrl_c(*ended):
 
 GIVEN = ('calibrate.launch', 'compensate.launch')
 """Launch files that another test starts as printed, with further arguments."""
-FURTHER = [
-    STARTING[3],
-    *(
-        pytest.param(command, marks=pytest.mark.long)
-        for command in STARTING[4:]
-        if not any(name in command for name in GIVEN)
-    ),
-]
-"""`make test` has the launch file of the demonstration only."""
+FURTHER = [command for command in STARTING[3:] if not any(name in command for name in GIVEN)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('command', FURTHER)
 def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
     terminal = terminals(command)
