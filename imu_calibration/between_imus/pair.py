@@ -94,15 +94,12 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
     inside = offset < (last - first)[:, None]
     phase = np.pi * ((time[index] - centres[:, None]) / length + 0.5)
     sine = np.sin(phase)
-    share = np.gradient(time)[index] / length
+    relative_step = np.gradient(time)[index] / length
     norm = 1 / 0.3125  # the mean of sin^6 over its half period is 5/16
-    weight = np.where(inside, norm * sine**SINE_POWER * share, 0.0)
-    slope = np.where(
-        inside,
-        -norm * SINE_POWER * np.pi / length * sine ** (SINE_POWER - 1) * np.cos(phase) * share,
-        0.0,
-    )
-    return Windows(index, weight, slope)
+    weight = np.where(inside, norm * sine**SINE_POWER * relative_step, 0.0)
+    factor = -norm * SINE_POWER * np.pi / length
+    slope = factor * sine ** (SINE_POWER - 1) * np.cos(phase) * relative_step
+    return Windows(index, weight, weight_slope=np.where(inside, slope, 0.0))
 
 
 def _weighted(index: np.ndarray, weight: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -213,9 +213,7 @@ def _missing_effects(findings: Iterable[Question], model: SensorModel) -> list[Q
     return [question for question in findings if question.effect.key not in model.slices]
 
 
-def _is_insignificant(
-    solution: Solution, question: Question, settings: SelectionSettings = SelectionSettings()
-) -> bool:
+def _is_insignificant(solution: Solution, question: Question, settings: SelectionSettings) -> bool:
     """Return whether an effect is in a solution but not significant."""
     if question.effect.key not in solution.model.slices:
         return False

@@ -219,14 +219,14 @@ def loss_of(
     """
     model, values = invertible_values(calibration)
     ref = motion.reference
-    estimated = []
+    estimated = [
+        effect
+        for effect in model.effects
+        if effect.key in calibration.model.slices and affine.capability_of(effect, target.estimates)
+    ]
     values_unestimated = values.copy()
-    for effect in model.effects:
-        if effect.key not in calibration.model.slices:
-            continue
-        if affine.capability_of(effect, target.estimates):
-            estimated.append(effect)
-            values_unestimated[model.slices[effect.key]] = effect.prior_values()
+    for effect in estimated:
+        values_unestimated[model.slices[effect.key]] = effect.prior_values()
     # In the frame of the program: true quantities, and readings by the formula of the program.
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
     # The whole document represents all effects of the full compensation.
@@ -246,10 +246,11 @@ def loss_of(
         )
         corrected = target.corrected(numbers, readings)
         for effect in model.effects:
-            if effect not in estimated:
-                lost_effect = _lost_effect(calibration, effect, target.holds, motion)
-                if lost_effect is not None:
-                    lost.append(lost_effect)
+            if effect in estimated:
+                continue
+            lost_effect = _lost_effect(calibration, effect, target.holds, motion)
+            if lost_effect is not None:
+                lost.append(lost_effect)
     remaining = {}
     raw_error = {}
     for index, sensor in enumerate(SENSORS):

@@ -247,8 +247,8 @@ class HandKnowledge:
         `ups` are the directions that point up in each of the k poses. The derivative depends on the
         values of the parameters, not on the information.
         """
-        bias, matrix, *_ = self.model.linear(self.values)
-        forces = bias + self.model.gravity * ups @ matrix.T
+        linear = self.model.linear(self.values)
+        forces = linear.force_bias + self.model.gravity * ups @ linear.force_matrix.T
         # At the reference time and temperature the columns of thermal effects are zero: one more
         # pose has no information about them.
         count = len(ups)
@@ -391,8 +391,10 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     for name, in_tolerances in undetermined.items():
         sensor = name.partition('.')[0]
         text = _without_motion(hand, hand.param_names.index(name), excesses)
-        group = remedies.setdefault((sensor, text), {}) if text else lacking.setdefault(sensor, {})
-        group[name] = in_tolerances
+        if text:
+            remedies.setdefault((sensor, text), {})[name] = in_tolerances
+        else:
+            lacking.setdefault(sensor, {})[name] = in_tolerances
     knowledge = knowledge_after(hand)
     plan = foretold(knowledge)[:1] if lacking else []
 

@@ -131,6 +131,7 @@ class HeldOutPoses(HeldOutData[HandCalibration]):
                 is_held_out = out[turn.first] or out[turn.last]
                 if turn.rotation is None and is_held_out and is_settled[turn.first]:
                     turns.append(turn)
+            # Without too many of the turns the gyroscope is not estimated well enough to be judged.
             if len(self.turns) - len(turns) < self.least_turns:
                 turns = []
             parts.append(HeldOutPart(out & is_settled, turns))

@@ -31,6 +31,8 @@ Mean square of the slopes of forces across gravity, relative to its expectation 
 which poses creep.
 """
 
+NOISE_PIECES = 8
+"""Pieces of an interval at rest whose means show noise that is not white."""
 ATTITUDES_APART = 0.2
 """Attitudes closer than this count as one pose, rad."""
 DITHER = 3.0
@@ -168,16 +170,14 @@ def noise_statistics(poses: Poses) -> dict[str, float | list[float]]:
     return statistics
 
 
-def _pooled_noise(
-    parts: Sequence[np.ndarray], rounding: np.ndarray, pieces: int = 8
-) -> SensorNoise:
+def _pooled_noise(parts: Sequence[np.ndarray], rounding: np.ndarray) -> SensorNoise:
     """
     Return the SensorNoise of one sensor from its readings in the intervals.
 
     The variance of single readings is the median of those of the intervals, at least that of
     rounding, shape (3,). The noise need not be white: the inflation is the variance of the means of
-    n samples times n over the variance of single readings, from `pieces` pieces of each interval,
-    if it exceeds 1 by two standard deviations.
+    n samples times n over the variance of single readings, from `NOISE_PIECES` pieces of each
+    interval, if it exceeds 1 by two standard deviations.
     """
     # Readings without any scatter get a weight that is finite.
     floor = 1e-9 * max(1e-3, max(np.max(np.abs(part)) for part in parts))
@@ -185,9 +185,10 @@ def _pooled_noise(
     sd = np.sqrt(np.maximum(median_variance, rounding)) + floor
     ratios = []
     for part in parts:
-        n_samples = len(part) // pieces
+        n_samples = len(part) // NOISE_PIECES
         if n_samples >= 4:
-            means = part[: n_samples * pieces].reshape(pieces, n_samples, 3).mean(1)
+            pieces = part[: n_samples * NOISE_PIECES].reshape(NOISE_PIECES, n_samples, 3)
+            means = pieces.mean(1)
             # Differences of neighbours: a slow drift belongs to the scatter between poses, not
             # here. They have twice the variance of the means.
             ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * n_samples / sd**2)
@@ -195,7 +196,7 @@ def _pooled_noise(
         return SensorNoise(sd**2, np.ones(3))
     ratio = np.mean(ratios, axis=0)
     # The mean of n squared differences of neighbours has the relative variance 3 / n.
-    margin = 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
+    margin = 2 * np.sqrt(3 / (len(ratios) * (NOISE_PIECES - 1)))
     return SensorNoise(sd**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
 
