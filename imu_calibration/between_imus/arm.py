@@ -134,7 +134,7 @@ def _fit_arm(rows: ArmRows) -> Fit:
     force_delay_column = -rows.force_slope[:, :, None]
     arm = np.zeros(3)
     for number in range(3):
-        # The column of the rates' delay needs the arm: the first fit has none.
+        # The column of the rates' delay needs the arm of the fit before: the first fit has none.
         rate_delay_column = (lever_slope @ arm)[:, :, None]
         design = np.concatenate(
             [lever, bias_columns, force_delay_column, rate_delay_column], axis=2
@@ -221,7 +221,7 @@ def _robust_fit(design: np.ndarray, target: np.ndarray, alpha_noise: float) -> _
     squares = np.zeros(len(design))  # squared residual of each window
     flat = design.reshape(-1, design.shape[2])
     values = np.full(design.shape[2], np.inf)
-    for _ in range(30):
+    for _ in range(30):  # or until the values have settled
         excess = 2 * alpha_noise * np.sum(weights - weight_fall * squares / 3)
         right_side = flat.T @ (target * weights[:, None]).ravel()
         previous_values = values
@@ -372,7 +372,7 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
         fit = _fit_arm(rows)
         remaining_delay = fit.values[-1]
         delay += remaining_delay
-        if abs(remaining_delay) < 1e-5:
+        if abs(remaining_delay) < 1e-5:  # s
             break
     return _result(rows, fit, delay, rotation, (a, b))
 

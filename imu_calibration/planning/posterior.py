@@ -86,6 +86,7 @@ def relax(
     visits = 1.0 / len(seconds) / seconds
     best = Relaxation(0.0, weights)
     for number in range(MAX_WEIGHT_STEPS):
+        # 1. The visits, scaled until the worst parameter meets its tolerance, and the prices K.
         direction = np.tensordot(visits[useful], flat_useful, 1).reshape(prior.shape)
         scale = _scale(direction, root, whitened_rows)
         # Nearly singular in unreachable directions.
@@ -97,8 +98,9 @@ def relax(
         worth = np.zeros(len(seconds))
         worth[useful] = flat_useful @ prices.ravel() / seconds[useful]
         plan_seconds = scale * float(visits @ seconds)
+        # 2. Now and then the certificate. It needs the worth of all motions, the steps only that of
+        #    the useful ones.
         if number % 25 == 0 or number == MAX_WEIGHT_STEPS - 1:
-            # The certificate needs the worth of all motions, the steps only of the useful ones.
             worth = flat @ prices.ravel() / seconds
             factor = 1.0 / worth.max()
             bound = factor * (weights @ (2 * variance - 1) - np.sum(prior * prices))
@@ -110,7 +112,7 @@ def relax(
             is_visited = visits * seconds > 1e-4 * (visits @ seconds)
             useful = np.flatnonzero((worth > 0.3 * worth.max()) | is_visited)
             flat_useful = flat[useful]
-        # Step of the visits, relative to the mean worth of the time spent; then of the weights.
+        # 3. Step of the visits, relative to the mean worth of the time spent; then of the weights.
         spent = visits[useful] * seconds[useful]
         mean_worth = worth[useful] @ spent / spent.sum()
         visits[useful] *= np.sqrt(np.maximum(worth[useful], 1e-12) / mean_worth)

@@ -64,14 +64,14 @@ def build_rows(
         Time constants of warm-ups under test, s.
 
     """
-    # An effect has one column group, a warm-up one for each time constant.
+    # Column groups: one of an effect, of a warm-up one for each time constant.
     groups = [_ColumnGroup(effect, effect.name) for effect in effects if not effect.time_constant]
     for effect in effects:
         if effect.time_constant:
             for number, tau in enumerate(constants):
                 groups.append(_ColumnGroup(effect, f'{effect.name}@{number}', float(tau)))
 
-    # Order of the parameters: baseline, Earth's rate, column groups.
+    # Parameters in the order baseline, Earth's rate, column groups.
     parts = {}
     prior_sds = [FREE_SD_FACTOR * hand.hand_model.priors, np.array([EARTH_UPWARDS_SD])]
     start = hand.hand_model.size + 1
@@ -92,6 +92,7 @@ def build_rows(
             )
             at_rest[group.effect.sensor][group.label] = columns[:, :, : group.size]
 
+    # Rows of the poses and of the turns.
     blocks = [
         _norm_block(hand, space, at_rest['accelerometer']),
         _rest_block(hand, space, at_rest['gyroscope']),

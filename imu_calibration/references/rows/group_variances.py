@@ -174,9 +174,10 @@ class _Groups:
         step = np.zeros(len(extra))
         if len(index):
             step[index] = np.linalg.solve(information[np.ix_(index, index)], score[index])
+        # Not below zero, and by at most a hundred typical variances in one step.
         return _ScoringStep(
-            np.clip(extra + step, 0.0, extra + 100 * typical),
-            2 * np.diag(information) * typical**2,
+            variance=np.clip(extra + step, 0.0, extra + 100 * typical),
+            dof=2 * np.diag(information) * typical**2,
         )
 
 
