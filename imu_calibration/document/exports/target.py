@@ -116,11 +116,12 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     for line in text_of(content, what).splitlines():
         fields = re.split(r'[\s,=]+', line.partition('#')[0].strip())
         # The first field in capitals is the name, the next one the value.
-        for name, value in zip(fields, fields[1:]):
-            if re.fullmatch(r'[A-Z][A-Z0-9_]+', name):
-                break
-        else:
+        pairs = [
+            pair for pair in zip(fields, fields[1:]) if re.fullmatch('[A-Z][A-Z0-9_]+', pair[0])
+        ]
+        if not pairs:
             continue
+        name, value = pairs[0]
         try:
             parameters[name] = float(value)
         except ValueError as error:

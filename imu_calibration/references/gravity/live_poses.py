@@ -527,8 +527,14 @@ class LiveByHand(LiveSession):
         for sensor in frozen_sensors:
             imu = without_sensor(imu, sensor)
         delay = delay_of(imu)
-        findings = tuple(late_gyroscope(delay))
-        recording = SampleRecording(imu, None, self.counts, findings, delay, frozen_sensors)
+        recording = SampleRecording(
+            imu=imu,
+            temperature_c=None,
+            counts=self.counts,
+            findings=tuple(late_gyroscope(delay)),
+            delay=delay,
+            unusable=frozen_sensors,
+        )
         self.result = calibrate_poses(recording, self.options, provenance, stills=self.scan.rests)
         return self.result
 
