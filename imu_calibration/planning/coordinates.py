@@ -253,12 +253,10 @@ class ToldApart:
         ratios = np.empty((len(covariance), len(self.pairs)))
         prior = self.coordinates.prior_information
         for number, (a, b) in enumerate(self.pairs):
-            omitted = np.zeros(0, int)
-            for cause in self.causes:
-                if cause is not a and cause is not b:
-                    omitted = np.concatenate([omitted, cause.places])
+            others = [cause.places for cause in self.causes if cause not in (a, b)]
             conditional = covariance[:, a.places[:, None], a.places]
-            if len(omitted):
+            if others:
+                omitted = np.concatenate(others)
                 cross = covariance[:, a.places[:, None], omitted]
                 conditional = conditional - cross @ np.linalg.solve(
                     covariance[:, omitted[:, None], omitted], cross.transpose(0, 2, 1)

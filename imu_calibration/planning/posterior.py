@@ -407,9 +407,10 @@ class Posterior:
                 # The mean of an axis is linear in z and has the sum of the axis' processes.
                 rows = np.zeros((3, len(information)))
                 rows[:, : self.size] = window.means[sensor]
-                for number in range(3 * len(noise.bias_processes)):
-                    rows[number % 3, first_process + number] = 1.0
-                first_process += 3 * len(noise.bias_processes)
+                n_processes = len(noise.bias_processes)
+                next_sensor = first_process + 3 * n_processes
+                rows[:, first_process:next_sensor] = np.tile(np.eye(3), n_processes)
+                first_process = next_sensor
                 variance = window.variance[sensor] + noise.offset_sd**2
                 information += rows.T @ (rows / variance[:, None])
         return information
