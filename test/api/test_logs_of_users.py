@@ -23,8 +23,8 @@ G0 = 9.80665
 
 @pytest.fixture(scope='module')
 def readings():
-    """Time in s, specific force and rates of a session at 100 Hz."""
-    motion, generator = hand_motion(hz=100.0, n_poses=12, seed=93), np.random.default_rng(93)
+    """Time in s, specific force and rates of a session at 50 Hz."""
+    motion, generator = hand_motion(hz=50.0, n_poses=12, seed=93), np.random.default_rng(93)
     force = ACCELEROMETER.read(motion.force, generator)
     return motion.time, force, GYROSCOPE.read(motion.rate, generator)
 

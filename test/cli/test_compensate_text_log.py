@@ -17,7 +17,7 @@ from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration
 
-N, RATE = 3000, 100.0
+N, RATE = 1500, 50.0
 
 
 @pytest.fixture
