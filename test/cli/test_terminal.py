@@ -226,6 +226,13 @@ def on_terminal(arguments, *, errors=False, code=0, **environment):
     return found
 
 
+def width_of(output):
+    """Return the length of the longest of more than ten lines, without colours."""
+    lines = re.sub(rb'\x1b\[[0-9;?]*[a-zA-Z]', b'', output).decode().splitlines()
+    assert len(lines) > 10
+    return max(map(len, lines))
+
+
 @pytest.mark.live
 @pytest.mark.parametrize('verb', parser.VERBS)
 def test_help_is_shorter_than_60_lines_on_a_terminal(verb):
@@ -240,7 +247,6 @@ def test_help_is_shorter_than_60_lines_on_a_terminal(verb):
         ['compensate', '--help'],
         ['convert', '--help'],
         ['effects'],
-        ['inspect', SESSION],
         ['export', '--list'],
     ],
 )
@@ -250,8 +256,7 @@ def test_no_line_is_wider_than_the_terminal(arguments):
 
     Help up to 138 columns, equations, names of parameters.
     """
-    lines = re.sub(rb'\x1b\[[0-9;?]*[a-zA-Z]', b'', on_terminal(arguments)).decode().splitlines()
-    assert len(lines) > 10 and max(map(len, lines)) <= 80
+    assert width_of(on_terminal(arguments)) <= 80
 
 
 @pytest.mark.live
@@ -269,9 +274,11 @@ def test_no_line_of_an_error_is_wider_than_the_terminal(arguments):
 
 
 @pytest.mark.live
-def test_colour_is_for_terminals_and_not_with_no_color(tmp_path):
+def test_an_inspection_has_colour_on_terminals_and_not_with_no_color(tmp_path):
+    shown = on_terminal(['inspect', SESSION])
+    assert b'\x1b[32m' in shown
+    assert width_of(shown) <= 80
     bag = str(write_small_bag(tmp_path / 'bag'))
-    assert b'\x1b[32m' in on_terminal(['inspect', bag])
     assert b'\x1b[3' not in on_terminal(['inspect', bag], NO_COLOR='1')
     plain = subprocess.run(
         [sys.executable, '-m', 'imu_calibration', 'inspect', bag],
