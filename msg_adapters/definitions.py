@@ -315,6 +315,7 @@ class _ElementCounter:
             return 1
         item, size = content
         n_per_item = self._count_in_field(item)
+        # Elements without fields need no bytes: a short message could state billions of them.
         if n_per_item == 0:
             raise ValueError(f'{self.message_type} has a sequence of elements without fields')
         if kind.name == 'ARRAY':

@@ -213,7 +213,7 @@ class RecordingTimes:
         """
         Return `Moments` for the prediction: the sampling errors of a recording of this length, s.
 
-        The Allan variances in them are ones.
+        The prediction uses their scales only; ones take the place of the Allan variances.
         """
         if seconds not in self._covariance_of_length:
             n = int(seconds / self._period)

@@ -167,7 +167,9 @@ def _at_step(mean: np.ndarray, still: np.ndarray, width: int) -> np.ndarray:
     Return a mask of the chunks at a step of the means, shape (n_chunks,).
 
     At a step the means of `width` chunks before and after, all at rest, differ by more than
-    `OUTLIER` times the usual difference, and by more than at all chunks nearby.
+    `OUTLIER` times the usual difference, and by more than at all chunks nearby. An eighth of
+    `width` on both sides of a step belongs to it, because its place is found within a few chunks.
+    With fewer than 4 `width` comparisons the usual difference is unknown, and there is no step.
 
     Parameters
     ----------

@@ -123,7 +123,7 @@ def _angle_sd(axis: np.ndarray, j: int, axis_cov: np.ndarray) -> float:
     """
     Return the sd of the angle to coordinate axis j.
 
-    Near zero, where the angle has no slope, that of the tilt itself.
+    Near zero, where the angle has no slope, that of one component of the tilt.
     """
     # angle = atan2(s, a_j) with the sine s, the length of the part of the axis across j:
     # d angle / d a_k = a_j a_k / s,   d angle / d a_j = -s
@@ -131,6 +131,7 @@ def _angle_sd(axis: np.ndarray, j: int, axis_cov: np.ndarray) -> float:
     sine = np.linalg.norm(axis[others])
     tilt_variance = np.trace(axis_cov[np.ix_(others, others)])
     if sine**2 <= tilt_variance:
+        # The trace is the sum of the variances of two components.
         return float(np.sqrt(tilt_variance / 2))
     slope = axis[j] * axis / sine
     slope[j] = -sine

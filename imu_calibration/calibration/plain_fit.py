@@ -195,10 +195,12 @@ def plan_of(solution: Solution, sensor: str, reference: np.ndarray) -> PlainEsti
             continue
         if effect.role in FITTED:
             replaced[parameters] = fitted[parameters] = True
+        # The limit of a range has no linear column, and the reference is that of both fits.
         elif effect.role is not Role.LIMIT and not is_of_reference(effect):
             replaced[parameters] = True
             dropped.append(effect.name)
-    # Entries without information keep their values; weak ones at their prior are estimated.
+    # Held parameters keep their values, because the data have no information on them; only weak
+    # ones, which `solution.replaced` names (their estimate was replaced by the prior), are fitted.
     uninformed = solution.held & ~np.isin(solution.param_names, solution.replaced)
     fitted &= ~uninformed
     replaced &= ~uninformed

@@ -177,14 +177,18 @@ def _step(step_ns: int | None) -> str:
 def _show_calibration(
     out: 'Terminal', summary: 'RecordingSummary', hints: dict[str, str]
 ) -> list[str]:
-    """Print data and parameters of the calibration; return why it is missing, a line each."""
+    """
+    Print data and parameters of the calibration; return why it cannot be used, a line each.
+
+    Nothing of a refused recording: its reasons are those of the summary.
+    """
     result = summary.calibrated
     if result is None or summary.refused:
         return []
     if isinstance(result, ImuCalibrationError):
         why = f'{summary.reference.not_usable}: {result.with_hint(hints)}'
         out.print(why)
-        return summary.reference.reasons([why], [])
+        return summary.reference.reasons(lacking=[why], doubts=[])
     for line in summary.reference.used_lines(result.calibration):
         out.print(line)
     _show_parameters(out, result.calibration, hints)

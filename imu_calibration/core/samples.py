@@ -300,6 +300,7 @@ class SampleBlock:
 
         """
         times = _times_of(time)
+        # Checked as floats; the stamps are made of `times`, whose integers are exact nanoseconds.
         seconds = _numbers('time', times, (np.size(times),))
         n = len(seconds)
         force_s = _numbers('force', force, (n, 3))

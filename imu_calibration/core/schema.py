@@ -106,7 +106,8 @@ def number(
     """
     Require a number that a float can hold, in [low, high].
 
-    `above`: larger than `low`. Without `finite`, infinite values and NaN are accepted.
+    `above`: larger than `low`. Without `finite`, every float is accepted, infinite values and NaN
+    too, and the limits hold for other numbers only.
     """
 
     def check(value: Any, place: str) -> None:

@@ -231,7 +231,8 @@ def wrap_steps(
         wraps &= distance < NEIGHBOUR_SHARE * sizes
     # Before the step the reading moves towards the end of the range.
     wraps &= earlier * np.sign(size) < BACKWARD_SHARE * sizes
-    # The end of the range: no reading of this sensor so far is beyond it.
+    # The end of the range: no reading of this sensor up to row + 3, the last one compared above, is
+    # beyond it. It lies at most one smooth step beyond both readings.
     end = np.maximum(np.abs(before), np.abs(after)) + neighbours
     wraps &= largest_so_far(samples, largest)[row + 3, column // 3] < END_SHARE * end
     return row[wraps] + 1, column[wraps], size[wraps] > 0

@@ -157,7 +157,7 @@ def draw(
         paint(figure, *data)
         canvas = _laid_out(figure)
         text = io.StringIO()
-        # Of pictures inside, which the canvas lays out at 72.
+        # The layout leaves the figure at 72 dots per inch, too coarse for pictures inside the SVG.
         figure.dpi = matplotlib.rcParams['figure.dpi']
         canvas.print_svg(
             text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None}

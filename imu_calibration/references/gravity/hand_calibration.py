@@ -510,6 +510,8 @@ def _best_time_constant(
 
     The best one has the smallest scatter of the sensor between poses.
     """
+    # The first two of `COMPONENTS`: the scatter of poses is that of the accelerometer, the drift
+    # that of the gyroscope.
     component = SENSORS.index(effect.sensor)
     trials = []
     variances = []

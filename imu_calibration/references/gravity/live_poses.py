@@ -282,8 +282,9 @@ def hand_coverage(
     if result is not None:
         if is_done(result):
             return replace(no_gain, done=True)
-        # Nor does an attitude determine more where each need is an input or a cause to be found. A
-        # sensor that moved at rest is put down in the attitude that the picture shows.
+        # Nor does an attitude determine more where each need is an input or a cause to be found,
+        # the keys of `REMEDY_KEYS`. `MOVED_REMEDY` is none of them: a sensor that moved at rest is
+        # put down again, in the attitude that the picture shows.
         needs = needs_of(result.calibration)
         if needs and set(needs) <= set(REMEDY_KEYS):
             return replace(no_gain, next=Step(needs[0]))

@@ -202,7 +202,8 @@ class NoiseModel(SensorNoise):
         """
         Return whether the weights of moving windows are those of `other` within `SAME_VARIANCE`.
 
-        A kind of window without additional weight of its slow part is not compared.
+        Only separate weights of slow and fast parts depend on the values of the parameters and need
+        another round of estimation; a kind of window with one weight for both is not compared.
         """
         variance_ratio = self.low_variance / other.low_variance
         for kind, factors in self.moving.items():

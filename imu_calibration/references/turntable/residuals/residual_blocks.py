@@ -392,9 +392,12 @@ def _used_windows(windows: Sequence[Window], length: float) -> np.ndarray:
     n_blocks = 0
     for window in windows:
         n_blocks += 1 if len(window.motion) == 1 else _count_blocks(window, length)
-    if n_blocks <= 2 * MAX_RESIDUAL_BLOCKS:
+    # The length allows for `MAX_RESIDUAL_BLOCKS` blocks of moving windows; rests and windows
+    # shorter than a block come in addition.
+    most = 2 * MAX_RESIDUAL_BLOCKS
+    if n_blocks <= most:
         return np.arange(len(windows))
-    n_used = len(windows) * 2 * MAX_RESIDUAL_BLOCKS // n_blocks
+    n_used = len(windows) * most // n_blocks
     return np.sort(np.random.default_rng(0).permutation(len(windows))[:n_used])
 
 
