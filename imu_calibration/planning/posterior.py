@@ -117,7 +117,10 @@ def relax(
         mean_worth = worth[useful] @ spent / spent.sum()
         visits[useful] *= np.sqrt(np.maximum(worth[useful], 1e-12) / mean_worth)
         # Early steps keep the visits of the other motions, which may become useful again.
-        visits = np.where(np.isin(np.arange(len(visits)), useful) | (number <= 50), visits, 0.0)
+        if number > 50:
+            kept = np.zeros_like(visits)
+            kept[useful] = visits[useful]
+            visits = kept
         weights = weights * variance / variance.max()
         weights /= weights.sum()
     return best
@@ -143,11 +146,12 @@ def _scale(direction: np.ndarray, root: np.ndarray, whitened_rows: np.ndarray) -
     whitened = scipy.linalg.solve_triangular(root, half_whitened.T, lower=True)
     values, vectors = scipy.linalg.eigh(0.5 * (whitened + whitened.T))
     squares = (whitened_rows @ vectors) ** 2
+    values = np.maximum(values, 0.0)
     low = -30.0
     high = 60.0
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
-        variance = (squares / (1 + np.exp(middle) * np.maximum(values, 0.0))).sum(axis=1)
+        variance = (squares / (1 + np.exp(middle) * values)).sum(axis=1)
         if variance.max() <= 1.0:
             high = middle
         else:

@@ -38,7 +38,7 @@ from worlds.searched_by_hand import searched
 
 NOTHING = np.zeros(3)
 MG, DEG = 9.80665e-3, np.pi / 180
-RIVALS = 'accel_quadratic+accel_scale_asymmetry+accel_cross_product'
+PRODUCTS = 'accel_quadratic+accel_scale_asymmetry+accel_cross_product'
 DRIFTS = 'gyro_bias_drift+gyro_bias_trend+gyro_g_sensitivity'
 """Candidates, with those that resemble an effect that is hidden here."""
 HIDDEN = {
@@ -105,7 +105,11 @@ def responding():
 @pytest.mark.parametrize(
     ('name', 'n_poses', 'candidates'),
     [
-        ('accel_quadratic', 36, f'{RIVALS}+accel_cubic+gyro_g_sensitivity'),
+        (
+            'accel_quadratic',
+            36,
+            'accel_quadratic+accel_cubic+accel_scale_asymmetry+gyro_g_sensitivity',
+        ),
         ('gyro_bias_drift', 24, f'{DRIFTS}+accel_quadratic'),
         ('gyro_g_sensitivity', 24, None),
     ],
@@ -270,7 +274,7 @@ def test_the_turns_tell_apart_what_is_one_to_the_norm():
 
     imu, ranges, _ = simulate(36, n_poses=24, spoil=spoil)
     data = gather_by_hand(imu, ranges)
-    result = diagnose_by_hand(data, options_of(RIVALS))
+    result = diagnose_by_hand(data, options_of(PRODUCTS))
     assert result.diagnosis.findings[0].effect == 'accel_cross_product'
     for name, true in (('x_yz', 15 * MG / 9.8**2), ('y_xz', 0.0), ('z_xy', 0.0)):
         full = f'accelerometer.accel_cross_product.{name}'

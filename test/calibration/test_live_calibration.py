@@ -14,6 +14,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.decision import HELPS
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.references.turntable import collector
@@ -29,6 +30,9 @@ from worlds.calibrated import calibrated_on_table
 from worlds.tables import three_axis_table
 
 TABLE = three_axis_table(height=150.0, mount={'rpy_deg': [0, 0, 0], 'xyz': None})
+OPTIONS = CalibrationOptions(
+    catalogue=CATALOGUE.with_candidates('accel_quadratic+gyro_g_sensitivity+time_offset')
+)
 SD = 1e-6
 """Live and offline agree to this share of the standard deviation."""
 
@@ -78,7 +82,7 @@ def blocks(*streams, seed=0, mean_seconds=0.5):
         yield SampleBlock(*parts)
 
 
-def offline(*sessions, options=CalibrationOptions()):
+def offline(*sessions, options=OPTIONS):
     """Return what the offline tool says."""
     return calibrated_on_table([[SampleBlock(*s)] for s in sessions], TABLE, options)
 
@@ -100,7 +104,7 @@ def assert_same(a, b, share=SD):
 @pytest.fixture(scope='module')
 def whole(quick):
     """Return a live calibration after the session; solutions do not change it."""
-    live = LiveCalibration(TABLE)
+    live = LiveCalibration(TABLE, OPTIONS)
     run(live, *quick)
     return live
 
@@ -114,7 +118,7 @@ def test_the_live_answer_is_the_offline_answer(whole, expected):
 
 
 def test_solving_on_the_way_changes_nothing(quick, expected):
-    live, count = LiveCalibration(TABLE), 0
+    live, count = LiveCalibration(TABLE, OPTIONS), 0
     for number, block in enumerate(blocks(*quick, seed=3)):
         live.push(block)
         if number % 60 == 59:
@@ -130,7 +134,7 @@ def test_windows_that_are_open_count_only_when_asked_for(quick):
 
     With them there are more samples, without them the windows that were completed.
     """
-    live = LiveCalibration(TABLE)
+    live = LiveCalibration(TABLE, OPTIONS)
     completed = [window for part in list(blocks(*quick))[:280] for window in live.push(part)]
     used = sum(len(window) for window in completed if window.kind != 'unused')
     without, with_open = (
@@ -148,7 +152,7 @@ def tilted():
 
 
 def test_a_tilted_table_is_linearised_anew_like_offline(tilted):
-    live = LiveCalibration(TABLE)
+    live = LiveCalibration(TABLE, OPTIONS)
     run(live, *tilted)
     expected = offline(tilted)
     tilt = expected.calibration.value('reference', 'table_tilt')
@@ -161,7 +165,7 @@ def test_a_tilted_table_is_linearised_anew_like_offline(tilted):
 
 
 def test_a_store_too_small_is_said_and_still_gives_the_first_pass(tilted):
-    live = LiveCalibration(TABLE, settings=LiveSettings(store_samples=100))
+    live = LiveCalibration(TABLE, OPTIONS, settings=LiveSettings(store_samples=100))
     run(live, *tilted)
     result = live.solve(pending=True)
     assert live.needs_linearising and not live._collector.store.complete
@@ -179,10 +183,10 @@ def cut(samples, start, stop):
 
 def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
     halves = [tuple(cut(s, *part) for s in quick) for part in ((0.0, 0.5), (0.5, 1.0))]
-    first = LiveCalibration(TABLE)
+    first = LiveCalibration(TABLE, OPTIONS)
     run(first, *halves[0])
     data = collector.to_bytes(first.gathered(pending=True), first.model)
-    second = LiveCalibration(TABLE, saved=data)
+    second = LiveCalibration(TABLE, OPTIONS, saved=data)
     assert second.n_windows > 20
     run(second, *halves[1])
     result, expected = second.solve(pending=True), offline(*halves)
@@ -218,7 +222,7 @@ def test_a_proven_session_is_proven_after_resume(whole):
     Without them the resumed session was unproven until as many windows had come again.
     """
     before = whole.solve(pending=True).calibration
-    after = LiveCalibration(TABLE, saved=whole.saved(pending=True)).solve().calibration
+    after = LiveCalibration(TABLE, OPTIONS, saved=whole.saved(pending=True)).solve().calibration
     assert set(before.decisions.values()) == {HELPS} and after.decisions == before.decisions
     for sensor in before.proof:
         assert after.proof[sensor].windows == before.proof[sensor].windows
@@ -287,7 +291,7 @@ def test_before_the_first_temperature_there_is_nothing_to_save():
 
 
 def test_a_state_of_another_model_or_a_broken_one_is_refused():
-    live = LiveCalibration(TABLE)
+    live = LiveCalibration(TABLE, OPTIONS)
     data = collector.to_bytes(live.gathered(), live.model)
     with refused(DocumentError, 'other_model', 'accel_size_effect'):
         LiveCalibration(
@@ -310,7 +314,7 @@ def test_a_state_of_another_model_or_a_broken_one_is_refused():
 
 
 def test_before_any_motion_it_waits_and_says_for_what():
-    live = LiveCalibration(TABLE)
+    live = LiveCalibration(TABLE, OPTIONS)
     with pytest.raises(NotObservableError):
         live.solve()
     groups = {(g.sensor, g.effect): g for g in live.groups()}
@@ -321,7 +325,9 @@ def test_before_any_motion_it_waits_and_says_for_what():
 def test_groups_name_the_motion_that_is_still_needed(quick):
     options = CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect')
     live = LiveCalibration(TABLE, options)
-    still = [window for window in run(LiveCalibration(TABLE), *quick) if window.kind == 'static']
+    still = [
+        window for window in run(LiveCalibration(TABLE, OPTIONS), *quick) if window.kind == 'static'
+    ]
     until = int(np.searchsorted(quick[0].stamp_ns, still[1].stamp_ns[-1]))
     run(live, *(s.select(slice(0, until)) for s in quick))
     live.solve(pending=True)
@@ -340,7 +346,7 @@ def test_groups_name_the_motion_that_is_still_needed(quick):
 
 
 def test_residuals_are_what_the_model_leaves(quick):
-    live = LiveCalibration(TABLE, settings=LiveSettings(residual_rate=10.0))
+    live = LiveCalibration(TABLE, OPTIONS, settings=LiveSettings(residual_rate=10.0))
     windows = run(live, *quick)
     assert live.residuals(windows) is None
     result = live.solve(pending=True)
@@ -369,7 +375,7 @@ def test_windows_of_one_kind_are_saved_in_common_columns(whole):
 
 
 def test_memory_stays_bounded(quick):
-    live = LiveCalibration(TABLE, settings=LiveSettings(store_samples=2000))
+    live = LiveCalibration(TABLE, OPTIONS, settings=LiveSettings(store_samples=2000))
     imu, joints = quick
     length = int(imu.stamp_ns[-1] - imu.stamp_ns[0]) + 10**10
     largest = []

@@ -24,8 +24,7 @@ from worlds.physics import make_session
 
 HYSTERESIS = ('accel_thermal_hysteresis', 'gyro_thermal_hysteresis')
 FEW = '+'.join(HYSTERESIS) + (
-    '+accel_thermal_bias+gyro_thermal_bias+gyro_thermal_scale+accel_bias_drift+'
-    'gyro_bias_drift+gyro_g_sensitivity'
+    '+accel_thermal_bias+gyro_thermal_bias+accel_bias_drift+gyro_bias_drift'
 )
 SHORT = {
     'profile': 'random_short',
