@@ -1,5 +1,5 @@
 """
-Scripts whose searches for effects on a table test only some candidates, without reports.
+Scripts whose searches for effects test only some candidates, without reports.
 
 Scripts are run as users run them, without an argument for the candidates of their searches.
 `python -m without_search 'EFFECT+... MODULE [ARGUMENT ...]' ...` runs modules one after the other,
@@ -16,19 +16,22 @@ from unittest.mock import patch
 
 @contextlib.contextmanager
 def candidates_in_scripts(candidates: str) -> Iterator[None]:
-    """Test only these effects of the catalogue, and those of users, in each search on a table."""
+    """Test only these effects of the catalogue, and those of users, in each search."""
     from imu_calibration.effects.catalogue import CATALOGUE
-    from imu_calibration.references.turntable.selection import investigation
+    from imu_calibration.references.gravity import model_selection
+    from imu_calibration.references.turntable.selection import testable_effects
 
-    every = investigation.testable_effects
+    every = testable_effects.sort_effects
     chosen = CATALOGUE.with_candidates(candidates).candidates
     left_out = {name for _, name in CATALOGUE.effects()} - set(chosen)
 
-    def some(*arguments):
-        effects, not_testable = every(*arguments)
+    def some(*arguments, **options):
+        effects, not_testable = every(*arguments, **options)
         return [effect for effect in effects if effect.name not in left_out], not_testable
 
-    with patch.object(investigation, 'testable_effects', some):
+    with contextlib.ExitStack() as stack:
+        for search in (model_selection, testable_effects):
+            stack.enter_context(patch.object(search, 'sort_effects', some))
         yield
 
 

@@ -12,8 +12,8 @@ from imu_calibration.kinematics.table import Table
 from validation.section import Section, text
 
 SEED = 31
-MOST_WORLDS = None
-"""Worlds that are run at most; None: all."""
+WORLDS = slice(None)
+"""Those that are run."""
 ON_A_SHAFT = ('driver_lag', 'rate_dependent_lag', 'motor_ripple', 'flexible_mount')
 
 
@@ -66,7 +66,7 @@ def outcome(cause, options):
 def run(folder, plots):
     """Return the section."""
     section, rows, improved = Section('Worlds with causes outside the catalogue'), [], []
-    for cause, table, options in worlds()[:MOST_WORLDS]:
+    for cause, table, options in worlds()[WORLDS]:
         cells, helps = outcome(cause, options)
         improved += helps
         rows.append(((cause or 'none').replace('_', ' '), table, *cells))

@@ -62,7 +62,7 @@ SMALLEST: dict[str, Any] = {
     'held_out.SPLITS': 2,
     'inspecting.ALL': slice(-1, None),
     'inspecting.SEVERAL': 'ferraris',
-    'misfit.MOST_WORLDS': 2,
+    'misfit.WORLDS': slice(1, 2),
     'mpu9150.LEFT_OUT': 2,
     'mpu9150.TURNS': 1,
     'noise.RESTING': slice(2, 3),
@@ -104,7 +104,7 @@ def reduced_to_smallest():
             module_name, constant = place.split('.')
             module = importlib.import_module(f'validation.{module_name}')
             entries = getattr(module, constant)
-            if entries is None or isinstance(entries, (int, float, str)):
+            if entries is None or isinstance(entries, (int, float, str, slice)):
                 reduced = size
             elif isinstance(size, slice):
                 reduced = entries[size]
