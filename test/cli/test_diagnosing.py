@@ -11,7 +11,7 @@ from imu_calibration.document.calibration_text import calibration_from_text
 
 from worlds.candidates import FEW
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @pytest.fixture(scope='module')

@@ -113,6 +113,7 @@ def test_other_verbs(folder, monkeypatch, capsys):
             document_of([verb, *arguments], capsys)
 
 
+@pytest.mark.long
 @pytest.mark.real_data
 def test_arm(recordings, capsys):
     """Both gyroscopes reach their limit, which the warnings say."""

@@ -273,6 +273,7 @@ def test_no_line_of_an_error_is_wider_than_the_terminal(arguments):
     assert len(lines) > 1 and max(map(len, lines)) <= 80
 
 
+@pytest.mark.long
 @pytest.mark.live
 def test_an_inspection_has_colour_on_terminals_and_not_with_no_color(tmp_path):
     shown = on_terminal(['inspect', SESSION])

@@ -215,6 +215,7 @@ def test_the_document_that_is_damaged_is_whole():
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'part', sorted({path[:1] for path in PLACES}), ids=lambda path: path[0] if path else 'whole'
 )
@@ -364,6 +365,7 @@ def use_noise(document):
         noise_to_text(figures)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('good', 'read'),
     (
