@@ -162,6 +162,7 @@ def drifting(size=0.5 * DEG, time_constant=35.0):
     return moved, session.table, bias + course[-1], bias, time[-1]
 
 
+@pytest.mark.long
 def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third():
     samples, table, at_end, at_start, duration = drifting()
     calibration = imu.calibrate(samples, table, candidates=DRIFTS).calibration
@@ -344,6 +345,7 @@ def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     )
 
 
+@pytest.mark.long
 def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
     samples, _, truth = simulate(8, n_poses=24)
     time = 1e-9 * (samples.stamp_ns - samples.stamp_ns[0])

@@ -185,6 +185,7 @@ def with_plain_values(calibration, kind, seed):
     return with_values(calibration, model, values)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('kind', 'seed'), [('losses', 615), ('cable', 604)])
 def test_applied_values_are_no_worse_than_least_squares_in_a_second_session(kind, seed):
     calibration = concluded(kind, seed, is_unexplained=True).calibration
@@ -282,6 +283,7 @@ def formula(name, column, unit):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('kind', 'seed', 'column', 'unit', 'helps'),
     [

@@ -109,6 +109,7 @@ def test_formulas_with_a_temperature_contain_its_slope():
     assert slope.unit('rad/s') == 'rad/s/(K/s)' and slope.smooth
 
 
+@pytest.mark.long
 def test_the_diagnosis_names_the_slope_of_the_temperature():
     # A wander of all axes alike followed it, and nothing was found.
     block, table = session_that_warms()

@@ -113,6 +113,7 @@ def test_the_least_variance_of_a_bias_beside_white_noise_is_that_of_the_dense_co
     assert least_bias_variance(noise, white, seconds) == pytest.approx(dense, rel=1e-3)
 
 
+@pytest.mark.long
 def test_the_bound_counts_the_white_noise_beside_a_wandering_bias():
     """At a quarter of the default tolerances it was 53 s where the plan took 91 s."""
     table = stand('three axes')
