@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
@@ -1054,9 +1055,8 @@ class _Table:
         """Lines in front of the first row of numbers."""
         self.first_row = rows[first]
         """Its cells."""
-        self.decimal_comma = any(
-            _has_decimal_comma(cell, self.delimiter) for row in rows[first:] for cell in row
-        )
+        cells = chain.from_iterable(rows[first:])
+        self.decimal_comma = any(_has_decimal_comma(cell, self.delimiter) for cell in cells)
         self.names = _unique(self._header_names(rows[:first]))
         """Names of the columns, all different."""
         self.dates = {k for k, cell in enumerate(self.first_row) if DATE.match(cell)}
@@ -1516,7 +1516,9 @@ def _only_set(path: Path, quantity: str, sets: AxisSets) -> list[Columns]:
     complete = {key: axes for key, axes in sets.items() if len(axes) == 3}
     if len(complete) > 1 and quantity == 'force':
         complete = _with_gravity(complete)
-    ordered = [[axes[axis] for axis in 'xyz'] for axes in complete.values()]
+    ordered = []
+    for axes in complete.values():
+        ordered.append([axes['x'], axes['y'], axes['z']])
     names = [tuple(column.names[0] for column in columns) for columns in ordered]
     if len(ordered) > 1:
         raise InputError(

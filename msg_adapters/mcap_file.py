@@ -415,7 +415,9 @@ class McapFile(StorageFile):
     def _stretches(self, topics: Sequence[str]) -> Iterator[Stretch]:
         """Yield the Stretches that may hold messages of the topics, read ahead in a thread."""
         channels_of_topic = self.topic_ids
-        wanted = {number for topic in topics for number in channels_of_topic.get(topic, ())}
+        wanted = set()
+        for topic in topics:
+            wanted.update(channels_of_topic.get(topic, ()))
         with closing(read_ahead(self._joined_pieces(wanted))) as pieces:
             for channel, packed in pieces:
                 yield Stretch(channel, packed, partial(log_times, packed))

@@ -154,7 +154,10 @@ CSV_KEYS = (
 def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
     paths_of_units = find_units(options.folder, options.output)
-    table = _table(options, [path for _, paths in paths_of_units for path in paths])
+    all_paths = []
+    for _, paths in paths_of_units:
+        all_paths += paths
+    table = _table(options, all_paths)
     units = _units(options, paths_of_units, table)
     if not options.force:
         _require_same_units(Path(options.output), units, report=not options.no_report)
@@ -201,9 +204,11 @@ def _units(
     """Return the units of `find_units`, each with its recordings and its exclusions."""
     choices = options.choices()
     provenance_options = provenance_with('fleet', (), choices, stand=options.stand())['options']
+    recordings_of_unit = {}
+    for name, paths in paths_of_units:
+        recordings_of_unit[name] = [path.name for path in paths]
     exclusions = exclusions_of_units(
-        parse_exclusions(options.exclude) if options.exclude else (),
-        {name: [path.name for path in paths] for name, paths in paths_of_units},
+        parse_exclusions(options.exclude) if options.exclude else (), recordings_of_unit
     )
     units = []
     for name, paths in paths_of_units:

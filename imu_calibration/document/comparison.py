@@ -354,11 +354,10 @@ def _compared(
     excluded = not_estimated | in_other_axes
 
     # 3. A row for each parameter.
-    units = {
-        name: effect.unit_of(k)
-        for effect in first.model.effects
-        for k, name in enumerate(effect.param_names())
-    }
+    units = {}
+    for effect in first.model.effects:
+        for k, name in enumerate(effect.param_names()):
+            units[name] = effect.unit_of(k)
     rows = []
     for k, name in enumerate(common):
         rows.append(

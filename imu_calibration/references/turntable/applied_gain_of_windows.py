@@ -215,7 +215,9 @@ def _errors(windows: Sequence[Window], table: Table, side: _Side) -> dict[str, n
 
     # Readings as compensation corrects them, with the motion at the gyroscope.
     ref = reference_of['gyroscope'].select(rows)
-    raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
+    raw = []
+    for sensor in SENSORS:
+        raw.append(np.concatenate([measured(window, sensor) for window in windows]))
     count = len(side.values)
     calibration = Calibration(side.model, side.applied, np.zeros((count, count)), (HELD,) * count)
     corrected = compensated_samples(

@@ -271,10 +271,13 @@ class ReducedRecording(WindowMeans):
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
         """Return the recording of the windows `rows` (mask) alone."""
         chosen = np.flatnonzero(rows)
+        factors = {}
+        for key, of_windows in self.factors.items():
+            factors[key] = [of_windows[k] for k in chosen]
         return replace(
             self,
             windows=tuple(self.windows[k] for k in chosen),
-            factors={key: [kept[k] for k in chosen] for key, kept in self.factors.items()},
+            factors=factors,
             describe={name: values[rows] for name, values in self.describe.items()},
         )
 
