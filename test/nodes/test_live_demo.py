@@ -10,7 +10,7 @@ pytest.importorskip('rclpy')
 from ros.live_station import free_domain
 from ros.workspace import ROOT
 
-pytestmark = [pytest.mark.slow, pytest.mark.live, pytest.mark.long]
+pytestmark = [pytest.mark.slow, pytest.mark.live]
 
 
 def test_the_smallest_live_demonstration_reduces_the_errors(tmp_path):
