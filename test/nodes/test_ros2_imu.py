@@ -105,6 +105,8 @@ def test_every_verb_of_the_plain_command_is_offered(place):
 )
 def test_output_and_exit_code_are_those_of_the_plain_command(place, line, monkeypatch, capfd):
     folder, shell, _ = place
+    for path in folder.glob('result*'):  # of another command
+        path.unlink()
     monkeypatch.chdir(folder)
     try:
         code = main(line.split())
