@@ -356,6 +356,7 @@ def test_a_correlation_time_that_fits_itself_gives_way_to_a_likelier_one():
     assert np.sqrt(taken.coefficients[-1]) == pytest.approx(truth.figures['gauss_markov'], rel=0.3)
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth_in_95_of_100_and_errors_are_close_to_the_bound():
     """
     Ten records of ten minutes; benchmarks/noise_records.py has 204 records.

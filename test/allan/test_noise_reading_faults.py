@@ -81,6 +81,7 @@ def test_torn_reads_within_the_noise_widen_the_interval():
     assert all(axis.startswith('accelerometer') for axis in faults)
 
 
+@pytest.mark.long
 def test_heavy_tails_widen_the_interval():
     """Three readings in a hundred have four times the noise: none of them is a sure outlier."""
     rng = np.random.default_rng(12)

@@ -122,6 +122,7 @@ def accelerometer_x_only(quiet, monkeypatch):
     return found
 
 
+@pytest.mark.long
 def test_rest_is_used_whole_and_nothing_is_taken_out(quiet):
     found = quiet[1].record
     assert len(found.parts) == 1 and found.curve.seconds == pytest.approx(1200.0, abs=1.0)
@@ -178,6 +179,7 @@ def warming(imu, per_kelvin, seed=3):
     return changed(imu, 0, 0, per_kelvin * (warmth - 30.0)), TemperatureSamples(stamps, noisy)
 
 
+@pytest.mark.long
 def test_the_temperature_is_taken_out_and_said(quiet, accelerometer_x_only):
     imu, before = quiet
     warm, temperature = warming(imu, 5e-3)

@@ -173,6 +173,7 @@ def calibrated(noise_file, tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_calibrate_takes_the_measured_noise_and_says_so(calibrated, noise_file):
     document = yaml.safe_load((calibrated / 'calibration.yaml').read_text())
     walk = 2e-5 * np.sqrt(3600.0 / 2)  # what counts within an hour

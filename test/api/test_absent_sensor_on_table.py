@@ -68,6 +68,7 @@ def errors_in_sd(sensor, session, calibration):
     return (calibration.values[at] - truth) / calibration.sd[at]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('sensor', READINGS)
 @pytest.mark.parametrize('value', [np.nan, 0.0], ids=['absent', 'zeros'])
 def test_it_is_calibrated_checked_and_applied(sensor, value):

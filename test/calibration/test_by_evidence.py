@@ -423,6 +423,7 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     assert np.all(np.abs(found.values[bias] - session.truth['gyroscope'].bias) < 4 * found.sd[bias])
 
 
+@pytest.mark.long
 def test_a_bias_is_not_known_better_than_windows_agree_on_it():
     """
     An offset after the outer joint turned forwards.

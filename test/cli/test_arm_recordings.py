@@ -210,6 +210,7 @@ def session(tmp_path_factory):
     return folder, made
 
 
+@pytest.mark.long
 def test_an_arm_calibrates_as_a_table_does(session, tmp_path):
     folder, made = session
     code = main(

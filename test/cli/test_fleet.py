@@ -183,6 +183,7 @@ def test_a_fleet_excludes_the_times_of_all_units_and_of_one(recordings, tmp_path
     assert "'unit_d=4:7'" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.live
 def test_processes_give_the_same_bytes(recordings, result, tmp_path):
     """Two units at a time write what one after the other writes."""

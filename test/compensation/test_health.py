@@ -165,6 +165,7 @@ def test_a_calibration_of_another_sensor_does_harm():
     )
 
 
+@pytest.mark.long
 def test_an_update_takes_the_drift_off_and_knows_how_well():
     errors, without, ratios = [], [], []
     for seed in range(2):

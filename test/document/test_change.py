@@ -35,6 +35,7 @@ def test_the_interval_of_a_change_has_the_spread_of_both_errors():
     assert not changes_since(stored, proof('rad', rest=(0.005, 0.1, 0.9)))
 
 
+@pytest.mark.long
 def test_check_gives_3_when_the_error_has_changed_even_if_it_still_helps():
     """The error in the file is a fifth of that of the recording, but the raw error is larger."""
     session = make_session(

@@ -278,6 +278,7 @@ def test_compensation_takes_it_out_offline_and_live():
         np.testing.assert_allclose([np.array(d[FIELDS[name]]) for d in out], wanted, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'names', [INVERTED, pytest.param(('gyro_scale_settling',), marks=pytest.mark.long)]
 )
@@ -300,6 +301,7 @@ def test_diagnosis_finds_and_names_them(names):
         assert ADDED[name]['text'] in found.report
 
 
+@pytest.mark.long
 def test_by_hand_it_is_found_too(name='gyro_anisoelasticity'):
     made = session(name)
     samples = SampleBlock(made.samples.imu)

@@ -29,6 +29,7 @@ def run_example(name):
     return done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'name, lines',
     [

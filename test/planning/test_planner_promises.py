@@ -70,6 +70,7 @@ def test_every_tolerance_is_met(plan):
     assert np.all(plan.sd[plan.wanted] <= plan.tolerances[plan.wanted] * (1 + 1e-6))
 
 
+@pytest.mark.long
 def test_the_same_is_planned_again():
     table = Table.from_mapping(
         {

@@ -381,6 +381,7 @@ def test_a_dead_gyroscope_leaves_the_accelerometer_calibrated(tmp_path, session,
     assert not [name for name in statuses if name.startswith('gyroscope')]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('fault', 'check', 'unusable'),
     ((clipped_gyroscope, 'clipping', True), (wrong_gravity, 'gravity', False)),

@@ -37,6 +37,7 @@ def moment_of(recording, share):
     return share * max(window.time[-1] for window in recording.windows)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'kind, what, axes',
     [
@@ -84,6 +85,7 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'shock, what, axes',
     [
@@ -135,6 +137,7 @@ def test_a_clock_of_another_rate_is_named():
     assert value == pytest.approx(200e-6 / (1 + 200e-6), abs=1e-7)
 
 
+@pytest.mark.long
 def test_a_step_of_the_clock_is_named_with_its_time():
     recording, found = investigated(Clock(step=8e-3), CLOCKS)
     assert [question.name for question in found.named] == ['clock_step'] and found.onset is None

@@ -546,6 +546,7 @@ def heldout_norm_rms(imu, ranges, gravity, **options):
     return float(np.sqrt(np.mean(found.hand_model.norm_rows(found.values, left_out)[0] ** 2)))
 
 
+@pytest.mark.long
 @pytest.mark.real_data
 def test_xsens_counts_against_its_factory_calibration(recordings):
     """
@@ -664,6 +665,7 @@ def test_ferraris_sections_agree_with_the_closed_form(recordings):
     assert found.statuses[found.param_names.index('accelerometer.matrix.zx')] != 'determined'
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.real_data
 def test_two_recordings_of_one_board_give_the_same_matrices(recordings):

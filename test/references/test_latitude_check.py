@@ -170,6 +170,7 @@ def test_a_simulated_world_turns_wherever_a_latitude_is_given():
     assert turning_world(free, plain) is free
 
 
+@pytest.mark.long
 def test_the_earth_below_a_table_without_latitude_is_no_g_sensitivity():
     session = make_session(8101, {'earth_rate': None}, imu_rate=25.0, joint_rate=25.0)
     nowhere = Table.from_mapping(

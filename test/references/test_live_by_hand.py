@@ -101,6 +101,7 @@ def test_the_live_answer_is_that_of_the_recording(session, expected):
     assert live.status().values['poses'] == 12 and live.status().values['turns'] == 11
 
 
+@pytest.mark.long
 def test_solving_on_the_way_changes_nothing(session, expected):
     live, solved = make_live(), 0
     for number, block in enumerate(blocks(session, 3)):

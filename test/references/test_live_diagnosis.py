@@ -135,6 +135,7 @@ def test_windows_after_the_adoption_count_like_those_before(hidden, expected):
     assert_same(live.solve(pending=True).calibration, expected.calibration)
 
 
+@pytest.mark.long
 def test_a_delay_is_taken_at_its_size_like_offline():
     """
     Columns that depend on their own value.
@@ -155,6 +156,7 @@ def test_a_delay_is_taken_at_its_size_like_offline():
     assert_same(found, expected)
 
 
+@pytest.mark.long
 def test_the_model_as_asked_stays(hidden):
     live = LiveCalibration(Table.from_mapping(hidden.table), replace(OPTIONS, as_asked=True))
     for block in blocks(hidden.imu, hidden.joints):
@@ -184,6 +186,7 @@ def test_what_cannot_join_is_said_and_widens(hidden):
     assert len(lines) == 2 and 'accel_quadratic' in lines[0]
 
 
+@pytest.mark.long
 def test_a_resumed_session_keeps_what_joined(station, hidden):
     """
     Saved with the wide model, the session goes on with it, and stays with it.

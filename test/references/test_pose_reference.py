@@ -65,6 +65,7 @@ def walking(recordings):
     return PoseBlocks(time, rate, Slerp(known[kept], Rotation.from_quat(np.array(attitudes)[kept])))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('quadratic', [0.0, 0.004])
 def test_bias_matrix_and_a_hidden_effect_are_estimated(quadratic):
     calibration = calibrate(walk(90, quadratic)).calibration
@@ -82,6 +83,7 @@ def test_bias_matrix_and_a_hidden_effect_are_estimated(quadratic):
     assert proof.after == pytest.approx(np.radians(0.05) * np.sqrt(2), rel=0.2)
 
 
+@pytest.mark.long
 def test_scales_agree_with_those_of_an_independent_fit(walking):
     """
     Published with the recording, with the standard deviations of that fit; ours are of white noise.

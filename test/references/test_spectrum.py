@@ -251,6 +251,7 @@ class Sway(Cause):
         return -world.to_sensor(np.cross(tilt, world.force_n)), world.to_sensor(rate)
 
 
+@pytest.mark.long
 def test_a_sway_of_the_floor_is_named_with_its_period_and_size():
     recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(1.0), **COARSE)
     model = with_candidates(recording.model, ONE)

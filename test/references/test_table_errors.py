@@ -90,6 +90,7 @@ def test_a_delay_is_fitted_and_named_with_its_value(session, delay=-0.011):
     assert [name for name in status if 'matrix' in name and status[name] is not DETERMINED] == []
 
 
+@pytest.mark.long
 def test_a_zero_is_fitted_and_named_with_its_value(session):
     position = session.joints.position + np.radians([0.0, 0.7, 0.0])
     summary = inspected(replace(session, joints=replace(session.joints, position=position)))
@@ -98,6 +99,7 @@ def test_a_zero_is_fitted_and_named_with_its_value(session):
     assert abs(np.degrees(value) + 0.7) < 5e-3  # 0.5 % of it, several standard deviations
 
 
+@pytest.mark.long
 def test_another_cause_is_a_residual_that_is_not_noise(session):
     """The gyroscope reads 3 deg/s more about x above 20 deg/s about z."""
     rate = session.imu.rate_s.copy()
@@ -124,6 +126,7 @@ def test_a_small_zero_of_the_last_joint_is_a_note_with_its_size(session, capsys)
     assert capsys.readouterr().err == f'note: {note["text"]}\n'
 
 
+@pytest.mark.long
 def test_an_added_delay_gives_the_result_of_a_requested_one(session):
     """Levelling is not shrunk in one of them only: values within 0.05 standard deviations."""
     imu = replace(session.imu, stamp_ns=session.imu.stamp_ns + 6_000_000)

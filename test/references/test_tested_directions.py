@@ -117,6 +117,7 @@ def test_errors_of_placements_do_not_demand_cross_terms():
     np.testing.assert_allclose(sd, PRIOR_SD, rtol=0.02)
 
 
+@pytest.mark.long
 def test_a_wandering_bias_estimated_with_cross_terms_does_not_demand_them():
     # Its path fitted errors of placements: p = 1e-5, 7.1 sd wrong, and `helps`.
     values, sd, proof = calibrated(*board(7426, placements=15, rests=5, shared=0.01))

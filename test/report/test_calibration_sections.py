@@ -150,6 +150,7 @@ class Balance(HTMLParser):
             self.wrong.append(tag)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('name', ('on_table', 'by_hand', 'demanding'))
 def test_the_page_is_whole_and_needs_nothing_else(pages, name):
     page = pages[name]

@@ -68,6 +68,7 @@ def result():
     )
 
 
+@pytest.mark.long
 def test_the_finding_is_told_drawn_and_measured(result):
     assert [f.effect for f in result.diagnosis.findings][:1] == ['gyro_g_sensitivity']
     assert result.lines[0].startswith('1. gyro_g_sensitivity')

@@ -459,6 +459,7 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
     ] and found.unexplained['gyroscope'].proposal is not None
 
 
+@pytest.mark.long
 def test_a_formula_of_the_session_is_not_written_into_a_model_for_other_sessions(tmp_path, capsys):
     session = physics.make_session(
         5,
