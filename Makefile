@@ -74,8 +74,10 @@ demo-check: $(STAMP)
 	  $(PY) examples/demo.py --output "$$folder/demo" | tee "$$folder/log" && $(PY) tools/demo_figures.py "$$folder/log"
 
 # The source distribution and the wheel made of it, as the package index accepts them.
+# setuptools unpacks the tree of a source distribution where it runs: in a folder of links, so that `make lint` beside it does not read a second tree.
 dist: $(STAMP)
-	@rm -rf dist build && $(PY) setup.py --quiet sdist
+	@rm -rf dist build && folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && ln -s "$(CURDIR)"/* "$$folder" && \
+	  cd "$$folder" && "$(abspath $(PY))" setup.py --quiet sdist --dist-dir "$(CURDIR)/dist"
 	@$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
 	@if $(PY) -c 'import twine' 2>/dev/null; then $(PY) -m twine check --strict dist/*; else echo 'twine is not in $(PINS): dist/ is not checked'; fi
 

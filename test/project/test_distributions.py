@@ -61,3 +61,24 @@ def test_the_source_distribution_is_complete(archive):
     with tarfile.open(archive) as opened:
         names = {name.partition('/')[2] for name in opened.getnames()}
     assert sources() - names == set()
+
+
+@pytest.mark.live
+def test_the_tree_of_a_distribution_is_not_unpacked_in_the_checkout(tmp_path):
+    """`make lint` runs beside `make dist` and reads every Python file of the checkout."""
+    checkout = tmp_path / 'checkout'
+    checkout.mkdir()
+    shutil.copy(ROOT / 'Makefile', checkout)
+    (checkout / 'setup.py').write_text(
+        'import os, pathlib\n'
+        'place = pathlib.Path(__file__).resolve().parent / "built_in"\n'
+        'place.write_text(os.getcwd())\n'
+    )
+    installed = ('VENV=installed', 'PINS=none.txt', '--old-file=installed/.installed-none')
+    (checkout / 'installed').mkdir()
+    (checkout / 'installed/.installed-none').touch()
+    # Only the first command runs: the wheel of an archive that is not there ends with an error.
+    subprocess.run(['make', 'dist', f'PY={sys.executable}', *installed], cwd=checkout)
+    folder = Path((checkout / 'built_in').read_text())
+    assert folder != checkout
+    assert not folder.exists()
