@@ -230,7 +230,7 @@ def open_recording(
     )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Recording:
     """An open bag; use it as a context manager or call `close`."""
 

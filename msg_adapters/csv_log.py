@@ -352,6 +352,7 @@ def _chosen_columns(table: _Table, columns: Sequence[str], raw: Sequence[str]) -
     for guess in _guess(table, {quantity for quantity, _ in stated}):
         if (guess.quantity, guess.joint) not in stated:
             chosen.append(guess)
+    chosen = [_as_raw(each) if each.quantity in raw else each for each in chosen]
     by_quantity = {each.quantity: each for each in chosen}
     missing = _missing_quantity(table, by_quantity, stated=bool(columns))
     if missing:
@@ -361,7 +362,7 @@ def _chosen_columns(table: _Table, columns: Sequence[str], raw: Sequence[str]) -
             f' {shortened(", ".join(table.names), 300)}{_unnamed_axes(table)}; {REMEDY}',
             key='columns',
         )
-    return [_as_raw(each) if each.quantity in raw else each for each in chosen]
+    return chosen
 
 
 def _unused_names(table: _Table, used: Iterable[Columns]) -> list[str]:

@@ -46,7 +46,7 @@ class RawMessages(NamedTuple):
 Piece = TypeVar('Piece')
 
 STRETCH_MESSAGES = 8192
-"""Messages per stretch where they arrive one by one."""
+"""Messages, rows or chunks of a batch at most."""
 
 
 def grouped(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[RawMessages]:

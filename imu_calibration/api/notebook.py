@@ -36,7 +36,7 @@ Result = TypeVar('Result')
 Recordings = str | PathLike | SampleBlock | Sequence[str | PathLike | SampleBlock]
 
 
-USE_CASES: dict[str, Callable[..., Any]] = {'compensate': _compensate, 'noise': _noise}
+API_FUNCTIONS: dict[str, Callable[..., Any]] = {'compensate': _compensate, 'noise': _noise}
 """Function with further options -> the function of `api` that has them."""
 
 
@@ -45,7 +45,7 @@ def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments,
     names = set(signature(function).parameters)
     # Further named arguments are those of the function of `api`, or choices.
     if 'options' in names:
-        names |= set(signature(USE_CASES[function.__name__]).parameters)
+        names |= set(signature(API_FUNCTIONS[function.__name__]).parameters)
     if 'choices' in names:
         names |= set(Choices.__annotations__)
     hints = {name: f'argument {name}' for name in names}

@@ -351,9 +351,8 @@ def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
         if effect.sensor in calibration.absent:
             continue
         parameters = calibration.model.slices[effect.key]
-        for k, index in enumerate(
-            range(parameters.start, parameters.stop)
-        ):  # of the effect, of the model
+        # k counts the parameters of the effect, index those of the model.
+        for k, index in enumerate(range(parameters.start, parameters.stop)):
             factor, unit = for_people(effect.unit_of(k), calibration.param_names[index])
             value, sd = with_sd(
                 calibration.values[index] * factor, calibration.own_sd[index] * factor

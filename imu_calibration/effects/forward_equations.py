@@ -348,17 +348,23 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     return jacobian
 
 
-class _NotedReads(dict):
-    """Values of effects by name; notes whose are read."""
+class _NotedReads(Mapping[str, np.ndarray]):
+    """Values of effects by name; notes whose are read, in whatever way."""
 
     def __init__(self, values: Mapping[str, np.ndarray]):
-        super().__init__(values)
+        self._values = values
         self.names: set[str] = set()
         """Names of the effects whose values were read."""
 
     def __getitem__(self, name: str) -> np.ndarray:
         self.names.add(name)
-        return super().__getitem__(name)
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
 
 
 def _readers(

@@ -263,8 +263,8 @@ def _off_the_median(around, place, limit):
     """
     Return where readings deviate from the median of nine, which two further outliers do not move.
 
-    By far more than their inner_range, and without a smaller deviation of a neighbour, which
-    indicates a knock. Arguments as for `_contradicted`.
+    By far more than the spread of the middle ones, and without a smaller deviation of a neighbour,
+    which indicates a knock. Arguments as for `_contradicted`.
     """
     ordered = np.sort(around, axis=1)
     deviations = np.abs(around - ordered[:, [SPIKE_NEIGHBOURS]])

@@ -766,7 +766,7 @@ class SampleTimes:
             if line.word == COUNTED and change <= SAME_PERIOD_SHARE * line_before.period_ns:
                 return []
             ready = self._timed_by_clock(final=True)
-            self._counted_clock = None
+            self._counted_clock = self._buffered = None
         if line.word == COUNTED:
             self._counted_clock = CountedClock(line)
             if self._buffered is not None:

@@ -34,7 +34,7 @@ class ProfileEntry:
     table: dict | None = None
     """Description of the table that the profile brings; None: it moves the given table."""
     n_joints: int | None = None
-    """Number of joints that the given table must have; None: any number, or `table`."""
+    """Number of joints for which `build` is made; None: any number, or that of `table`."""
     adapts: bool = False
     """
     Whether a table with another number of joints gets `any_table` instead, and one with joint

@@ -117,8 +117,8 @@ class HandModel:
         return np.isin(self.model.param_names, UPPER_TERMS)
 
     @cached_property
-    def held(self) -> np.ndarray:
-        """Mask of the parameters that are not estimated, shape (n,)."""
+    def always_held(self) -> np.ndarray:
+        """Mask of `held_terms` and of all parameters of absent sensors, shape (n,)."""
         of_absent_sensors = self.model.mask(lambda effect: effect.sensor in self.absent)
         return np.isin(self.model.param_names, self.held_terms) | of_absent_sensors
 

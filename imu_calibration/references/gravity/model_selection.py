@@ -100,9 +100,7 @@ class HandInvestigation(SelectedEffects):
         evidence = self.problem.evidence
         used = self.search.indices(self.named)
         return {
-            sensor: unexplained_by_hand(
-                self.baseline, evidence.blocks, evidence, used=used, sensor=sensor
-            )
+            sensor: unexplained_by_hand(self.baseline, evidence, used=used, sensor=sensor)
             for sensor in SENSORS
         }
 

@@ -48,7 +48,6 @@ class _Excess:
 
 def unexplained_by_hand(
     hand: HandCalibration,
-    blocks: Sequence[Rows],
     evidence: RowEvidence,
     *,
     used: Sequence[int],
@@ -65,16 +64,15 @@ def unexplained_by_hand(
     ----------
     hand : HandCalibration
         Solution of the baseline.
-    blocks : sequence of Rows
-        Rows at rest and of turns; those at rest are the first of each sensor.
     evidence : RowEvidence
-        Of these rows.
+        Of blocks of rows at rest and of turns; those at rest are the first of each sensor.
     used : sequence of int
         Parameters of the model, columns of the rows.
     sensor : str
         Its rows are examined.
 
     """
+    blocks = evidence.blocks
     residuals = evidence.residuals(used)
     largest = _Excess()
     for block, residual in zip(blocks, residuals):

@@ -72,7 +72,7 @@ def solve_joint(
         GravityRows(model, poses, turns),
         first_state(model, poses),
         fallback=np.square(SCATTER_SD),
-        always_held=model.held,
+        always_held=model.always_held,
     )
     # Its memory has the turns as integrated at the estimate, none from earlier steps.
     reference = GravityRows(model, poses, turns)
@@ -124,7 +124,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
     values = model.nominal.copy()
     if 'accelerometer' not in model.absent:
         index = model.base_index('accelerometer')
-        index = index[~model.held[index]]
+        index = index[~model.always_held[index]]
         squares = _NormsAndPriors(model, poses.force, poses.conditions, index)
         least_cost = np.inf
         for start in _starting_points(model, poses):

@@ -157,9 +157,9 @@ def fit_placements(
     # Gauss-Newton steps, since the norm is not linear in the parameters: a cross term c also
     # changes it by ``g c^2 / 2``, 0.1 m/s^2 for 0.15.
     index = np.concatenate([model.base_index('accelerometer'), model.extra_index('accelerometer')])
-    index = index[~model.held[index]]
+    index = index[~model.always_held[index]]
     values = values.copy()
-    values[model.held] = model.nominal[model.held]
+    values[model.always_held] = model.nominal[model.always_held]
     squares = _PlacementSquares(model, force, conditions, index)
     values = gauss_newton(squares, values, n_steps=PLACEMENT_STEPS)
 

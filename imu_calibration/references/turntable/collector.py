@@ -437,8 +437,6 @@ class Collector:
         unusable: Sequence[str] = (),
     ):
         self.step = step
-        self.model = step.model
-        """Defines the columns; in a live session it may change."""
         self.session = session
         self.windows = windows
         # Cleans the samples, joins the streams and finds the windows.
@@ -452,6 +450,11 @@ class Collector:
             unusable=unusable,
         )
         self.gathered = SessionData(judged_from=step.judged_from)
+
+    @property
+    def model(self) -> SensorModel:
+        """Defines the columns; in a live session it may change."""
+        return self.step.model
 
     def push(self, block: SampleBlock) -> list[Window]:
         """Process a block and return the windows that it completed."""
@@ -575,7 +578,7 @@ class LiveCollector(Collector):
         """
         windows = self.store.reduced(model, self.step.table, self.session)
         self.gathered = self.gathered.with_windows(windows)
-        self.model = model
+        self.step = replace(self.step, model=model)
 
     def snapshot(self, pending: bool) -> tuple[SessionData, WindowStore]:
         """

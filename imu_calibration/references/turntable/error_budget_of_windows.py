@@ -258,7 +258,7 @@ def _sources(gathered: SessionData) -> Iterator[_Source]:
             temperature_c=None,
         )
     stride = max(1, int(np.ceil(sum(len(w) for w in gathered.kept) / MOVING_SAMPLES)))
-    for window, session in zip(gathered.kept, gathered.sessions_of_kept):
+    for window, session in zip(gathered.kept, gathered.sessions_of_kept, strict=True):
         used = slice(None, None, stride)
         yield _Source(
             kind=window.kind,

@@ -202,8 +202,8 @@ class NoiseModel(SensorNoise):
         """
         Return whether the weights of moving windows are those of `other` within `SAME_VARIANCE`.
 
-        Only separate weights of slow and fast parts depend on the values of the parameters and need
-        another round of estimation; a kind of window with one weight for both is not compared.
+        A kind of window with one weight for its slow and fast parts is not compared: its weight
+        changes little with the values of the parameters, and one round of estimation suffices.
         """
         variance_ratio = self.low_variance / other.low_variance
         for kind, factors in self.moving.items():

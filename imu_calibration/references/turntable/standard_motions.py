@@ -188,11 +188,11 @@ def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ())
         for step, temperature_c in enumerate(temperatures):
             temperature = np.full(1, temperature_c)
             stamp_ns = np.array([step * len(rests) * 60 * 10**9])
-            warm = branch.of(temperature)
+            thermal_branch = branch.of(temperature)
             warming = slope.of(stamp_ns, temperature)
             for rest in rests:
                 pieces.append(
-                    replace(rest, temperature_c=temperature, branch=warm, warming=warming)
+                    replace(rest, temperature_c=temperature, branch=thermal_branch, warming=warming)
                 )
         return pieces
 

@@ -64,7 +64,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
 
     # Unmodelled effects make the standard deviations larger than the information matrix predicts.
     # The same factor is assumed after further motions.
-    factor = np.maximum(result.calibration.sd / np.maximum(sd_of_information(base), 1e-300), 1.0)
+    factor = np.maximum(result.calibration.sd / sd_of_information(base), 1.0)
 
     def excess(information: np.ndarray) -> np.ndarray:
         """Return the excess of the standard deviations over the tolerances (`sd_excess`)."""

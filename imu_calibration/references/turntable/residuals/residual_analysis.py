@@ -6,7 +6,7 @@ temperature replaces, and describes the residual of each sensor.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import cached_property
 from itertools import chain
@@ -101,7 +101,9 @@ class ResidualAnalysis(Investigation):
         """
         if isinstance(investigation, cls):
             return investigation
-        return cls(**vars(investigation))
+        # Not what is cached in it.
+        parts = {part.name: getattr(investigation, part.name) for part in fields(investigation)}
+        return cls(**parts)
 
     @cached_property
     def residual_of(self) -> dict[str, Unexplained]:

@@ -440,9 +440,10 @@ def _explanations_of_pair(
     one: _Option, two: _Option, names: Sequence[str]
 ) -> Iterator[Explanation]:
     """
-    Yield the explanations of the lags of both sensors, `one` and `two`, with positive lags.
+    Yield the explanations of the lags of both sensors, `one` and `two`.
 
-    The lags are separate, or a common clock and the additional lags of each sensor. Nothing if no
+    The lags are separate, or a common clock and the additional lags of each sensor. Lags of sensors
+    are positive, the common clock may have either sign. Nothing if no
     sensor has a lag. `names` are the parameters of which an explanation has the values.
     """
     if not (one.kind or two.kind):

@@ -161,6 +161,8 @@ class LinearisedProblem:
         """Return the same, with a search that allows sizes above those of any known instrument."""
         other = copy(self)
         other.search = self.search.asking_any_size()
+        # What is cached belongs to the search of this problem.
+        other.__dict__.pop('explained', None)
         return other
 
     @property
