@@ -5,7 +5,8 @@ By a robust fit with Student-t errors and noisy columns.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -87,9 +88,9 @@ class Fit:
     weights: np.ndarray
     """Weight of each window, shape (n,)."""
     weight_fall: np.ndarray
-    """Derivative of each weight by the square of its residual, negated, shape (n,)."""
-    hessian: np.ndarray
-    """Derivative of the estimating equations by the values, shape (8, 8)."""
+    """Twice the decrease of each weight per increase of its squared residual, shape (n,)."""
+    noise_correction: np.ndarray
+    """Correction of the normal matrix for the noise of the columns, shape (8, 8)."""
     signal_shares: np.ndarray
     """
     Shares of the arm's information that are not due to the noise of the columns, of three
@@ -98,12 +99,17 @@ class Fit:
     directions: np.ndarray
     """Arms of these directions, in the columns, shape (3, 3)."""
 
-    def weighted(self, index: np.ndarray | slice) -> np.ndarray:
-        """
-        Return ``design' (w - weight_fall r r')`` of the windows `index`, shape (n, p, 3).
+    @cached_property
+    def hessian(self) -> np.ndarray:
+        """Derivative of the score ``sum design' w r`` by the values, negated, shape (8, 8)."""
+        return self.curvature(slice(None)) + self.noise_correction
 
-        The bracket is the derivative of the weighted residual ``w r`` of a window by its residual
-        r, with the weight w.
+    def score_slope(self, index: np.ndarray | slice) -> np.ndarray:
+        """
+        Return the derivative of the score by the residuals of windows, shape (n, p, 3).
+
+        A window with the residual r and the weight w adds ``design' w r`` to the score. The weight
+        depends on r too: the derivative is ``design' (w - weight_fall r r')``.
         """
         transposed = np.swapaxes(self.design[index], 1, 2)
         residual = self.residual[index]
@@ -114,7 +120,7 @@ class Fit:
 
     def curvature(self, index: np.ndarray | slice) -> np.ndarray:
         """Return the contribution of the windows `index` to the Hessian, shape (p, p)."""
-        rows = np.swapaxes(self.weighted(index), 1, 2).reshape(-1, self.design.shape[2])
+        rows = np.swapaxes(self.score_slope(index), 1, 2).reshape(-1, self.design.shape[2])
         return rows.T @ self.design[index].reshape(rows.shape)
 
 
@@ -132,18 +138,18 @@ def _fit_arm(rows: ArmRows) -> Fit:
     lever_slope = _lever_rows(rows.jerk, rows.products_slope)
     bias_columns = np.tile(np.eye(3), (len(lever), 1, 1))
     force_delay_column = -rows.force_slope[:, :, None]
-    arm = np.zeros(3)
-    for number in range(3):
-        # The column of the rates' delay needs the arm of the fit before: the first fit has none.
-        rate_delay_column = (lever_slope @ arm)[:, :, None]
-        design = np.concatenate(
-            [lever, bias_columns, force_delay_column, rate_delay_column], axis=2
-        )
-        used = design if number else design[:, :, :-1]
-        robust = _robust_fit(used, rows.difference, rows.alpha_noise)
-        arm = robust.values[:3]
 
-    # Information of the arm with and without the correction for the noise of the columns.
+    # The column of the rates' delay is proportional to the arm: the first fit is made without it,
+    # the others with the arm of the fit before.
+    without_rate_delay = np.concatenate([lever, bias_columns, force_delay_column], axis=2)
+    robust = _robust_fit(without_rate_delay, rows.difference, rows.alpha_noise)
+    for _ in range(2):
+        rate_delay_column = (lever_slope @ robust.values[:3])[:, :, None]
+        design = np.concatenate([without_rate_delay, rate_delay_column], axis=2)
+        robust = _robust_fit(design, rows.difference, rows.alpha_noise)
+
+    # Information of the arm C with, and U without the correction for the noise of the columns. The
+    # share x of a direction v that is not noise: C v = x U v.
     corrected = _normal(design, robust.weights, robust.excess)
     uncorrected = _normal(design, robust.weights, 0.0)
     try:
@@ -153,18 +159,16 @@ def _fit_arm(rows: ArmRows) -> Fit:
             'the motion must show the whole arm, one direction has no signal; '
             'twist fast about all axes'
         ) from error
-    fit = Fit(
+    return Fit(
         values=robust.values,
         design=design,
         residual=rows.difference - design @ robust.values,
         weights=robust.weights,
         weight_fall=robust.weight_fall,
-        hessian=corrected,
+        noise_correction=corrected - uncorrected,
         signal_shares=shares,
         directions=directions,
     )
-    hessian = fit.curvature(slice(None)) + (corrected - uncorrected)
-    return replace(fit, hessian=hessian)
 
 
 def _reduced(normal: np.ndarray) -> np.ndarray:
@@ -195,7 +199,7 @@ class _RobustFit:
     weights: np.ndarray
     """Weight of each window, shape (n,)."""
     weight_fall: np.ndarray
-    """Derivative of each weight by the square of its residual, negated, shape (n,)."""
+    """Twice the decrease of each weight per increase of its squared residual, shape (n,)."""
     excess: float
     """Contribution of the noise of the angular acceleration to the normal matrix of the arm."""
 
@@ -204,9 +208,15 @@ def _robust_fit(design: np.ndarray, target: np.ndarray, alpha_noise: float) -> _
     """
     Return the Student-t regression of ``target = design @ values`` by reweighting.
 
-    The weight decreases with the residual, so the derivative of a weighted residual is smaller than
-    its weight: ``weight - weight_fall residual^2``. The noise in the columns biases the values in
-    this proportion.
+    With s the sum of the three squared residuals of a window, and nu = `TAIL_DOF`::
+
+        w           = (nu + 3) / (nu + s / scale)             weight
+        weight_fall = -2 dw/ds = 2 w^2 / ((nu + 3) scale)
+        excess      = 2 alpha_noise sum (w - weight_fall s / 3)
+
+    The columns of the arm are ``[alpha x]``, and ``[alpha x]' [alpha x]`` of noise with the variance
+    `alpha_noise` on each axis is ``2 alpha_noise I`` in the mean. It counts with the derivative of
+    ``w r`` by the residual r, averaged over the three axes.
 
     Parameters
     ----------
@@ -221,7 +231,7 @@ def _robust_fit(design: np.ndarray, target: np.ndarray, alpha_noise: float) -> _
     squares = np.zeros(len(design))  # squared residual of each window
     flat = design.reshape(-1, design.shape[2])
     values = np.full(design.shape[2], np.inf)
-    for _ in range(30):  # or until the values have settled
+    for _ in range(30):  # at most; mostly the values settle earlier
         excess = 2 * alpha_noise * np.sum(weights - weight_fall * squares / 3)
         right_side = flat.T @ (target * weights[:, None]).ravel()
         previous_values = values
@@ -259,9 +269,10 @@ def response(fit: Fit, columns: np.ndarray) -> np.ndarray:
     """
     Return the derivative of the values by changes of the left-hand side, shape (p, k).
 
-    `columns`: derivative of the left-hand side by k quantities, shape (n, 3, k).
+    `columns`: derivative of the left-hand side by k quantities, shape (n, 3, k). By the implicit
+    function theorem it is ``hessian^-1 sum score_slope columns``.
     """
-    score = np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True)
+    score = np.einsum('npi,nik->pk', fit.score_slope(slice(None)), columns, optimize=True)
     return np.linalg.solve(fit.hessian, score)
 
 
@@ -399,7 +410,7 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
         With too few windows.
 
     """
-    # Windows at the same true times, on the clock of each sensor.
+    # 1. Windows at the same true times, on the clock of each sensor.
     length = window_length(a, b)
     offset = rotation.offset
     centres = window_centres(a, b, offset=offset, length=length)
@@ -409,19 +420,21 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
     rate_b = make_windows(b.time, centres + offset + delay, length)
     clipped = force_a.touches(a.flagged) | force_b.touches(b.flagged)
     clipped |= rate_a.touches(a.flagged) | rate_b.touches(b.flagged)
-    unclipped = ~clipped
 
-    # Windows of strong motion: angular acceleration alpha and products omega omega', from the mean
-    # of both gyroscopes in the axes of a.
+    # 2. Angular acceleration alpha, and products omega omega': from the mean of both gyroscopes in
+    #    the axes of A.
     rate_b_in_a = b.rate @ rotation.mat_ab.T
     alpha_a = rate_a.slope(a.rate)
     alpha_b = rate_b.slope(rate_b_in_a)
     products = 0.5 * (_products(rate_a.mean, a.rate) + _products(rate_b.mean, rate_b_in_a))
-    alpha_squared = 0.25 * np.sum((alpha_a + alpha_b) ** 2, axis=1)
+    alpha = 0.5 * (alpha_a + alpha_b)
+
+    # 3. Windows of strong motion without clipping. The acceleration of one metre of arm is about
+    #    sqrt(|alpha|^2 + |omega|^4).
     rate_squared = np.trace(products, axis1=1, axis2=2)
-    strength = np.sqrt(alpha_squared + rate_squared**2)
+    strength = np.sqrt(np.sum(alpha**2, axis=1) + rate_squared**2)
     moving = strength > MOTION_SHARE * np.quantile(strength, 0.99)
-    used = unclipped & moving
+    used = ~clipped & moving
     if used.sum() < WINDOWS_LEAST:
         raise NotObservableError(
             f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got'
@@ -429,21 +442,21 @@ def _build_rows(a: PairedImu, b: PairedImu, rotation: RelativeRotation, delay: f
             ' range of the gyroscopes'
         )
 
-    # The derivative of alpha by differences of windows: accurate enough, because only the small
-    # column of the delay has it.
+    # 4. The derivative of alpha, by differences of windows: accurate enough, because only the small
+    #    column of the delay has it.
     lag = 0.1 * (centres[1] - centres[0])
     used_centres = centres[used] + delay
     alpha_later = make_windows(a.time, used_centres + lag, length).slope(a.rate)
     alpha_sooner = make_windows(a.time, used_centres - lag, length).slope(a.rate)
 
-    # Half of the difference of two gyroscopes is the error of their mean, if their errors are
-    # independent.
+    # 5. Half of the difference of two gyroscopes has the variance of the error of their mean, if
+    #    their errors are independent.
     alpha_noise = np.mean((alpha_b - alpha_a)[used] ** 2) / 4
     force = force_b.select(used).mean(b.force @ rotation.mat_ab.T)
     return ArmRows(
         centres=centres[used],
         difference=force - force_a.select(used).mean(a.force),
-        alpha=0.5 * (alpha_a + alpha_b)[used],
+        alpha=alpha[used],
         products=products[used],
         jerk=(alpha_later - alpha_sooner) / (2 * lag),
         products_slope=_products(rate_a.select(used).slope, a.rate),
@@ -508,13 +521,17 @@ def _result(
         When a direction of the arm is not determined.
 
     """
+    # Independent errors: of the motion, of the gyroscopes' calibrations, of the relative rotation.
     motion_cov = _jackknife_covariance(fit, rows.centres)[:3, :3]
     calibration_cov = _calibration_covariance(fit, rows, *imus)
+    # A small turn e of B changes its force in A's axes by e x force = -[force x] e.
     by_rotation = response(fit, -skew(rows.force))
     rotation_cov = (by_rotation @ rotation.cov @ by_rotation.T)[:3, :3]
     covariance = motion_cov + calibration_cov + rotation_cov
     sd = np.sqrt(np.diag(covariance))
     _require_signal(fit, sd)
+
+    # The last fitted value is the remaining delay of the rates, of which `delay` is the sum.
     nuisances = {}
     for name, value in zip(NUISANCE, [*fit.values[3:7], delay]):
         nuisances[name] = float(value)

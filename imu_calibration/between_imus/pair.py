@@ -74,7 +74,12 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
     """
     Return the windows of `length` seconds around `centres` over the samples at `time`.
 
-    The weight of a window is ``phi(t) = sin^6(pi (t - begin) / length) / (5/16) / length``.
+    With ``phase = pi (t - begin) / length``, and the mean 5/16 of sin^6 over a window::
+
+        phi     = sin^6(phase) / (5/16) / length
+        dphi/dt = 6 sin^5(phase) cos(phase) (pi / length) / (5/16) / length
+
+    Each sample counts for the time step around it.
 
     Parameters
     ----------
@@ -86,16 +91,19 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
         Full length, s.
 
     """
+    # Window k has the samples first[k] to stop[k] - 1. All windows get the width of the longest: the
+    # entries after their last sample are not `inside` and have no weight.
     first = np.searchsorted(time, centres - length / 2, side='right')
-    last = np.searchsorted(time, centres + length / 2, side='left')
-    width = max(int(np.max(last - first, initial=1)), 1)
-    offset = np.arange(width)
-    index = np.minimum(first[:, None] + offset, len(time) - 1)
-    inside = offset < (last - first)[:, None]
+    stop = np.searchsorted(time, centres + length / 2, side='left')
+    width = max(int(np.max(stop - first, initial=1)), 1)
+    entry = np.arange(width)
+    index = np.minimum(first[:, None] + entry, len(time) - 1)
+    inside = entry < (stop - first)[:, None]
+
     phase = np.pi * ((time[index] - centres[:, None]) / length + 0.5)
     sine = np.sin(phase)
     relative_step = np.gradient(time)[index] / length
-    norm = 1 / 0.3125  # the mean of sin^6 over its half period is 5/16
+    norm = 1 / 0.3125
     weight = np.where(inside, norm * sine**SINE_POWER * relative_step, 0.0)
     factor = -norm * SINE_POWER * np.pi / length
     slope = factor * sine ** (SINE_POWER - 1) * np.cos(phase) * relative_step
@@ -207,8 +215,13 @@ def window_length(a: PairedImu, b: PairedImu) -> float:
 
 
 def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) -> np.ndarray:
-    """Return the middles of the windows, s on A's clock: on A's samples where these are even."""
+    """
+    Return the middles of the windows over the common time of both IMUs, s on A's clock.
+
+    The first one is on a sample of A, and each window overlaps the next `SAMPLES_LEAST` ones.
+    """
     step = max(a.period, length / SAMPLES_LEAST)
+    # Half a window, and 0.1 s for windows that are shifted by a delay.
     margin = 0.51 * length + 0.1
     begin = max(a.time[0], b.time[0] - offset) + margin
     end = min(a.time[-1], b.time[-1] - offset) - margin
@@ -257,12 +270,31 @@ def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
         difference = rate_b @ mat_ab.T - rate_a
         offset -= float(np.sum(difference * alpha) / max(np.sum(alpha * alpha), 1e-300))
 
-    # Windows of rates overlap, so that their errors are not independent.
-    vectors_a, vectors_b, overlap = rate_a, rate_b, SAMPLES_LEAST
     at_rest = _directions_at_rest(a, b, offset)
-    if at_rest is not None:
-        vectors_a, vectors_b = at_rest
-        overlap = 1
+    if at_rest is None:
+        # So many windows of the rates overlap each other and have common errors.
+        return _rotation_between(rate_a, rate_b, offset, overlap=SAMPLES_LEAST)
+    return _rotation_between(*at_rest, offset, overlap=1)
+
+
+def _rotation_between(
+    vectors_a: np.ndarray, vectors_b: np.ndarray, offset: float, *, overlap: int
+) -> RelativeRotation:
+    """
+    Return the rotation that turns the vectors of B into those of A, with its covariance.
+
+    A small turn e changes a vector v of A by ``e x v = -[v x] e``, so that with errors of the
+    variance s^2 per component the information on e is ``sum [v x]' [v x] / s^2``.
+
+    Parameters
+    ----------
+    vectors_a, vectors_b : array, shape (n, 3)
+    offset : float
+        Delay of B's stamps, s.
+    overlap : int
+        Number of consecutive vectors with common errors.
+
+    """
     mat_ab = nearest_rotation(vectors_a.T @ vectors_b)
     residual = vectors_a - vectors_b @ mat_ab.T
     cross = skew(vectors_a)
