@@ -214,9 +214,9 @@ def _robust_fit(design: np.ndarray, target: np.ndarray, alpha_noise: float) -> _
         weight_fall = -2 dw/ds = 2 w^2 / ((nu + 3) scale)
         excess      = 2 alpha_noise sum (w - weight_fall s / 3)
 
-    The columns of the arm are ``[alpha x]``, and ``[alpha x]' [alpha x]`` of noise with the variance
-    `alpha_noise` on each axis is ``2 alpha_noise I`` in the mean. It counts with the derivative of
-    ``w r`` by the residual r, averaged over the three axes.
+    The columns of the arm are ``[alpha x]``; noise of alpha with the variance `alpha_noise` on each
+    axis increases ``[alpha x]' [alpha x]`` by ``2 alpha_noise I`` in the mean. It counts with the
+    derivative of ``w r`` by the residual r, averaged over the three axes.
 
     Parameters
     ----------

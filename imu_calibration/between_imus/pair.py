@@ -91,8 +91,8 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
         Full length, s.
 
     """
-    # Window k has the samples first[k] to stop[k] - 1. All windows get the width of the longest: the
-    # entries after their last sample are not `inside` and have no weight.
+    # Window k has the samples first[k] to stop[k] - 1. All windows get the width of the longest;
+    # their entries after the last sample are not `inside` and have no weight.
     first = np.searchsorted(time, centres - length / 2, side='right')
     stop = np.searchsorted(time, centres + length / 2, side='left')
     width = max(int(np.max(stop - first, initial=1)), 1)

@@ -83,7 +83,8 @@ def make_separator(
             model = model.with_effect(sensor, name)
     for cause in causes:
         effect = model.catalogue.find(*cause, model.joint_names)
-        if special(effect) or effect.smooth or 'temperature' in effect.needs:
+        no_motion_shows = special(effect) or effect.smooth or 'temperature' in effect.needs
+        if no_motion_shows:
             raise InputError(
                 f"effects that motion separates must depend on it, '{cause[1]}' depends on time,"
                 ' temperature or range; omit it'
@@ -95,7 +96,7 @@ def make_separator(
     n_candidates = len(model.catalogue.effects(model.joint_names))
     collinear = causes_with_sizes(problem, causes, table, sizes=sizes or {})
     problem.goal = ToldApart(coordinates, collinear, n_candidates)
-    # The information of the calibration about all parameters but those of the finding, whose
+    # Known is what the calibration determines, except for the parameters of the finding: their
     # estimate assumes that it is the true cause.
     rows = {name: k for k, name in enumerate(calibration.param_names)}
     for k in _indices(calibration.model, finding):
@@ -481,13 +482,13 @@ def with_finding(
     effect = next(each for each in model.effects if (each.sensor, each.name) == cause)
     values = model.start_from(calibration.model, calibration.values)
     values[model.slices[cause]] = [sizes.get(name, 0.0) for name in effect.param_names()]
-    # The known covariance and status, those of the prior for the parameters of the effect.
-    places = [model.param_names.index(name) for name in calibration.param_names]
+    # Covariance and status: those of the prior for the effect, of the calibration for the others.
+    others = [model.param_names.index(name) for name in calibration.param_names]
     covariance = np.diag(model.prior()[1] ** 2)
     status = [HELD] * len(values)
-    covariance[np.ix_(places, places)] = calibration.covariance
-    for place, parameter_status in zip(places, calibration.status, strict=True):
-        status[place] = parameter_status
+    covariance[np.ix_(others, others)] = calibration.covariance
+    for index, known_status in zip(others, calibration.status, strict=True):
+        status[index] = known_status
     return replace(
         calibration,
         model=model.at(values),

@@ -62,9 +62,11 @@ class Coordinates:
         """Units of the parameters, SI, shape (n_params,)."""
         self.basis = _basis(prior.gauge * self.units)
         """Orthonormal columns, shape (n_params, n)."""
-        whitened_basis = self.basis / (model.prior()[1] / self.units)[:, None]
+        # The basis obeys the gauge already: the sds here are those without it.
+        _, sd_without_gauge = model.prior()
+        whitened_basis = self.basis / (sd_without_gauge / self.units)[:, None]
         self.prior_information = whitened_basis.T @ whitened_basis
-        """Of z, shape (n, n)."""
+        """Of z, ``basis' diag(units / sd)^2 basis``, shape (n, n)."""
 
     def excess(self, covariance: np.ndarray) -> np.ndarray:
         """
@@ -120,7 +122,7 @@ class Coordinates:
             Of all its parameters, SI; parameters that this model lacks are averaged over.
 
         """
-        # Shared parameters: indexes in this model, and in the covariance.
+        # Shared parameters: their indices in this model, and in the covariance.
         shared = np.array(
             [k for k, name in enumerate(self.model.param_names) if name in names], int
         )
@@ -129,15 +131,17 @@ class Coordinates:
         source = np.array([names[self.model.param_names[k]] for k in shared])
         units = self.units[shared]
         scaled = covariance[np.ix_(source, source)] / np.outer(units, units)
+        # basis' C^-1 basis by the eigenvectors of C. A direction below KNOWN_SHARE counts as known;
+        # those that the gauge fixes have variance 0, and no component in the basis.
         variances, directions = scipy.linalg.eigh((scaled + scaled.T) / 2)
-        # Directions that the gauge fixes have no variance and no component in the basis;
-        # KNOWN_SHARE is as good as certain.
         least_variance = max(1e-13 * variances.max(), KNOWN_SHARE**2)
         sd = np.sqrt(np.maximum(variances, least_variance))
         rows = (directions.T @ self.basis[shared]) / sd[:, None]
+
+        # Without the prior, and without negative eigenvalues.
         added = rows.T @ rows - self.prior_information
-        weights, directions = scipy.linalg.eigh((added + added.T) / 2)
-        return (directions * np.maximum(weights, 0.0)) @ directions.T
+        eigenvalues, eigenvectors = scipy.linalg.eigh((added + added.T) / 2)
+        return (eigenvectors * np.maximum(eigenvalues, 0.0)) @ eigenvectors.T
 
 
 def _basis(gauge: np.ndarray) -> np.ndarray:
@@ -152,6 +156,7 @@ def _basis(gauge: np.ndarray) -> np.ndarray:
     if in_gauge.any():
         null_space = scipy.linalg.null_space(gauge[:, in_gauge] / np.abs(gauge).max())
     free = np.flatnonzero(~in_gauge)
+    # First a column for each free parameter, then the directions of the others.
     basis = np.zeros((len(in_gauge), len(free) + null_space.shape[1]))
     basis[free, np.arange(len(free))] = 1.0
     basis[np.ix_(in_gauge, len(free) + np.arange(null_space.shape[1]))] = null_space
@@ -247,19 +252,23 @@ class ToldApart:
         """
         Return lambda of each pair in units of the sufficient value, shape (k, n_pairs).
 
-        `covariance`: of z with all causes, shape (k, n, n). Omitting causes is conditioning on
-        them, and ``[M_aa - M_ar M_rr^-1 M_ra]`` is the inverse of the conditional covariance of a.
+        `covariance`: of z with all causes, shape (k, n, n). To omit the causes o from the model is
+        to know that they are zero: ``[M_aa - M_ar M_rr^-1 M_ra]`` is the inverse of the covariance
+        of a, given those of o::
+
+            C_aa - C_ao C_oo^-1 C_oa
         """
         ratios = np.empty((len(covariance), len(self.pairs)))
         prior = self.coordinates.prior_information
         for number, (a, b) in enumerate(self.pairs):
             others = [cause.places for cause in self.causes if cause not in (a, b)]
+            # Blocks of each covariance: shapes (k, n_a, n_a), (k, n_a, n_o) and (k, n_o, n_o).
             conditional = covariance[:, a.places[:, None], a.places]
             if others:
-                omitted = np.concatenate(others)
-                cross = covariance[:, a.places[:, None], omitted]
+                o = np.concatenate(others)
+                cross = covariance[:, a.places[:, None], o]
                 conditional = conditional - cross @ np.linalg.solve(
-                    covariance[:, omitted[:, None], omitted], cross.transpose(0, 2, 1)
+                    covariance[:, o[:, None], o], cross.transpose(0, 2, 1)
                 )
             # Only the information of the motions, without that of the prior.
             information = np.linalg.inv(conditional) - prior[np.ix_(a.places, a.places)]

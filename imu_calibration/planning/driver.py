@@ -234,7 +234,8 @@ class Driver:
 
     def start(self) -> None:
         """Allow motions, once the joints rest; the first one will be slow."""
-        self._next_is_slow, self._rested_at = True, None
+        self._next_is_slow = True
+        self._rested_at = None
         self._become(DriveState.IDLE, 'started')
 
     def begin(self, points: TrajectoryPoints, words: str, now: float) -> TrajectoryPoints:
@@ -315,7 +316,7 @@ class Driver:
             Seconds of a steady clock.
 
         """
-        # The driver ros2_control publishes NaN until the hardware was read.
+        # 1. The message. The driver ros2_control publishes NaN until the hardware was read.
         if not np.all(np.isfinite(position)):
             for joint in np.flatnonzero(~np.isfinite(position)):
                 name = self.joint_names[joint]
@@ -329,26 +330,30 @@ class Driver:
         self._stamp = time
         self._heard_at = now
         self.position = np.asarray(position, float)
-        if self.is_driving and (fault := self.stamp_fault(now)):
+        fault = self.stamp_fault(now) if self.is_driving else ''
+        if fault:
             return self.stop(fault)
         self._note_rest()
         if self._watch is None or not self.is_driving:
             return False
+
+        # 2. Faults of a commanded motion, or of the joints that settle after it.
         fault = self._limit_fault(position, rate)
-        if fault:
-            return self.stop(fault)
-        if self.state is DriveState.MOVING:
+        if not fault and self.state is DriveState.MOVING:
             self._watch.observe(time, self.position, now=now)
             fault = self._tracking_fault()
-            if fault:
-                return self.stop(fault)
-            if self._watch.at_end:
-                self._rested_at = self.position
-                self._rested_since = time
-                self._settling_since = time
-                self._become(DriveState.SETTLING, self.reason)
-            return False
-        return self._settle()
+        if fault:
+            return self.stop(fault)
+
+        # 3. From the motion to settling at its end, from there to measuring at rest.
+        if self.state is DriveState.SETTLING:
+            return self._settle()
+        if self._watch.at_end:
+            self._rested_at = self.position
+            self._rested_since = time
+            self._settling_since = time
+            self._become(DriveState.SETTLING, self.reason)
+        return False
 
     def tick(self, now: float) -> bool:
         """Check the time limits; return whether all joints must stop."""

@@ -81,7 +81,7 @@ class PlannedMotion:
         Return all segments from the present position, with whole turns of endless joints unchanged.
         """
         move = self.travel(position)
-        # Whole turns of endless joints between where the move ends and the place.
+        # An endless joint moves the shortest way: the move may end whole turns beside the place.
         shift = (move[-1].end if move else np.asarray(position, float)) - self.place
         shifted = tuple(replace(segment, start=segment.start + shift) for segment in self.segments)
         return move + shifted
@@ -190,28 +190,28 @@ def candidates(limits: MotionLimits) -> np.ndarray:
     """
     Return positions to choose from, shape (n, n_joints), first the one nearest to zero.
 
-    With at most three joints a grid follows, by distance from zero, then a Sobol sequence within
-    the reachable range.
+    With at most three joints a grid follows, first where the last joint is near zero, of these
+    first where the one before it is; then a Sobol sequence within the reachable range.
     """
     from scipy.stats import qmc  # here, because its import is slow
 
     lower, upper = reachable(limits)
     home = np.clip(np.zeros(len(limits)), lower, upper)
-    spread = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)
-    parts = [home[None], spread]
-    if len(limits) <= 3:
-        steps = []
-        for a, b, turning in zip(lower, upper, limits.turns, strict=True):
-            if not turning:
-                steps.append(np.linspace(a, b, 3))
-                continue
-            # Multiples of the grid within the limits, up to rounding errors.
-            first = np.ceil(a / POSITION_GRID - 1e-9)
-            last = np.floor(b / POSITION_GRID + 1e-9)
-            steps.append(np.arange(first, last + 1) * POSITION_GRID)
-        grid = np.stack(np.meshgrid(*steps, indexing='ij'), axis=-1).reshape(-1, len(limits))
-        parts.insert(1, grid[np.lexsort(np.abs(grid).T)])
-    return np.concatenate(parts)
+    sobol = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)
+    if len(limits) > 3:
+        return np.concatenate([home[None], sobol])
+
+    steps = []  # of each joint
+    for a, b, turning in zip(lower, upper, limits.turns, strict=True):
+        if not turning:
+            steps.append(np.linspace(a, b, 3))
+            continue
+        # Multiples of the grid within the limits, up to rounding errors.
+        first = np.ceil(a / POSITION_GRID - 1e-9)
+        last = np.floor(b / POSITION_GRID + 1e-9)
+        steps.append(np.arange(first, last + 1) * POSITION_GRID)
+    grid = np.stack(np.meshgrid(*steps, indexing='ij'), axis=-1).reshape(-1, len(limits))
+    return np.concatenate([home[None], grid[np.lexsort(np.abs(grid).T)], sobol])
 
 
 def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
@@ -380,7 +380,8 @@ class MotionLibrary:
         """
         Return about `count` of the positions, evenly from number `first` on.
 
-        Fewer for a long chain, because the number of moves grows with their square.
+        For n > 3 joints only ``3 count / n``, because the number of moves between places grows with
+        the square of their number.
         """
         count = max(1, min(count, 3 * count // len(self.names)))
         stride = max(len(self.spread) // count, 1)
@@ -470,17 +471,38 @@ class MotionLibrary:
 
         `swings`: whether each joint swings, shape (n_joints,); `frequency` in Hz, of each or all.
         """
-        # Largest position, rate and acceleration of a swing of unit amplitude.
         frequency = np.broadcast_to(frequency, place.shape).astype(float)
+        lower, upper = reachable(self.limits)
+        # Joints with ends swing about the middle of their range.
+        middle = np.where(self.limits.endless | ~swings, place, 0.5 * (lower + upper))
+        amplitude = self._largest_amplitude(swings, frequency, seconds)
+        swing = self._builder(middle).swing(amplitude, frequency, seconds).segments
+        sizes = []
+        for k in np.flatnonzero(swings):
+            size = f'{1000 * amplitude[k]:.0f} mm'
+            if self.limits.turns[k]:
+                size = f'{np.degrees(amplitude[k]):.0f}°'
+            sizes.append(f'{self.names[k]} by {size} at {frequency[k]:.2g} Hz')
+        return self._motion(kind, middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s')
+
+    def _largest_amplitude(
+        self, swings: np.ndarray, frequency: np.ndarray, seconds: float
+    ) -> np.ndarray:
+        """
+        Return the amplitude of each joint in a swing, rad or m, shape (n_joints,); 0 without one.
+
+        Position, rate and acceleration are proportional to it. Arguments as for `_swing`.
+        """
+        # Largest position, rate and acceleration of a swing of unit amplitude.
         unit = np.where(swings, 1.0, 0.0)
-        unit_swing = self._builder(np.zeros(len(place))).swing(unit, frequency, seconds).segments
+        unit_swing = self._builder(np.zeros(len(unit))).swing(unit, frequency, seconds).segments
         motion = motion_at(unit_swing, np.linspace(0.0, seconds, int(60 * seconds)))
         largest_position = np.maximum(np.abs(motion.position).max(axis=0), 1e-9)
         largest_rate = np.maximum(np.abs(motion.rate).max(axis=0), 1e-9)
         largest_acceleration = np.maximum(np.abs(motion.acceleration).max(axis=0), 1e-9)
 
         # The largest amplitude within all limits, less 1 %: the largest values are between the
-        # instants of `motion`.
+        # instants of `motion`. Of the range 2 % remain free at each end.
         lower, upper = reachable(self.limits)
         room = np.where(self.limits.endless, np.inf, 0.48 * (upper - lower))
         reach = [
@@ -489,17 +511,7 @@ class MotionLibrary:
             self.limits.acceleration / largest_acceleration,
             np.array([MAX_SWING[bool(turning)] for turning in self.limits.turns]),
         ]
-        amplitude = 0.99 * unit * np.minimum.reduce(reach)
-        middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))
-        swing = self._builder(middle).swing(amplitude, frequency, seconds).segments
-
-        sizes = []
-        for k in np.flatnonzero(unit):
-            size = f'{1000 * amplitude[k]:.0f} mm'
-            if self.limits.turns[k]:
-                size = f'{np.degrees(amplitude[k]):.0f}°'
-            sizes.append(f'{self.names[k]} by {size} at {frequency[k]:.2g} Hz')
-        return self._motion(kind, middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s')
+        return 0.99 * unit * np.minimum.reduce(reach)
 
     def _rate_words(self, rates: np.ndarray) -> str:
         """Return the joints that turn and their rates (rad/s) as text."""

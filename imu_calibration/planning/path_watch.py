@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,6 +37,46 @@ back all may be where they began.
 """
 
 
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """A trajectory at n instants, at most `PATH_STEP_SECONDS` apart."""
+
+    time: np.ndarray
+    """Instants since the start, s, shape (n,)."""
+    place: np.ndarray
+    """Positions of the joints, in tolerances, shape (n, n_joints)."""
+    rests: np.ndarray
+    """Whether the path rests at each instant, shape (n,)."""
+    rest_end: np.ndarray
+    """First instant from each one on at which the path moves, or the last; indices, shape (n,)."""
+
+    @classmethod
+    def make(cls, start: np.ndarray, points: TrajectoryPoints, tolerance: np.ndarray) -> '_Path':
+        """Return the path through `points`; `start` and `tolerance` as for `PathWatch`."""
+        n_steps = max(int(np.ceil(points.duration / PATH_STEP_SECONDS)), 1)
+        time = np.linspace(0.0, points.duration, n_steps + 1)
+        trajectory = trajectory_from(rest_at(np.asarray(start, float)[None]), points)
+        place = trajectory.at(time).position / tolerance
+        # By positions: the rate of the spline may vanish where an oscillation reverses.
+        moved = np.max(np.abs(np.diff(place, axis=0, prepend=place[:1])), axis=1)
+        rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
+        # Of the instants with motion, in order, the first that is not before each instant.
+        moving = np.append(np.flatnonzero(~rests), n_steps)
+        rest_end = moving[np.searchsorted(moving, np.arange(n_steps + 1))]
+        return cls(time, place, rests, rest_end)
+
+    def reachable(self, instant: int, elapsed: float) -> slice:
+        """
+        Return the instants at which joints may be `elapsed` s after the one at `instant`.
+
+        They are never behind it. Joints may end a rest before the scheduled time, so that the time
+        counts from its end.
+        """
+        latest = self.time[self.rest_end[instant]] + elapsed + MAX_LEAD_SECONDS
+        stop = np.searchsorted(self.time, latest, side='right')
+        return slice(instant, max(stop, instant + 1))
+
+
 class PathWatch:
     """
     Follows joints along a trajectory.
@@ -55,25 +96,10 @@ class PathWatch:
     """
 
     def __init__(self, start: np.ndarray, points: TrajectoryPoints, tolerance: np.ndarray):
-        path = trajectory_from(rest_at(np.asarray(start, float)[None]), points)
-        count = max(int(np.ceil(points.duration / PATH_STEP_SECONDS)), 1)
-        # The path at n instants, in the time of the path.
-        self._time = np.linspace(0.0, points.duration, count + 1)
-        """Instants, s, shape (n,)."""
-        motion = path.at(self._time)
-        self._path = motion.position / tolerance
-        """Positions in tolerances, shape (n, n_joints)."""
+        self._path = _Path.make(start, points, tolerance)
         self.tolerance = np.asarray(tolerance, float)
-        # The rate of the spline may vanish where an oscillation reverses: rest means no motion over
-        # several steps.
-        moved = np.max(np.abs(np.diff(self._path, axis=0, prepend=self._path[:1])), axis=1)
-        self._path_rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
-        """Whether the path rests at each instant, shape (n,)."""
-        moving = np.append(np.flatnonzero(~self._path_rests), len(self._time) - 1)
-        self._rest_end = moving[np.searchsorted(moving, np.arange(len(self._time)))]
-        """First instant from each one on at which the path moves, or the last, shape (n,)."""
         self._instant = 0
-        """Instant of the path at which the joints are."""
+        """Instant of the path at which the joints are, an index."""
         self._start = np.asarray(start, float) / tolerance
         """Where the joints rested before, in tolerances."""
         self._last_time: float | None = None
@@ -103,12 +129,12 @@ class PathWatch:
     @property
     def progress(self) -> float:
         """Progress of the joints along the path, s of the time of the path."""
-        return float(self._time[self._instant])
+        return float(self._path.time[self._instant])
 
     @property
     def at_end(self) -> bool:
         """Whether the joints have reached the last point of the path."""
-        return self._instant == len(self._time) - 1
+        return self._instant == len(self._path.time) - 1
 
     @property
     def pace(self) -> float:
@@ -133,31 +159,30 @@ class PathWatch:
         self._last_time = time
         place = position / self.tolerance
         self._remember(time, place)
+        path = self._path
+        before = self._instant
+        path_rests = path.rests[before]
 
-        # The part of the path that may be reached by now. Joints may end a rest before the
-        # scheduled time, so its end is evaluated as well.
-        path_rests = self._path_rests[self._instant]
-        latest = self._time[self._rest_end[self._instant]] + elapsed + MAX_LEAD_SECONDS
-        stop = np.searchsorted(self._time, latest, side='right')
-        ahead = slice(self._instant, max(stop, self._instant + 1))
-
-        # Of the points that fit the position, the one nearest to the expected time.
-        distance = np.max(np.abs(self._path[ahead] - place), axis=1)
-        fits = np.flatnonzero(distance <= max(DEAD_BAND, np.min(distance)))
-        # The remainder below a step is kept; otherwise a slow pace would never end a rest.
+        # 1. Expected time of the path. While the path rests the positions do not tell it: there it
+        #    passes at the pace of the joints. A remainder below a step is kept; otherwise a slow
+        #    pace would never end a rest.
         pace = self.pace if path_rests else 1.0
         expected = self.progress + self._remainder + elapsed * pace
-        before = self._instant
-        nearest = np.argmin(np.abs(self._time[ahead][fits] - expected))
+
+        # 2. Of the reachable instants whose places fit, the one nearest to the expected time.
+        ahead = path.reachable(before, elapsed)
+        distance = np.max(np.abs(path.place[ahead] - place), axis=1)
+        fits = np.flatnonzero(distance <= max(DEAD_BAND, np.min(distance)))
+        nearest = np.argmin(np.abs(path.time[ahead][fits] - expected))
         self._instant += int(fits[nearest])
         remainder = expected - self.progress
         self._remainder = float(np.clip(remainder, -PATH_STEP_SECONDS, PATH_STEP_SECONDS))
-        self.deviation = np.abs(self._path[self._instant] - place)
+        self.deviation = np.abs(path.place[self._instant] - place)
 
-        # Scheduled and elapsed time in motion give the pace.
+        # 3. Pace, from scheduled and elapsed time in motion, and the time without progress.
         advances = self._instant > before or self.at_end
         if advances and not path_rests and self.has_begun:
-            self._path_seconds += float(self._time[self._instant] - self._time[before])
+            self._path_seconds += float(path.time[self._instant] - path.time[before])
             self._joint_seconds += elapsed + self.waited
         self._steady_now = now
         self.waited = 0.0 if advances else self.waited + elapsed
@@ -187,12 +212,12 @@ class PathWatch:
         n_steps = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1
         place = self._recent[-1][1]
         if self.has_strayed:
-            path = self._path[max(self._instant - n_steps, 0) : self._instant + 1]
-            commanded = np.ptp(path, axis=0)
+            before = self._path.place[max(self._instant - n_steps, 0) : self._instant + 1]
+            commanded = np.ptp(before, axis=0)
         else:
             # Distance to the following path: of joints with equal motion, a joint that has arrived
             # is not the cause.
-            path = self._path[self._instant : self._instant + n_steps + 1]
-            commanded = np.max(np.abs(path - place), axis=0)
+            ahead = self._path.place[self._instant : self._instant + n_steps + 1]
+            commanded = np.max(np.abs(ahead - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
         return int(np.argmax(commanded - moved - LATENESS_TIE * self._largest_movement))

@@ -141,12 +141,13 @@ def greedy(
     chosen = []
     spent = 0.0  # s
     margin = 1.0  # on the standard deviations of the search
-    factor = 0.0  # on the variance of the noise
-    # Information without the factor, and length, of each chosen motion.
+    factor = 0.0  # on the variance of the noise; 0 before the first round
+    # Of each chosen motion the information for a factor of 1, and the length, s.
     steps: list[tuple[np.ndarray, float]] = []
     first_distance = problem.goal.distance(posterior.covariance_z[None])[0]
     while len(chosen) < MAX_PLAN_MOTIONS and spent < longest:
-        # More rests reduce the factor: the motions so far have more information.
+        # 1. The factor falls with every rest: the motions so far then have more information, and
+        #    their posterior is computed again.
         new_factor = problem.variance_factor(problem.timed(chosen, start).windows)
         if new_factor != factor:
             factor = new_factor
@@ -154,6 +155,7 @@ def greedy(
             for information, seconds in steps:
                 posterior.take(information / factor, seconds)
 
+        # 2. The next motion: a mandatory one, or the best one if it has a gain and there is time.
         candidates = CandidateMotions(problem, posterior, place, margin=margin, factor=factor)
         if len(chosen) < len(first):
             number = first[len(chosen)]
@@ -163,6 +165,8 @@ def greedy(
                 break
             if spent + float(candidates.seconds[number]) > longest:
                 break
+
+        # 3. Its information and time are added.
         information = candidates.information[number]
         seconds = float(candidates.seconds[number])
         steps.append((factor * information, seconds))
@@ -171,13 +175,14 @@ def greedy(
         spent += seconds
         place = int(problem.library.place_of[number])
 
+        # 4. End at the goal, if it is also reached by the exact covariance.
         distance = problem.goal.distance(posterior.covariance_z[None], margin)[0]
         report('planning', 1.0 - distance / max(first_distance, 1e-9), 1.0)
         if distance == 0.0 and len(chosen) >= len(first):
             if remaining_distance(problem, chosen, start) == 0.0:
                 break
-            # The posterior has constant biases within a motion; if that was optimistic, the target
-            # must be lower.
+            # The posterior has constant biases within a motion, which was optimistic: the search
+            # goes on to lower standard deviations.
             margin *= MARGIN_STEP
     return chosen
 
@@ -448,28 +453,48 @@ class Planner:
         self.drop_inseparable(longest)
         sequence = self._sequence(place, first, longest)
         bound = float('nan')
-        goal = problem.goal
-        if with_bound and isinstance(goal, WithinTolerances):
-            timed = problem.timed(sequence, place)
-            factor = problem.variance_factor(timed.windows)
-            relaxed = problem.relaxation(factor=factor)
-            bound = problem.lower_bound(factor=factor, relaxed=relaxed)
-            # A second search, in which the parameters that limit the relaxed plan count more.
-            if timed.seconds > MAX_BOUND_RATIO * bound:
-                weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
-                problem.goal = WithinTolerances(problem.coordinates, weights)
-                second = self._sequence(place, first, longest)
-                problem.goal = goal
-                second_timed = problem.timed(second, place)
-                reaches_goal = remaining_distance(problem, second, place) == 0.0
-                if second_timed.seconds < timed.seconds and reaches_goal:
-                    sequence = second
-                    factor = problem.variance_factor(second_timed.windows)
-                    bound = problem.lower_bound(factor=factor)
+        if with_bound and isinstance(problem.goal, WithinTolerances):
+            sequence, bound = self._bounded(sequence, place, first, longest)
         return self._plan_of(sequence, start, place, bound)
 
+    def _bounded(
+        self, sequence: list[int], place: int, first: Sequence[int], longest: float
+    ) -> tuple[list[int], float]:
+        """
+        Return (plan, lower bound of its time in s) of `sequence`, or of a faster one.
+
+        Where `sequence` is much longer than the bound, there is a second search. `place`, `first`
+        and `longest` as for `_sequence`.
+        """
+        problem = self.problem
+        timed = problem.timed(sequence, place)
+        factor = problem.variance_factor(timed.windows)
+        relaxed = problem.relaxation(factor=factor)
+        bound = problem.lower_bound(factor=factor, relaxed=relaxed)
+        # A bound of NaN has no second search: a tolerance is out of reach.
+        if not timed.seconds > MAX_BOUND_RATIO * bound:
+            return sequence, bound
+
+        # In the second search the parameters that limit the relaxed plan count more.
+        weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
+        goal = problem.goal
+        problem.goal = WithinTolerances(problem.coordinates, weights)
+        second = self._sequence(place, first, longest)
+        problem.goal = goal
+        second_timed = problem.timed(second, place)
+        reaches_goal = remaining_distance(problem, second, place) == 0.0
+        if second_timed.seconds >= timed.seconds or not reaches_goal:
+            return sequence, bound
+        # Other rests: another factor on the noise, and with it another bound.
+        factor = problem.variance_factor(second_timed.windows)
+        return second, problem.lower_bound(factor=factor)
+
     def _sequence(self, place: int, first: Sequence[int], longest: float) -> list[int]:
-        """Return the motions of the greedy search from a place, without needless ones."""
+        """
+        Return the motions of the greedy search from a place, without needless ones.
+
+        `first`: mandatory first motions; `longest`: time at most, s.
+        """
         sequence = greedy(self.problem, place, first=first, longest=longest)
         return shortened_plan(self.problem, sequence, place, fixed=len(first))
 
@@ -592,10 +617,14 @@ def plan_by_hand(
         Samples per second.
 
     """
+    # The integral of the rates over a turn of half a revolution: its variance is that of a sample
+    # times the seconds of the turn over the samples per second.
+    turn_seconds = np.pi / TURN_RATE
+    turn_variance = noise['gyroscope'].low_variance.mean() * turn_seconds / rate
     noise_of_means = NoiseOfMeans(
         force=_mean_sd(noise['accelerometer'], HOLD_TIME * rate),
         rate=_mean_sd(noise['gyroscope'], HOLD_TIME * rate),
-        turn=float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate)),
+        turn=float(np.sqrt(turn_variance)),
     )
     knowledge = knowledge_at_first(model, tolerances, noise=noise_of_means)
     steps = foretold(knowledge)

@@ -181,7 +181,7 @@ class PlanningProblem:
         Return the numbers of the motions at rest with which a session from a place begins.
 
         They are in widely different attitudes; the next place is always the nearest one, and the
-        first rest is longer.
+        first rest is longer. A chain with fewer attitudes than rests visits them again.
         """
         # Place -> its motions at rest. The library has the places with the largest differences in
         # attitude first.
@@ -192,13 +192,14 @@ class PlanningProblem:
         unvisited = list(rests_at)[:LEAST_RESTS]
         chosen: list[int] = []
         visited: list[int] = []
-        while len(chosen) < LEAST_RESTS and (unvisited or len(chosen) > 1):
-            if not unvisited:  # a chain with few attitudes returns to them
-                unvisited = [at for at in dict.fromkeys(visited) if at != place]
-            place = min(unvisited, key=lambda target: self.move_seconds[place, target])
-            unvisited.remove(place)
-            visited.append(place)
-            rests = rests_at[place]
+        here = place
+        while len(chosen) < LEAST_RESTS and (unvisited or len(visited) > 1):
+            if not unvisited:  # again, in the order of the first visits
+                unvisited = [visit for visit in dict.fromkeys(visited) if visit != here]
+            here = min(unvisited, key=lambda target: self.move_seconds[here, target])
+            unvisited.remove(here)
+            visited.append(here)
+            rests = rests_at[here]
             if not chosen:
                 rests = [number for number in rests if self.seconds[number] >= FIRST_REST]
             chosen.append(min(rests, key=self.seconds.__getitem__))
@@ -288,16 +289,16 @@ class PlanningProblem:
         seconds = 0.0
         for sensor in SENSORS:
             biases = coordinates.model.part(sensor, Role.OFFSET)
-            for k, parameter in enumerate(range(biases.start, biases.stop)):
+            for axis, parameter in enumerate(range(biases.start, biases.stop)):
                 # Largest variance of the observations: 1 / tolerated = 1 / prior + 1 / largest.
                 prior = coordinates.prior_sd[parameter] ** 2
                 tolerated = coordinates.tolerances[parameter] ** 2
                 largest = 1.0 / (1.0 / tolerated - 1.0 / prior) if tolerated < prior else np.inf
-                white = factor * self.noise[sensor].low_variance[k % 3] / self.rate
+                white = factor * self.noise[sensor].low_variance[axis] / self.rate
                 suffices = least_bias_variance(self.noise[sensor], white, lengths) <= largest
                 if not suffices.any():
                     return np.inf
-                # The last length that is too short.
+                # The bound is the last length of the grid that is too short.
                 last_too_short = max(int(np.argmax(suffices)) - 1, 0)
                 seconds = max(seconds, float(lengths[last_too_short]))
         return seconds
@@ -362,8 +363,9 @@ class PlanningProblem:
                     total / bias_variance
                 ) ** 2
                 prior[place, place] = 1.0 / total
-                # Without any margin a small number is used: the value of the relaxation then
-                # exceeds any session of interest.
+                # Only the row of this bias has an element at its place, 1. Without any margin a
+                # small number is used: the value of the relaxation then exceeds any session of
+                # interest.
                 rows[np.abs(rows[:, place]) > 0.5] /= np.sqrt(max(tolerated, 1e-4))
         return prior, rows
 

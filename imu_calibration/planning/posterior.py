@@ -87,19 +87,19 @@ def relax(
     best = Relaxation(0.0, weights)
     for number in range(MAX_WEIGHT_STEPS):
         # 1. The visits, scaled until the worst parameter meets its tolerance, and the prices K.
-        direction = np.tensordot(visits[useful], flat_useful, 1).reshape(prior.shape)
-        scale = _scale(direction, root, whitened_rows)
+        added = np.tensordot(visits[useful], flat_useful, 1).reshape(prior.shape)
+        scale = _scale(added, root, whitened_rows)
         # Nearly singular in unreachable directions.
-        covariance = inverse_normal(prior + scale * direction)
-        columns_of_rows = covariance @ rows.T
-        variance = np.einsum('pn,np->p', rows, columns_of_rows)
+        covariance = inverse_normal(prior + scale * added)
+        columns_of_rows = covariance @ rows.T  # C e_p
+        variance = np.einsum('pn,np->p', rows, columns_of_rows)  # e_p' C e_p
         prices = (columns_of_rows * weights) @ columns_of_rows.T
         # Worth of a second of each motion: tr(M_i K) / seconds_i.
         worth = np.zeros(len(seconds))
         worth[useful] = flat_useful @ prices.ravel() / seconds[useful]
         plan_seconds = scale * float(visits @ seconds)
-        # 2. Now and then the certificate. It needs the worth of all motions, the steps only that of
-        #    the useful ones.
+        # 2. Every 25 steps the certificate, the end of the search, and the useful motions: only the
+        #    certificate needs the worth of all.
         if number % 25 == 0 or number == MAX_WEIGHT_STEPS - 1:
             worth = flat @ prices.ravel() / seconds
             factor = 1.0 / worth.max()
@@ -112,15 +112,14 @@ def relax(
             is_visited = visits * seconds > 1e-4 * (visits @ seconds)
             useful = np.flatnonzero((worth > 0.3 * worth.max()) | is_visited)
             flat_useful = flat[useful]
-        # 3. Step of the visits, relative to the mean worth of the time spent; then of the weights.
+        # 3. Step of the visits by the root of their worth relative to the mean worth of the time
+        #    spent; then of the weights by the variances.
         spent = visits[useful] * seconds[useful]
         mean_worth = worth[useful] @ spent / spent.sum()
         visits[useful] *= np.sqrt(np.maximum(worth[useful], 1e-12) / mean_worth)
         # Early steps keep the visits of the other motions, which may become useful again.
         if number > 50:
-            kept = np.zeros_like(visits)
-            kept[useful] = visits[useful]
-            visits = kept
+            visits[np.setdiff1d(np.arange(len(visits)), useful)] = 0.0
         weights = weights * variance / variance.max()
         weights /= weights.sum()
     return best
@@ -131,23 +130,23 @@ def _largest_variance(information: np.ndarray, rows: np.ndarray) -> float:
     return float(np.einsum('pn,pn->p', rows @ np.linalg.inv(information), rows).max())
 
 
-def _scale(direction: np.ndarray, root: np.ndarray, whitened_rows: np.ndarray) -> float:
+def _scale(added: np.ndarray, root: np.ndarray, whitened_rows: np.ndarray) -> float:
     """
-    Return the factor s of `direction` at which the worst parameter meets its tolerance.
+    Return the factor s of `added` information at which the worst parameter meets its tolerance.
 
-    With prior information R R' (`root` R), direction D, and rows e_p = R f_p (`whitened_rows` f_p),
-    by the eigenvalues l_j and eigenvectors v_j of R^-1 D R'^-1::
+    With prior information R R' (`root` R), added D, and rows e_p = R f_p (`whitened_rows` f_p), by
+    the eigenvalues l_j and eigenvectors v_j of R^-1 D R'^-1::
 
         max_p e_p' (R R' + s D)^-1 e_p = max_p sum_j (f_p' v_j)^2 / (1 + s l_j) = 1
 
     It decreases with s, whose logarithm is found by bisection.
     """
-    half_whitened = scipy.linalg.solve_triangular(root, direction, lower=True)
+    half_whitened = scipy.linalg.solve_triangular(root, added, lower=True)
     whitened = scipy.linalg.solve_triangular(root, half_whitened.T, lower=True)
     values, vectors = scipy.linalg.eigh(0.5 * (whitened + whitened.T))
     squares = (whitened_rows @ vectors) ** 2
     values = np.maximum(values, 0.0)
-    low = -30.0
+    low = -30.0  # logarithms of the factor
     high = 60.0
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
@@ -332,16 +331,19 @@ class WindowPredictor:
             means[sensor] = np.empty((3, slope.shape[2]))
             variance[sensor] = np.empty(3)
             reference = noise.reference.variance([cut.kind], np.array([cut.seconds]))[0]
-            # Both halves are turned into the directions of the wander, where its values are
-            # independent; an instant in the middle has no wander.
+            # Each half is turned into the directions of the wander, where its values are
+            # independent. The early half is reversed before, so that both begin at the middle. An
+            # instant in the middle has no wander.
             half_wander, directions = wander_of(sensor, count, cut.seconds)
             half = len(half_wander)
             wander = np.concatenate([half_wander, np.zeros(count % 2), half_wander])
             early, centre, late = np.split(
                 np.column_stack([np.ones(count), design]), [half, count - half]
             )
-            # Without the copy numpy multiplies reversed rows without BLAS.
-            rows = np.concatenate([directions.T @ early[::-1].copy(), centre, directions.T @ late])
+            reversed_early = early[
+                ::-1
+            ].copy()  # of rows in reversed order numpy makes no BLAS call
+            rows = np.concatenate([directions.T @ reversed_early, centre, directions.T @ late])
             ones = rows[:, 0]
             rows = rows[:, 1:]
             for axis in range(3):
@@ -551,10 +553,17 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
     The observation of length T, one for each of `seconds`, has white noise and the bias processes;
     the result has the shape (k,).
 
-    For one process, ``integral(S exp(-|t - s| / time) h(s)) + white h(t) = 1`` is solved by ``h = a
-    + b cosh(k (t - T / 2))`` with ``k^2 = 1 / time^2 + 2 S / (time white)``, and the variance is
-    ``1 / integral(h)``. Of several processes the variances add up (parallel sums are concave), with
-    the white noise added to any one of them.
+    For one process of the variance S, the weight h of an unbiased estimate of least variance solves
+    ``integral(S exp(-|t - s| / time) h(s) ds) + white h(t) = 1``, and the variance is ``1 /
+    integral(h)``::
+
+        h     = level / white + b cosh(k (t - T / 2))
+        k^2   = 1 / time^2 + 2 S / (time white)
+        level = 1 / (time k)^2
+        b     = (1 - level) / (white (cosh(k T / 2) + k time sinh(k T / 2)))
+
+    Of several processes the variances add up (parallel sums are concave), with the white noise
+    added to any one of them: the largest sum counts.
 
     Parameters
     ----------
@@ -565,15 +574,14 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
     """
     seconds = np.asarray(seconds, float)
     least = white / seconds
-    for chosen in noise.bias_processes:
-        k = np.sqrt(1 / chosen.time**2 + 2 * chosen.sd**2 / (chosen.time * white))
-        level = 1 / (chosen.time * k) ** 2
-        steep = np.tanh(k * seconds / 2)
-        # The integral of h.
-        information = (
-            level * seconds + 2 * (1 - level) * steep / (k * (1 + k * chosen.time * steep))
+    for process in noise.bias_processes:
+        k = np.sqrt(1 / process.time**2 + 2 * process.sd**2 / (process.time * white))
+        level = 1 / (process.time * k) ** 2
+        tanh = np.tanh(k * seconds / 2)
+        integral_of_h = (
+            level * seconds + 2 * (1 - level) * tanh / (k * (1 + k * process.time * tanh))
         ) / white
-        further = tuple(process for process in noise.bias_processes if process is not chosen)
-        further_variance = common_variance(replace(noise, bias_processes=further), seconds)
-        least = np.maximum(least, 1 / information + further_variance)
+        others = tuple(other for other in noise.bias_processes if other is not process)
+        variance_of_others = common_variance(replace(noise, bias_processes=others), seconds)
+        least = np.maximum(least, 1 / integral_of_h + variance_of_others)
     return least

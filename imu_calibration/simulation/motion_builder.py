@@ -89,17 +89,21 @@ class Segment:
         return motion
 
     def _add_steps(self, motion: np.ndarray, time: np.ndarray) -> None:
-        """Add change of rate and shift to position and derivatives, shape (4, n, n_joints)."""
-        part = time / self.duration
+        """
+        Add change of rate and shift to position and derivatives, shape (4, n, n_joints).
+
+        Each derivative by t of ``change T integral Q(t / T)`` and ``shift S(t / T)`` adds 1 / T.
+        """
+        share = time / self.duration
         change = self.rate_to - self.rate_from
         if change.any():
             for order in range(4):
                 scale = change * self.duration ** (1 - order)
-                motion[order] += np.outer(_RATE_STEP[order](part), scale)
+                motion[order] += np.outer(_RATE_STEP[order](share), scale)
         if self.shift.any():
             for order in range(4):
-                scale = self.shift * self.duration ** (0 - order)
-                motion[order] += np.outer(_POSITION_STEP[order](part), scale)
+                scale = self.shift * self.duration**-order
+                motion[order] += np.outer(_POSITION_STEP[order](share), scale)
 
     def _add_sines(self, motion: np.ndarray, time: np.ndarray) -> None:
         """
@@ -177,26 +181,24 @@ class Profile:
         return JointMotion(time, *motion)
 
     def _evaluate(self, time: np.ndarray) -> np.ndarray:
-        """Return position, rate, acceleration and jerk at times within the profile, (4, n, m)."""
-        edges = self.edges
-        order = None
-        ordered = time
+        """
+        Return position, rate, acceleration and jerk at times within the profile, (4, n, n_joints).
+        """
         if not np.all(time[1:] >= time[:-1]):
             order = np.argsort(time, kind='stable')
-            ordered = time[order]
-        motion = np.empty((4, len(time), len(self.segments[0].start)))
-        # Times low:high are in a segment.
-        cuts = np.searchsorted(ordered, edges[1:-1])
-        lows = [0, *cuts]
-        highs = [*cuts, len(time)]
-        for segment, start, low, high in zip(self.segments, edges, lows, highs, strict=False):
-            if high > low:
-                motion[:, low:high] = segment.at(ordered[low:high] - start)
-        if order is None:
+            motion = np.empty((4, len(time), len(self.segments[0].start)))
+            motion[:, order] = self._evaluate(time[order])
             return motion
-        unsorted = np.empty_like(motion)
-        unsorted[:, order] = motion
-        return unsorted
+
+        # Segment k has the times cuts[k]:cuts[k + 1].
+        edges = self.edges
+        cuts = [0, *np.searchsorted(time, edges[1:-1]), len(time)]
+        motion = np.empty((4, len(time), len(self.segments[0].start)))
+        for k, segment in enumerate(self.segments):
+            inside = slice(cuts[k], cuts[k + 1])
+            if cuts[k + 1] > cuts[k]:
+                motion[:, inside] = segment.at(time[inside] - edges[k])
+        return motion
 
     def find(self, kind: str) -> np.ndarray:
         """Return (start, end) of every segment of a kind, s, shape (n, 2)."""

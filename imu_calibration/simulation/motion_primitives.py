@@ -300,7 +300,7 @@ def _gimbals(order: str, up_axis: str) -> dict[str, Any]:
     return _table([AXIS_VECTORS[axis] for axis in order], AXIS_VECTORS[up_axis])
 
 
-REGISTRY: dict[str, ProfileEntry] = {
+PAPER_PROFILES: dict[str, ProfileEntry] = {
     **{
         f'avrutov_{order}{suffix}': ProfileEntry(
             (

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 from imu_calibration.core.errors import InputError, did_you_mean
 from imu_calibration.kinematics.motion_limits import MotionLimits, free_limits, limits_of
 from imu_calibration.kinematics.table import Table
-from imu_calibration.simulation import motion_primitives
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment, stretch
 from imu_calibration.simulation.motion_primitives import (
     FACES,
+    GIMBALS,
+    PAPER_PROFILES,
     ProfileEntry,
     Task,
     poses,
@@ -56,8 +57,7 @@ def within_limits(
     """
     limits = builder.limits
     count = builder.n_joints
-    lower = np.where(limits.endless, -np.pi, limits.lower)
-    upper = np.where(limits.endless, np.pi, limits.upper)
+    lower, upper = _turn_or_range(limits)
     moving = np.flatnonzero(upper > lower)
 
     def spread_positions(n: int) -> np.ndarray:
@@ -65,38 +65,22 @@ def within_limits(
         number = rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T
         return lower + (upper - lower) * (number + 0.5) / n
 
-    def swing(at: np.ndarray, frequency: np.ndarray) -> Task:
-        """
-        Return the task of swinging about `at`, the joints with a frequency above zero (Hz).
-
-        The amplitude is 70 % of the smallest limit by range, speed and acceleration.
-        """
-        omega = 2 * np.pi * np.maximum(frequency, 1e-9)
-        largest = [
-            0.3 * (upper - lower),
-            limits.speed / omega,
-            limits.acceleration / omega**2,
-            np.full(count, MAX_PROFILE_SWING),
-        ]
-        amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(largest), 0.0)
-        within_range = np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude)
-        middle = np.where(limits.endless, at, within_range)
-        return swing_at(middle, amplitude, np.maximum(frequency, 0.1), duration=swing_time)
-
     tasks = [_rest_at(position) for position in spread_positions(n_poses)]
     unit = np.eye(count)  # row: 1 for one joint
     for joint in moving.tolist():
         # One joint swings.
         for at, frequency in zip(spread_positions(len(frequencies)), frequencies, strict=True):
-            tasks.append(swing(at, frequency * unit[joint]))
+            tasks.append(_swing_within(limits, at, frequency * unit[joint], swing_time))
 
-        # Two joints swing.
+        # Two joints swing, at different frequencies (Hz). For the first joint, which has no earlier
+        # one, a position is drawn and not used.
         earlier_joints = moving[moving < joint][-n_other:]
         positions = spread_positions(max(len(earlier_joints), 1))
         for other, at in zip(earlier_joints, positions, strict=False):
-            tasks.append(swing(at, 0.3 * unit[joint] + 0.45 * unit[other]))
+            of_both = 0.3 * unit[joint] + 0.45 * unit[other]
+            tasks.append(_swing_within(limits, at, of_both, swing_time))
 
-        # A joint without an end spins, up to 90 % of its speed.
+        # A joint without an end spins, at 27 to 90 % of its speed.
         if limits.endless[joint]:
             shares = 0.9 * np.linspace(0.3, 1.0, len(frequencies))
             speeds = shares * np.degrees(limits.speed[joint])
@@ -111,6 +95,35 @@ within_limits_short = partial(
 )
 
 
+def _turn_or_range(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (lower, upper) ends of each joint, of an endless one half a turn to each side."""
+    lower = np.where(limits.endless, -np.pi, limits.lower)
+    return lower, np.where(limits.endless, np.pi, limits.upper)
+
+
+def _swing_within(
+    limits: MotionLimits, at: np.ndarray, frequency: np.ndarray, duration: float
+) -> Task:
+    """
+    Return the task of swinging about a position, the joints with a frequency above zero (Hz).
+
+    The amplitude is 70 % of the smallest limit by range, speed and acceleration. Near an end of the
+    range the middle is moved, so that a tenth of the amplitude remains free.
+    """
+    lower, upper = _turn_or_range(limits)
+    omega = 2 * np.pi * np.maximum(frequency, 1e-9)
+    largest = [
+        0.3 * (upper - lower),
+        limits.speed / omega,
+        limits.acceleration / omega**2,
+        np.full(len(at), MAX_PROFILE_SWING),
+    ]
+    amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(largest), 0.0)
+    within_range = np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude)
+    middle = np.where(limits.endless, at, within_range)
+    return swing_at(middle, amplitude, np.maximum(frequency, 0.1), duration=duration)
+
+
 def _rest_at(position: np.ndarray) -> Task:
     """Return the task of resting at joint positions, rad and m."""
     return lambda builder: builder.move_to(position).rest(4.0)
@@ -122,7 +135,11 @@ SPEEDS_DEG = (60.0, 120.0, 200.0)
 
 
 def profile_names() -> dict[str, str]:
-    """Return the names of all profiles with one line of description each, a dict."""
+    """
+    Return name -> one line of description of each profile.
+
+    Of the profiles that differ in the direction of gravity only one is listed.
+    """
     return {name: entry.description for name, entry in _REGISTRY.items() if '_up_' not in name}
 
 
@@ -174,9 +191,11 @@ def make_profile(
         )
     # A description in a mapping states no limits.
     limits = limits_of(table) if isinstance(table, Table) else free_limits(len(joint_names))
-    build = entry.build if fits else _any_table
+    build = entry.build
     if entry.adapts and not limits.endless.all():
         build = within_limits
+    elif not fits:
+        build = _any_table
 
     def build_segments(dwell: float) -> tuple[Segment, ...]:
         builder = MotionBuilder(len(joint_names), dwell, limits)
@@ -383,10 +402,11 @@ def _random(
     each axis, and `n_simultaneous` turns about two axes at once.
     """
     # The order of the draws is part of the recording of a seed. Angles in deg, speeds in deg/s.
+    # Poses.
     tasks = poses([_random_direction_near(rng, up_b, 0.25) for up_b in directions], 2.6)
 
     # Spins about each axis of the sensor at every speed, about oblique axes, and of one joint.
-    speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
+    speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])  # (n_speeds, 3 axes)
     for k, axis in enumerate(np.eye(3)):
         tasks.append(spin_vertical(_random_direction_near(rng, axis, 0.2), speeds[:, k], 2.0))
     for _ in range(n_oblique):
@@ -403,10 +423,10 @@ def _random(
             amplitude = rng.uniform(7, 14) / frequency
             tasks.append(swing(axis, amplitude, frequency, duration=3.5))
 
-    # Two axes turn at once.
+    # Two axes turn at once, in other ones of the five ways each time.
     rates = rng.uniform(80, 180, (n_simultaneous, 2)) * rng.choice([-1, 1], (n_simultaneous, 2))
-    for k, pair in zip(rng.permutation(5), rates):
-        tasks.append(simultaneous(pair, 2.0)[k])
+    for way, rates_of_pair in zip(rng.permutation(5), rates):
+        tasks.append(simultaneous(rates_of_pair, 2.0)[way])
     run(builder, rng, tasks, reference_every=15)
 
 
@@ -431,9 +451,10 @@ def _random_direction_near(
 def _any_table(builder: MotionBuilder, rng: np.random.Generator) -> None:
     """Poses, spins at three speeds, swings and two joints at once for any number of joints."""
     count = builder.n_joints
+    # 24 positions, in which each joint has every multiple of 15 deg once, in a random order.
     angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
     tasks = [_rest_at(np.radians(row)) for row in angles]
-    unit = np.eye(count)
+    unit = np.eye(count)  # row: 1 for one joint
     for joint in range(count):
         for speed in SPEEDS_DEG:
             tasks.append(spin_joint(joint, rng.uniform(-180, 180, count), speed, dwell=4.0))
@@ -450,7 +471,7 @@ def _any_table(builder: MotionBuilder, rng: np.random.Generator) -> None:
 
 
 _ON_ARM = {
-    **motion_primitives.GIMBALS,
+    **GIMBALS,
     'mount': {'rpy_deg': [0.0, 0.0, 0.0], 'xyz': [0.2, 0.15, 0.1]},
 }
 
@@ -518,5 +539,5 @@ _REGISTRY = {
     'any_table': ProfileEntry(
         'poses, spins, swings and simultaneous turns of all joints of the table', _any_table
     ),
-    **motion_primitives.REGISTRY,
+    **PAPER_PROFILES,
 }

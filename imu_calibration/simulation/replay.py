@@ -120,8 +120,10 @@ def simulate_on_recording(
             code='no_motion',
         )
 
-    # Outputs without noise; where biases follow the vibration, with that of the recording.
+    # Outputs without noise; where biases follow the vibration, with that of the recording. Windows
+    # are predicted in groups, which bounds the memory.
     outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
+    # Windows of one sample have no period.
     period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
     noise = noise or recorded_noise(windows)
     exact = {}

@@ -335,13 +335,13 @@ class TableController:
         index = np.searchsorted(begins, time, side='right') - 1
         motion = np.zeros((4, len(time), len(self.joint_names)))
         for k in np.unique(index):
-            mask = index == k
+            is_now = index == k
             if k < 0:
-                part = self._profile_motion(time[mask])
+                now = self._profile_motion(time[is_now])
             else:
                 _, trajectory = self._started[k]
-                part = trajectory.at(time[mask])
-            motion[:, mask] = part.position, part.rate, part.acceleration, part.jerk
+                now = trajectory.at(time[is_now])
+            motion[:, is_now] = now.position, now.rate, now.acceleration, now.jerk
         return JointMotion(time, *motion)
 
     def _profile_motion(self, time: np.ndarray) -> JointMotion:
