@@ -130,7 +130,8 @@ def test_other_tables():
 
 
 @pytest.mark.parametrize(
-    'name', sorted(name for name in PAPER_PROFILES if name.startswith('avrutov_') and name[8] in 'XYZ')
+    'name',
+    sorted(name for name in PAPER_PROFILES if name.startswith('avrutov_') and name[8] in 'XYZ'),
 )
 def test_equal_angles_determine_the_linear_model(name):
     """
