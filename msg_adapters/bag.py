@@ -336,7 +336,7 @@ class Recording:
 
         [] without messages.
         """
-        # With a chosen frame, several frames are no error.
+        # Several frames are an error unless one is chosen. Here it is '': all frames are counted.
         decoder = self._decoders(None, '')[self.imu_topic]
         raw = next(iter(self.source.stretches([self.imu_topic])), None)
         if raw is not None:
@@ -533,12 +533,14 @@ class Ros1File:
         self.topics = {}
         """Id of a connection -> topic."""
         for connection in self.reader.connections:
-            topic = self.topics[connection.id] = clean_name(connection.topic)
-            self.types[topic] = message_type = clean_name(connection.msgtype)
+            topic = clean_name(connection.topic)
+            message_type = clean_name(connection.msgtype)
+            self.topics[connection.id] = topic
+            self.types[topic] = message_type
             self.counts[topic] = self.counts.get(topic, 0) + connection.msgcount
             self.definitions[message_type] = ('ros2msg', connection.msgdef.data)
 
-    def _drop_repeated_entries(self):
+    def _drop_repeated_entries(self) -> None:
         """Keep one index entry for each place of a message, so that none is read twice."""
         indexes = {}
         n_repeated = 0

@@ -146,13 +146,15 @@ class BagWriter:
         return self
 
     def __exit__(self, kind, error, _):
-        # A bag is finished only without an error; an error of its files has a remedy in its text.
-        try:
-            if kind is None:
-                return self.close()
-        except (OSError, sqlite3.Error) as failure:
-            error = failure
+        # A bag is finished only without an error.
+        if kind is None:
+            try:
+                self.close()
+                return
+            except (OSError, sqlite3.Error) as failure:
+                error = failure
         self.abort()
+        # An error of the files, while they were written or finished, has its remedy in the text.
         if isinstance(error, (OSError, sqlite3.Error)):
             raise InputError(
                 f'{self.path} must be writable to its end, got: {error}; free space or choose'

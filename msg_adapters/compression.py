@@ -177,11 +177,11 @@ def decompress_file(source: Path, target: Path) -> str | None:
     with source.open('rb') as packed, Path(target).open('wb') as plain:
         decompressor = module.ZstdDecompressor()
         n_frames = 0
-        data = b''
+        data = b''  # input that the decompressor has not received yet
         in_frame = True  # whether a frame is incomplete; an empty file lacks its first one
         try:
             while True:
-                # The decompressor may hold output of earlier input.
+                # More input is needed only after the output of earlier input.
                 if not data and decompressor.needs_input:
                     data = packed.read(PACKED_PIECE_BYTES)
                     if not data:
@@ -189,7 +189,8 @@ def decompress_file(source: Path, target: Path) -> str | None:
                 plain.write(decompressor.decompress(data, PACKED_PIECE_BYTES))
                 data = b''
                 in_frame = True
-                if decompressor.eof:  # a file may hold several frames
+                # A file may have several frames: the input after this one begins the next.
+                if decompressor.eof:
                     data = decompressor.unused_data
                     decompressor = module.ZstdDecompressor()
                     n_frames += 1

@@ -204,17 +204,18 @@ class _Patch:
 
         A zero stamp counts as the time of arrival. `received_ns`: shape (n,).
         """
+        # 1. Samples of the wanted messages, in the order of `packed`. `message_of_sample` has the
+        #    index into `packed` of each, as the indices of the groups; it is ascending.
         nothing = np.zeros(0, dtype=int), packed.select(np.zeros(0, dtype=int))
         groups = self._wanted_groups(packed)
         if not groups:
             return nothing
-        # Message of each sample, ascending.
         message_of_sample = np.sort(np.concatenate([index for _, index, _ in groups]))
         samples = in_order([(index, decode_imu(layout, group)) for layout, index, group in groups])
         stamp_ns = np.where(samples.stamp_ns == 0, received_ns[message_of_sample], samples.stamp_ns)
         samples = replace(samples, stamp_ns=stamp_ns)
 
-        # Without excluded times.
+        # 2. Without excluded times.
         if self.keep is not None:
             is_used = self.keep(stamp_ns)
             if not is_used.any():
@@ -223,7 +224,7 @@ class _Patch:
             samples = samples.select(is_used)
             groups = _groups_of(groups, message_of_sample)
 
-        # Correct all samples in order of time, then patch the bytes of each layout.
+        # 3. Correct all samples in order, then patch the bytes of each layout.
         if self.other is not None:
             samples = self.other.added_to(samples)
         corrected = self.correct(samples)
@@ -234,15 +235,9 @@ class _Patch:
             fields = self._fields(layout, group, readings, corrected.marks[sample])
             table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
             if self.late_ns:
-                seconds, nanoseconds = np.divmod(layout.stamp_ns(group) - self.late_ns, NS_PER_S)
-                table[:, ENCAPSULATION_SIZE:FRAME_OFFSET] = np.hstack(
-                    [
-                        _bytes_of(seconds, layout.order + 'i4'),
-                        _bytes_of(nanoseconds, layout.order + 'u4'),
-                    ]
-                )
+                _write_stamps(table, layout.stamp_ns(group) - self.late_ns, layout.order)
             tables.append(Packed.of_rows(table))
-        # From the order of the groups to that of the messages.
+        # 4. From the order of the groups to that of the messages.
         order = np.argsort(np.concatenate([index for _, index, _ in groups]))
         return message_of_sample, Packed.chain(tables).select(order)
 
@@ -266,6 +261,7 @@ class _Patch:
         `readings`: 'force', 'rate' -> corrected values, (n, 3); `marks`: variances of force and
         rate that replace their covariances where they are not zero, (n, 2).
         """
+        # Measured covariances, (n, 9), and whether a message declares the quantity absent, (n, 1).
         measured_cov = {}
         absent = {}
         for quantity in readings:
@@ -282,6 +278,7 @@ class _Patch:
             pairs = np.concatenate(list(measured_cov.values()), axis=1)
             propagated = np.split(_propagated(self.propagate, pairs), 2, axis=1)
             for k, quantity in enumerate(readings):
+                # A variance above zero replaces the covariance by a diagonal one.
                 mark = marks[:, k : k + 1]
                 after = np.where(mark > 0, mark * np.eye(3).ravel(), propagated[k])
                 fields[f'{quantity}_cov'] = np.where(
@@ -319,9 +316,16 @@ def _orientation_fields(
     }
 
 
-def _bytes_of(values: np.ndarray, dtype: str) -> np.ndarray:
-    """Return integers as bytes in a type of four bytes, uint8, shape (n, 4)."""
-    return values.astype(dtype).view(np.uint8).reshape(-1, 4)
+def _write_stamps(table: np.ndarray, stamp_ns: np.ndarray, order: str) -> None:
+    """
+    Write header stamps, ns, shape (n,), into messages: seconds, then nanoseconds, four bytes each.
+
+    `table`: one message per row, uint8, changed in place; `order`: byte order, '<' or '>'.
+    """
+    seconds, nanoseconds = np.divmod(stamp_ns, NS_PER_S)
+    middle = ENCAPSULATION_SIZE + 4
+    table[:, ENCAPSULATION_SIZE:middle] = seconds.astype(order + 'i4')[:, None].view(np.uint8)
+    table[:, middle:FRAME_OFFSET] = nanoseconds.astype(order + 'u4')[:, None].view(np.uint8)
 
 
 def _orientation_of_target(

@@ -82,13 +82,13 @@ def _corrected_header(text: LogText) -> list[str]:
     return names
 
 
-def _is_number(text, place):
+def _is_number(text: LogText, place: int) -> bool:
     """Return whether the first cell of a column is a number, not a date or a time of day."""
     cell = split_cells(text.lines[0], text.delimiter, text.path)[place]
     return ':' not in cell
 
 
-def _number(value, comma):
+def _number(value: float, comma: bool) -> str:
     """Return a number as text; '' for NaN."""
     if not np.isfinite(value):
         return ''

@@ -397,20 +397,22 @@ def _text_of(
     """
     used = tuple(each for each in used if each.quantity != 'joint')
     places = {each.quantity: tuple(map(table.column, each.names)) for each in used}
-    rows = np.arange(len(stamp_ns))
+    row_of_sample = np.arange(len(stamp_ns))
     if joined is not None:
         # Samples have the stamps of the slower sensor: find its first row with each stamp.
         names = next(each.names for each in used if SENSOR_OF.get(each.quantity) == joined.slower)
         rows_of_sensor = np.flatnonzero(np.isfinite(table.values(names)).all(axis=1))
-        stamps, first = np.unique(stamp_ns[rows_of_sensor], return_index=True)
-        rows = rows_of_sensor[first[np.searchsorted(stamps, joined.imu.stamp_ns)]]
+        # `first` has, for each distinct stamp, the place of its first row among `rows_of_sensor`.
+        distinct_ns, first = np.unique(stamp_ns[rows_of_sensor], return_index=True)
+        stamp_of_sample = np.searchsorted(distinct_ns, joined.imu.stamp_ns)
+        row_of_sample = rows_of_sensor[first[stamp_of_sample]]
     return LogText(
         path=table.path,
         names=tuple(table.names),
         columns=used,
         places=places,
         lines=tuple(table.lines),
-        row_of_sample=rows,
+        row_of_sample=row_of_sample,
         delimiter=table.delimiter,
         decimal_comma=table.decimal_comma,
     )
@@ -452,13 +454,16 @@ def _unnamed_axes(table: _Table) -> str:
 def _times(table: _Table, columns: Columns) -> tuple[Columns, CounterStamps]:
     """Return the Columns of time with the unit, and the stamps of the rows without overflows."""
     values = table.raw(columns.names[0])
-    if len(columns.names) == 2:
+    if len(columns.names) == 2:  # seconds and nanoseconds are one time
         values = table.stamps(columns).view('datetime64[ns]')
     _require_distinct_times(values, table.path)
+    # SampleTimeFine counts us or 100 us, and its steps would look like those of other units.
     if _words(columns.names[0])[0] in SAMPLE_TIME_FINE:
         columns = _with_unit(columns, lambda: _unit_of_sample_time_fine(values), table.path)
+    # No effect on Columns that have a unit by now.
     columns = _with_unit(columns, lambda: _time_unit(values), table.path)
     tick_ns = 1e9 * _time_size(columns.unit)
+    # Dates, times of day and pairs of columns are not readings of a counter.
     counter_ns = values * tick_ns if values.dtype.kind == 'f' else None
     return columns, without_overflows(table.stamps(columns), tick_ns, counter_ns)
 
@@ -479,13 +484,15 @@ def _sensors(
     table: _Table, by_quantity: dict[str, Columns], stamp_ns: np.ndarray, time: Columns
 ) -> _Readings:
     """Return the `_Readings` of a table with stamps of its rows; `time`: their Columns."""
+    # Logs of one sensor: the other one has no readings.
     absent = np.full((len(stamp_ns), 3), np.nan)
     if 'force' not in by_quantity:
         rate = _with_unit(by_quantity['rate'], lambda: None, table.path)
         rate_s = table.values(rate.names) * _size_of(rate)
         return _Readings((rate,), ImuSamples(stamp_ns, absent, rate_s, 'imu_link'))
     raw_force = table.values(by_quantity['force'].names)
-    # Increments have their own error, the other readings of an unknown unit that of `_with_unit`.
+    # Force without a unit: increments over a sample have their own error, which must come before
+    # that of `_with_unit` for all other readings.
     if by_quantity['force'].unit is None and _force_unit(raw_force) is None:
         _refuse_increments(raw_force, stamp_ns)
     force = _with_unit(by_quantity['force'], lambda: _force_unit(raw_force), table.path)
@@ -494,12 +501,12 @@ def _sensors(
         return _Readings((force,), ImuSamples(stamp_ns, force_s, absent, 'imu_link'))
     raw_rate = table.values(by_quantity['rate'].names)
 
-    # Rows of both sensors give samples as they are.
-    common = np.isfinite(force_s).all(axis=1) & np.isfinite(raw_rate).all(axis=1)
+    # Most rows with a reading have both sensors: each row is a sample.
+    has_both = np.isfinite(force_s).all(axis=1) & np.isfinite(raw_rate).all(axis=1)
     accelerometer = finite_stream(stamp_ns, force_s)
     gyroscope = finite_stream(stamp_ns, raw_rate)
-    fewest = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
-    if np.count_nonzero(common) >= MIN_COMMON_ROWS * fewest:
+    n_of_rarer = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
+    if np.count_nonzero(has_both) >= MIN_COMMON_ROWS * n_of_rarer:
         imu = ImuSamples(stamp_ns, force_s, raw_rate, 'imu_link')
         return _with_rate_unit(force, by_quantity['rate'], imu, path=table.path, time=time)
 
@@ -657,7 +664,8 @@ def _rows_of_sensors(table: _Table, where: Sequence[str]) -> list[_SensorRows]:
                 groups.append(_SensorRows(sensor, cell, f'{column}={cell}'))
         if not groups:
             continue
-        # One name in all rows is only needed where no name of a column has the sensor.
+        # A column with the same name in all rows, such as that of a device, is not used where the
+        # names of the columns have the sensors.
         if len(cells) == 1 and any(guess.quantity in SENSOR_OF for guess in _guess(table)):
             continue
         calibrated = [group for group in groups if 'uncal' not in group.name.lower()]
@@ -801,7 +809,8 @@ def _sensor_log(
         columns = _as_raw(columns)
     table.load([*by_quantity['time'].names, *columns.names], where)
     time, counted = _times(table, by_quantity['time'])
-    # Both sensors count from one origin, but need not begin together.
+    # Stamps of counted times begin at one value in every log. With the first time added, those of
+    # both sensors have a common origin, whichever begins first.
     start_ns = table.start_ns(time)
     counted = replace(counted, stamp_ns=counted.stamp_ns + start_ns)
     values = table.values(columns.names)
@@ -892,41 +901,60 @@ N_NAMES = {'force': (3,), 'rate': (3,), 'time': (1, 2)}
 """Quantity -> numbers of its columns; one for the other quantities."""
 
 
+SCALED_UNITS = ('counts:', 'increments:')
+"""Beginnings of the units of a sensor that contain a colon."""
+
+
 def _parse(text: str) -> Columns:
     """Return the Columns of one assignment QUANTITY=NAMES:UNIT; raises InputError."""
     label, _, names_and_unit = text.partition('=')
     quantity, _, joint = label.partition('.')
-    # Units that contain a colon: counts:... and increments:...
-    scaled = re.fullmatch(r'(.*?):((counts|increments):.*)', names_and_unit)
-    if scaled:
-        name_text = scaled[1]
-        unit = scaled[2]
-    elif ':' in names_and_unit:
-        name_text, _, unit = names_and_unit.rpartition(':')
-    else:
-        name_text = names_and_unit
-        unit = ''
-    units = COLUMN_UNITS.get(quantity, {})
-    unit = SPELLINGS.get(quantity, {}).get(unit.lower(), unit) if unit else None
+    name_text, unit = _split_unit(names_and_unit)
     names = tuple(name.strip() for name in name_text.split(',') if name.strip())
+    is_known = quantity in COLUMN_UNITS
     has_joint_as_needed = (quantity == 'joint') == bool(joint)
     has_all_names = len(names) in N_NAMES.get(quantity, (1,))
-    if not units or not has_joint_as_needed or not has_all_names:
+    if not is_known or not has_joint_as_needed or not has_all_names:
         raise InputError(
             'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and'
             f' rate, two for a time in seconds and nanoseconds, got {text!r}; {REMEDY}',
             key='columns',
         )
-    if unit is not None and scaled and quantity in SENSOR_OF:
-        unit = unit_of(SENSOR_OF[quantity], unit).unit
-    elif unit is not None and unit not in units and (quantity != 'time' or not _tick_size(unit)):
-        ticks = ', or a tick such as 25us or 1/32768s' if quantity == 'time' else ''
-        raise InputError(
-            f'the unit of {quantity} must be one of {", ".join(units)}{ticks}, got {unit!r};'
-            f' correct {text!r}',
-            key='columns',
-        )
-    return Columns(quantity, names, unit, joint, 'given')
+    known_unit = _known_unit(quantity, unit, text) if unit else None
+    return Columns(quantity, names, known_unit, joint, 'given')
+
+
+def _split_unit(text: str) -> tuple[str, str]:
+    """
+    Return (names, unit or '') of NAMES:UNIT.
+
+    The last colon is before the unit, except that `SCALED_UNITS` contain a colon.
+    """
+    scaled = re.fullmatch(r'(.*?):((counts|increments):.*)', text)
+    if scaled:
+        return scaled[1], scaled[2]
+    names, colon, unit = text.rpartition(':')
+    return (names, unit) if colon else (text, '')
+
+
+def _known_unit(quantity: str, unit: str, assignment: str) -> str:
+    """
+    Return the unit that the user states for a quantity, in the usual spelling.
+
+    Raises InputError for an unknown one; `assignment`: the whole text, for this error.
+    """
+    if quantity in SENSOR_OF and unit.startswith(SCALED_UNITS):
+        return unit_of(SENSOR_OF[quantity], unit).unit
+    unit = SPELLINGS[quantity].get(unit.lower(), unit)
+    units = COLUMN_UNITS[quantity]
+    if unit in units or (quantity == 'time' and _tick_size(unit)):
+        return unit
+    ticks = ', or a tick such as 25us or 1/32768s' if quantity == 'time' else ''
+    raise InputError(
+        f'the unit of {quantity} must be one of {", ".join(units)}{ticks}, got {unit!r};'
+        f' correct {assignment!r}',
+        key='columns',
+    )
 
 
 def _tick_size(unit: str) -> float:
@@ -1042,6 +1070,7 @@ class _Table:
     def __init__(self, path: Path, sensor: str = ''):
         self.path = path
         self.sensor = sensor
+        # 1. The lines at the beginning of the file as cells, and the first row of numbers.
         lines, is_cut = _head_lines(path)
         self.delimiter = _delimiter(lines)
         """None for white space."""
@@ -1056,6 +1085,7 @@ class _Table:
         """Lines in front of the first row of numbers."""
         self.first_row = rows[first]
         """Its cells."""
+        # 2. Names of the columns, and the form of their cells.
         cells = chain.from_iterable(rows[first:])
         self.decimal_comma = any(_has_decimal_comma(cell, self.delimiter) for cell in cells)
         self.names = _unique(self._header_names(rows[:first]))
@@ -1069,6 +1099,7 @@ class _Table:
         for k, name in enumerate(self.names):
             if all(len(row) > k and _is_word(row[k]) for row in rows[first:]):
                 self.word_columns.append(name)
+        # 3. The content, which is empty before `load`.
         self.n_dropped = 0
         """Rows that `load` left out: too short, or repeated lines of the header."""
         self.lines: list[str] = []
@@ -1087,9 +1118,7 @@ class _Table:
         """
         width = len(self.first_row)
         if not self.first_row[-1].strip():  # rows end with a separator, the header does not
-            for row in rows:
-                if len(row) == width - 1:
-                    row.append('')
+            rows = [[*row, ''] if len(row) == width - 1 else row for row in rows]
         header = [row for row in rows if len(row) == width][-2:]
         if not header:
             return [str(k + 1) for k in range(width)]
@@ -1097,7 +1126,7 @@ class _Table:
         for name in header[0]:
             printable_name = ''.join(c if c.isprintable() else ' ' for c in name)
             names.append(re.sub(r'\s+', ' ', printable_name).strip())
-        if len(header) == 2:
+        if len(header) == 2:  # names, then units
             units = [_without_brackets(unit) for unit in header[1]]
             names = [
                 f'{name} ({unit})' if unit else name
@@ -1150,7 +1179,9 @@ class _Table:
         Rows that do not fulfil the conditions `where` are left out.
         """
         wanted = sorted({self.column(name) for name in names})
-        self.lines = self._complete(self._selected(self._rows, where), wanted[-1] + 1)
+        # Lines that end before the last of these columns are left out.
+        selected = self._selected(self._rows, where)
+        self.lines = self._complete(selected, wanted[-1] + 1)
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
         self._values = dict(zip(numbers, self._numbers(numbers).T, strict=True))
         for k in set(wanted) - set(numbers):
@@ -1306,6 +1337,7 @@ class _Table:
         values = self.raw(time.names[0])
         if len(time.names) == 2:
             seconds_and_ns = self.values(time.names)
+            # Rows without a number of seconds are refused below, with their count.
             if np.isfinite(seconds_and_ns).all():
                 seconds, nanoseconds = seconds_and_ns.astype(np.int64).T
                 return seconds * 10**9 + nanoseconds
@@ -1411,11 +1443,14 @@ def _first_row(rows: list[list[str]]) -> int | None:
     """
     n_numbers = [sum(map(_numeric, row)) for row in rows]
     n_words = [sum(map(_is_word, row)) for row in rows]
+    # Of the rows with at least two numbers: a single one may be part of a title.
     usual_n_numbers = Counter(number for number in n_numbers if number >= 2).most_common(1)
     if not usual_n_numbers:
         return None
     usual_n_words = Counter(n_words).most_common(1)[0][0]
     for k, row in enumerate(rows):
+        # A time and three axes are four numbers; a narrower row has fewer, and so has a log whose
+        # usual rows have fewer.
         has_numbers = n_numbers[k] >= min(4, len(row), usual_n_numbers[0][0])
         if len(row) > 1 and has_numbers and n_words[k] <= usual_n_words:
             return k
@@ -1464,6 +1499,7 @@ def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
     joints = []
     for name in table.names:
         words, unit_text = _words_in(table, name)
+        # 1. A column of one number: a joint, a time or a temperature.
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
         if joint:
             joints.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
@@ -1474,6 +1510,7 @@ def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
             if has_fitting_unit and re.fullmatch(COLUMN_PATTERNS[quantity], words):
                 # The first column with the name.
                 single_columns.setdefault(quantity, Columns(quantity, (name,), unit))
+        # 2. An axis of a sensor. The rows of a stated sensor need no name of it in their columns.
         reading = _reading_of(words)
         if reading is None:
             continue
@@ -1486,11 +1523,13 @@ def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
                 column = Columns(quantity, (name,), unit)
                 sets.setdefault(reading.group, {})[reading.axis] = column
 
-    # Time: seconds and nanoseconds, a column with a usual name, or another one that may be it.
+    # 3. The time: seconds and nanoseconds, else a column with a usual name, else the only one that
+    #    may be it.
     time = _seconds_and_nanoseconds(table) or single_columns.get('time') or _unnamed_time(table)
     if time is not None:
         single_columns['time'] = time
     columns = [*single_columns.values(), *joints]
+    # 4. The only set of three axes of each sensor.
     for quantity, sets in axis_sets.items():
         if quantity not in stated:
             columns += _only_set(table.path, quantity, sets)
@@ -1498,11 +1537,18 @@ def _guess(table: _Table, stated: Iterable[str] = frozenset()) -> list[Columns]:
 
 
 def _words_in(table: _Table, name: str) -> tuple[str, str]:
-    """Return words and unit of a column as `_words`, with a sensor or quantity found otherwise."""
+    """
+    Return words and unit of a column as `_words`, after names that are too short are completed.
+
+    A column x, y or z gets the sensor of its unit, else the words of the name of the file, which
+    then has the readings of one sensor.
+    """
     words, unit_text = _words(name)
     axis_name = re.fullmatch(r'([xyz])(?: axis)?', words)
-    if axis_name:  # a file of one sensor, which has the name of it, or sets by their units
-        words = f'{_sensor_of_unit(unit_text) or _words(table.path.stem)[0]} {axis_name[1]}'
+    if axis_name:
+        sensor = _sensor_of_unit(unit_text) or _words(table.path.stem)[0]
+        words = f'{sensor} {axis_name[1]}'
+    # T in °C is a temperature, no time.
     if words in ('t', 't imu') and _unit('temperature', unit_text):
         words = 'temperature'
     return words, unit_text
@@ -1551,8 +1597,30 @@ DECORATION = r'(?:raw|cal|out|ln cal|wr cal|ln raw|wr raw|ln|wr)'
 
 
 def _reading_of(words: str) -> _Reading | None:
-    """Return the `_Reading` of a name in lower-case words, None for a name without an axis."""
-    # Additions of a logger after the axis: acc x raw, accel ln x cal.
+    """
+    Return the `_Reading` of a name in lower-case words, None for a name without an axis.
+
+    ``'imu1 accel x raw'`` gives ``_Reading('accel', 'x', 'imu1accelraw')``.
+    """
+    bare, decoration = _without_decoration(words)
+    # An axis in front becomes the last word: x acc, xacc, x ang rate, raw imu x acc.
+    bare = re.sub(r'^(?:(?:.* )?imu\d? )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\2 \1', bare)
+    bare = re.sub(r'^([xyz]) (.*)$', r'\2 \1', bare)
+    bare, device_name = _without_device(bare)
+    axis = re.fullmatch(r'(.*?) ?([xyz])', bare)
+    if axis is None:
+        return None
+    group = re.sub(r'[^a-z0-9]', '', device_name + axis[1] + decoration)
+    return _Reading(axis[1], axis[2], group)
+
+
+def _without_decoration(words: str) -> tuple[str, str]:
+    """
+    Return (name without the additions of a logger, these additions).
+
+    ``'acc x raw'`` gives ``('acc x', 'raw')``, ``'shimmer a1 accel ln x cal'`` gives
+    ``('accel x', 'lncal')``.
+    """
     suffix = re.search(rf'(?<= ){DECORATION}$', words)
     decoration = suffix[0] if suffix else ''
     bare = words.removesuffix(decoration).strip()
@@ -1560,12 +1628,16 @@ def _reading_of(words: str) -> _Reading | None:
     if ranged:
         bare = f'{ranged[1]} {ranged[3]}'
         decoration = ranged[2] + decoration
-    bare = re.sub(r'^shimmer \w+ ', '', bare)
-    # The axis in front: x acc, xacc, x ang rate, after the name of a message.
-    bare = re.sub(r'^(?:(?:.* )?imu\d? )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\2 \1', bare)
-    bare = re.sub(r'^([xyz]) (.*)$', r'\2 \1', bare)
+    return re.sub(r'^shimmer \w+ ', '', bare), decoration
 
-    # The number of one of several IMUs: imu1 ax, ax 1, or acc1 x.
+
+def _without_device(bare: str) -> tuple[str, str]:
+    """
+    Return (name without the one of several IMUs that it names, the name or number of this IMU).
+
+    ``'imu1 ax'`` gives ``('ax', 'imu1')``, ``'acc1 x'`` gives ``('acc x', '1')`` and ``'ax 1'``
+    gives ``('ax', '1')``.
+    """
     device_name = ''
     device = re.fullmatch(r'((?:imu|sensor|mpu|device) ?\d+) (.*)', bare)
     if device:
@@ -1575,11 +1647,7 @@ def _reading_of(words: str) -> _Reading | None:
     if numbered:
         bare = f'{numbered[1]} {numbered[3]}'.strip()
         device_name += numbered[2]
-    axis = re.fullmatch(r'(.*?) ?([xyz])', bare)
-    if axis is None:
-        return None
-    group = re.sub(r'[^a-z0-9]', '', device_name + axis[1] + decoration)
-    return _Reading(axis[1], axis[2], group)
+    return bare, device_name
 
 
 def _sensor_of_unit(unit_text: str) -> str:
@@ -1675,24 +1743,28 @@ def name_with_unit(name: str, quantity: str, unit: str) -> str:
     return f'{_without_unit(name)[0].strip()} ({unit})'
 
 
+UNIT_SUFFIX = re.compile(
+    r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|[mun]?sec|ms|us|ns|deg|rad|deg_?c|celsius|c|s)$',
+    re.IGNORECASE,
+)
+"""Unit after an underscore: acc_x_mg. At least two characters are before a g: a_g is no unit."""
+UNIT_ENDING = re.compile(
+    r'(?<=temp)((?:deg)?c)$|(?<=temperature)((?:deg)?c)$|(?<=time)([mun]s)$', re.IGNORECASE
+)
+"""Unit without an underscore: tempC, timems."""
+
+
 def _without_unit(name: str) -> tuple[str, str]:
     """Return (name without its unit, text of the unit or ''): in brackets, or as a suffix."""
     bracket = re.search(r'[(\[](.*?)[)\]]\s*(?:\[\d+\])?$', name)
     unit = bracket.group(1) if bracket else ''
     text = name[: bracket.start()] if bracket else name
     if not unit:
-        suffix = re.search(
-            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|[mun]?sec|ms|us|ns|deg|rad|deg_?c|celsius|c|s)$',
-            text,
-            re.IGNORECASE,
-        ) or re.search(
-            r'(?<=temp)((?:deg)?c)$|(?<=temperature)((?:deg)?c)$|(?<=time)([mun]s)$',
-            text,
-            re.IGNORECASE,
-        )
+        suffix = UNIT_SUFFIX.search(text) or UNIT_ENDING.search(text)
         if suffix:
             unit = suffix.group().removeprefix('_')
             text = text[: suffix.start()]
+    # The name is the unit.
     if not unit and text.lower() in ('millis', 'micros', 'nanos', 'ms', 'us', 'ns'):
         unit = text
     return text, unit
@@ -1782,10 +1854,13 @@ def _require_time_of_turns(time: Columns, rate: Columns, imu: ImuSamples, path: 
     unit_s = _time_size(time.unit)
     unit_rad_s = _size_of(rate)
     band = OWN_RATE_BAND if rate.origin == 'values' else RATE_BAND
+    # The unit of the rates with which they turn gravity by these stamps, rad/s: it is theirs where
+    # the stamps are right.
     factor = _turning_factor(imu.stamp_ns, imu.force_s, imu.rate_s)
     if factor is not None and 1 / band < factor / unit_rad_s < band:
         return
 
+    # The period with which they turn gravity in their unit, and the unit of time that gives it.
     true_period_s = _period_of_turns(imu, unit_rad_s)
     if true_period_s is None:
         return

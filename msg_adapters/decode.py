@@ -77,7 +77,8 @@ class Decoder:
 
         """
         if self.deserialize is not None:
-            packed = Packed.join([self._standard(packed.message(k)) for k in range(len(packed))])
+            messages = map(packed.message, range(len(packed)))
+            packed = Packed.join([self._standard(message) for message in messages])
         groups, n_broken = group_by_layout(packed, FIND_LAYOUT[self.message_type])
         if n_broken:
             self.dropped[f'{self.name} message that cannot be decoded'] += n_broken
@@ -253,10 +254,11 @@ class JointDecoder(Decoder):
                 key='joint_topic',
             )
         got = '; '.join(', '.join(names) or 'no names' for names in self.seen_names)
-        missing = min(
-            ([name for name in self.names if name not in names] for names in self.seen_names),
-            key=len,
-        )
+        # Of the list that lacks fewest joints.
+        missing_joints = []
+        for names in self.seen_names:
+            missing_joints.append([name for name in self.names if name not in names])
+        missing = min(missing_joints, key=len)
         raise InputError(
             f'JointState must name the joints of the table ({", ".join(self.names)}), got'
             f' {got}, which lacks {", ".join(missing)}; correct the names in the'

@@ -90,8 +90,9 @@ class ImuStream:
         self._use(layout.order)
         self._order = data[:2]
         self._body = layout.offsets['orientation'][0]
-        # The padding after it is arbitrary.
-        head_end = FRAME_OFFSET + 4 + struct.unpack_from(layout.order + 'I', data, FRAME_OFFSET)[0]
+        # The head is the frame_id with its length; the padding after it is arbitrary.
+        (frame_size,) = struct.unpack_from(layout.order + 'I', data, FRAME_OFFSET)
+        head_end = FRAME_OFFSET + 4 + frame_size
         self._head_part = slice(FRAME_OFFSET, head_end)
         self._head = data[self._head_part]
         self._rate_at = layout.offsets['rate_s'][0]

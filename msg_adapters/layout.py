@@ -57,6 +57,7 @@ class Packed:
         """
         Copy each message into the bytes `target`, from its `place` on: one gather for each size.
         """
+        # Messages of one size as words of this many bytes; `overlapping` has a word at each byte.
         order = np.argsort(self.size, kind='stable')
         size_changes = np.flatnonzero(np.diff(self.size[order])) + 1
         for of_size in np.split(order, size_changes):
@@ -156,6 +157,7 @@ class MessageLayout:
 
     def stamp_ns(self, packed: Packed) -> np.ndarray:
         """Return the header stamps of messages that have this layout, int64, shape (n,)."""
+        # Seconds and nanoseconds alternate, four bytes each; the first are signed.
         pairs = np.ascontiguousarray(packed.items_at(ENCAPSULATION_SIZE, 'V8'))
         sec = pairs.view(self.order + 'i4')[::2]
         nanosec = pairs.view(self.order + 'u4')[1::2]

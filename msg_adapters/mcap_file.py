@@ -262,7 +262,7 @@ def walk(buffer: np.ndarray) -> Walk:
     others = []
     position = 0
     last_length = -1
-    n_of_length = 0  # messages of this length in front of the present one, without interruption
+    n_equal = 0  # messages of `last_length` that directly precede the present one
     end = len(buffer)
     while position + PREFIX.size <= end:
         opcode, length = PREFIX.unpack_from(view, position)
@@ -270,25 +270,26 @@ def walk(buffer: np.ndarray) -> Walk:
         is_last = opcode in (CHUNK, DATA_END, FOOTER)
         if is_last or not is_record(opcode) or record_end > end:
             break
+        # 1. A record that is no message is copied.
         if opcode != MESSAGE:
             if len(others) == MOST_OTHERS:
                 break
             others.append((opcode, bytes(view[position + PREFIX.size : record_end])))
             position = record_end
             continue
+        # 2. A message, alone or with those of equal length after it. After `RUN` equal ones the
+        #    next are compared in one step, at most four times as many as there were.
         if length < MESSAGE_HEAD_SIZE:
             break
-        n_of_length = n_of_length + 1 if length == last_length else 0
+        n_equal = n_equal + 1 if length == last_length else 0
         last_length = length
         stride = PREFIX.size + length
-        # After `RUN` messages of one length the next ones are compared in one step, four times as
-        # many as there were.
-        if n_of_length < RUN:
+        if n_equal < RUN:
             run_offsets = np.array([position])
         else:
-            run_offsets = _run_offsets(buffer, position, stride, 4 * n_of_length)
+            run_offsets = _run_offsets(buffer, position, stride, 4 * n_equal)
         offsets.append(run_offsets)
-        n_of_length += len(run_offsets) - 1
+        n_equal += len(run_offsets) - 1
         position = int(run_offsets[-1]) + stride
 
     offset = np.concatenate(offsets)
@@ -478,7 +479,8 @@ class McapFile(StorageFile):
         """
         Yield the records of the data section; messages outside of chunks in runs.
 
-        A truncated chunk is yielded with its remaining bytes.
+        A truncated chunk is yielded with its remaining bytes. Behind damage the next record is the
+        next chunk that the summary lists.
         """
         position: int | None = len(MAGIC)
         self.n_unpacked = 0
@@ -489,28 +491,31 @@ class McapFile(StorageFile):
             record_end = content_start + length
             if opcode in (DATA_END, FOOTER):
                 return
+            # Damage, or a record that is cut off.
             if not is_record(opcode) or record_end > self.size:
                 if opcode == CHUNK:  # up to the next one, so that no byte is read twice
                     chunk_end = self._next_chunk(position) or self.size
                     yield McapRecord(CHUNK, content_start, chunk_end - content_start)
                 position = self._resume(position)
-            elif opcode == MESSAGE:
-                content = self._read(position, max(n_ahead, record_end - position))
-                buffer = np.frombuffer(content, np.uint8)
-                run = walk(buffer)
-                # More bytes next time if most of these are of the run, else twice its length.
-                if 2 * run.end > len(buffer):
-                    n_ahead = min(2 * n_ahead, CHUNK_STRETCH_BYTES)
-                else:
-                    n_ahead = max(2 * run.end, MESSAGE_PREFIX)
-                if run.end:
-                    yield McapRecord(MESSAGE, position, run.end, run)
-                    position += run.end
-                else:
-                    position = self._resume(position)
-            else:
+                continue
+            if opcode != MESSAGE:
                 yield McapRecord(opcode, content_start, length)
                 position = record_end
+                continue
+
+            # A message outside of chunks, and the run that it begins.
+            content = self._read(position, max(n_ahead, record_end - position))
+            run = walk(np.frombuffer(content, np.uint8))
+            # More bytes next time if most of these are of the run, else twice its length.
+            if 2 * run.end > len(content):
+                n_ahead = min(2 * n_ahead, CHUNK_STRETCH_BYTES)
+            else:
+                n_ahead = max(2 * run.end, MESSAGE_PREFIX)
+            if not run.end:  # the message is too short for its own head
+                position = self._resume(position)
+                continue
+            yield McapRecord(MESSAGE, position, run.end, run)
+            position += run.end
 
     def _prefix(self, position: int) -> tuple[int, int]:
         """Return (opcode, length) of the record at `position`, zeros at the end of the file."""
@@ -549,7 +554,7 @@ class McapFile(StorageFile):
                 return []  # the chunk is then walked through
             position += PREFIX.size + length
 
-    def _read_summary(self):
+    def _read_summary(self) -> None:
         """Read channels, counts and positions of chunks from the summary, when the file has one."""
         footer = self._read(max(self.size - FOOTER_SIZE, 0), FOOTER_SIZE)
         if len(footer) < FOOTER_SIZE or not footer.endswith(MAGIC) or footer[0] != FOOTER:

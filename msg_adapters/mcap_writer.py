@@ -122,14 +122,16 @@ class McapWriter:
         headers['channel'] = topic_ids
         headers['log_ns'] = received_ns
         headers['publish_ns'] = received_ns
-        # Records of all messages, one after the other: header, then data.
+        # Records of all messages, one after the other: header, then data. `start` and `end` are the
+        # first byte of each record and the one after its last.
         n_head = MESSAGE_HEADER.itemsize
         end = np.cumsum(messages.size + n_head)
         start = end - messages.size - n_head
         content = np.empty(end[-1], np.uint8)
         overlapping(content, f'V{n_head}')[start] = headers.view(f'V{n_head}')
         messages.copy_to(content, start + n_head)
-        # A chunk ends with the message that passes a multiple of CHUNK_SIZE.
+        # A chunk ends with the message that passes a multiple of CHUNK_SIZE; `cuts` are the first
+        # messages of the chunks after the first one.
         cuts = np.flatnonzero(np.diff(end // CHUNK_SIZE)) + 1
         for first, stop in zip([0, *cuts], [*cuts, len(messages)], strict=True):
             self._write_chunk(
@@ -142,10 +144,12 @@ class McapWriter:
         """
         Write a chunk with its message indexes, and keep its ChunkIndex record.
 
-        `headers` and `offset` of each message in the `records`, which are uint8, shape (n_bytes,).
+        `headers` of n messages, shape (n,), and the first byte of their records in `records`,
+        `offset`, int64, shape (n,). `records`: uint8, shape (n_bytes,).
         """
+        # Definitions of new topics come first, and offsets count from the begin of the chunk.
         content = self.new_records + records.tobytes()
-        offset += len(self.new_records)
+        offset = offset + len(self.new_records)
         self.new_records = b''
         packed = self.compress(content)
         times = int(headers['log_ns'].min()), int(headers['log_ns'].max())
@@ -214,8 +218,8 @@ class McapWriter:
             information['message_count'],
             len(self.schemas),
             len(self.channels),
-            0,
-            1,
+            0,  # attachments
+            1,  # metadata
             len(self.chunk_indexes),
             first_ns,
             first_ns + information['duration']['nanoseconds'],

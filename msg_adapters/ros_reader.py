@@ -34,12 +34,14 @@ class RosReader(Rosbag2):
         """Return whether a recording may be compressed by something that is not installed here."""
         if all_installed():
             return False
-        files = sorted(path.iterdir()) if path.is_dir() else [path]
-        # A plain SQLite file is the one storage without compressed parts.
-        by_message = path.is_dir() and read_metadata(path).get('compression_mode')
-        return bool(by_message) or any(
-            file.suffix in (*COMPRESSED, '.mcap') for file in files if file.is_file()
-        )
+        files = [path]
+        if path.is_dir():
+            if read_metadata(path).get('compression_mode'):
+                return True
+            files = list(path.iterdir())
+        # Chunks of an .mcap file may be compressed; a plain SQLite file has no compressed parts.
+        suffixes = {file.suffix for file in files if file.is_file()}
+        return not suffixes.isdisjoint((*COMPRESSED, '.mcap'))
 
     @property
     def storage(self) -> str:

@@ -266,10 +266,11 @@ class Rosbag2:
 
     def _counts(self) -> dict[str, int]:
         """Return topic -> messages by the metadata, without them by the files."""
-        counts = self._announced_counts()
+        counts = Counter(self._announced_counts())
         if not counts:
-            counts = sum((Counter(file.count()) for file in self.files), Counter())
-        return {name: counts.get(name, 0) for name in self.types}
+            for file in self.files:
+                counts.update(file.count())
+        return {name: counts[name] for name in self.types}
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:

@@ -148,7 +148,7 @@ class SqliteFile(StorageFile):
                 clean_name(str(name)): (str(encoding), str(text)) for name, encoding, text in rows
             }
 
-    def _require_tables(self):
+    def _require_tables(self) -> None:
         """
         Refuse views, virtual tables and generated columns.
 
@@ -204,22 +204,23 @@ class SqliteFile(StorageFile):
 
     def _stretches(self, topics: Sequence[str]) -> Iterator[Stretch]:
         """Yield the messages of some topics in Stretches of many rows, in the order of the ids."""
-        wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
-        # A scan begins.
+        wanted: set[int] = set()
+        for topic in topics:
+            wanted.update(self.topic_ids.get(topic, ()))
+        # A scan begins: instructions of SQLite, steps behind damage, and bytes of its messages.
         self._n_calls = 0
         self._n_steps = 0
-        """Steps behind damage in the present scan."""
+        scanned_bytes = 0
         rows_of_stretch = RANGE_IDS // 2 if len(wanted) == 1 else STRETCH_ROWS
-        n_scanned = 0  # bytes of the messages of the scan
         # Parts of the present stretch, their rows and bytes.
         parts: list[Part] = []
         n_rows = 0
         n_bytes = 0
         for part in self._parts(wanted):
             part_bytes = len(part.packed.buffer)
-            n_scanned += part_bytes
+            scanned_bytes += part_bytes
             # More messages than the file can hold: damaged rows refer to the same pages.
-            if n_scanned > self.size:
+            if scanned_bytes > self.size:
                 self._lose(f'rest {UNKNOWN_EXTENT} after rows that share their pages', 1)
                 break
             parts.append(part)
@@ -237,27 +238,29 @@ class SqliteFile(StorageFile):
         """Yield the Parts of the rows with the topic ids `wanted`, in the order of the row ids."""
         if not wanted:
             return
-        # Rows up to this id are done; None where no further row can be read.
+        # Rows up to the id `after` are done; None where no further row can be read.
         after: int | None = FIRST_ID
+        # 1. Messages of one topic and of one size at once. SQLite treats them as text in UTF-8, its
+        #    result must be limited, and messages of an incomplete page need a test of each.
         if len(wanted) == 1 and self._is_utf8 and self._cut_page is None and CAN_LIMIT:
             after = yield from self._equal_messages(min(wanted))
-        declared = {number for numbers in self.topic_ids.values() for number in numbers}
-        unwanted = declared - wanted
+        # 2. The remaining rows in batches. After an error the search continues behind the damage.
+        unwanted = set(chain.from_iterable(self.topic_ids.values())) - wanted
         statement = _statement(wanted, unwanted)
         while after is not None:
-            rows = []
+            last_rows = []
             try:
                 cursor = self.connection.execute(statement, (after, LAST_ID))
                 while batch := cursor.fetchmany(BATCH_ROWS):
-                    rows = batch
-                    yield from self._usable(rows, wanted)
+                    last_rows = batch
+                    yield from self._usable(batch, wanted)
                 return
             except sqlite3.Error as error:
                 damage = error
-            # Continue after the last good row. Of a row of an undeclared topic the id is damaged.
-            ids = [row_id for row_id, topic_id, *_ in rows if topic_id in wanted]
-            after = max([after, *ids[-1:]])
-            after = yield from self._behind_damage(after, wanted, unwanted)
+            # The last good row: where a row has an undeclared topic, its id is damaged as well.
+            ids = [row_id for row_id, topic_id, *_ in last_rows if topic_id in wanted]
+            last_id = max([after, *ids[-1:]])
+            after = yield from self._behind_damage(last_id, wanted, unwanted)
             if after is None:
                 self._lose(f'rest {UNKNOWN_EXTENT} after damage ({damage})', 1)
 
@@ -278,6 +281,7 @@ class SqliteFile(StorageFile):
             "SELECT count(*), max(length(data)), CAST(group_concat(data, '') AS BLOB) "
             + rows_of_range
         )
+        # A range has the ids above `after` up to `until`. The first one begins with the first row.
         after = FIRST_ID
         limit_before = self._limit_length(STRETCH_BYTES)
         try:
@@ -289,13 +293,14 @@ class SqliteFile(StorageFile):
                 until = min(until + RANGE_IDS, LAST_ID)
                 ids = (after, until)
                 count, longest, messages = self.connection.execute(statement, ids).fetchone()
+                # No row, or sizes that differ: these rows are read one by one.
                 if longest is None or len(messages) != count * longest:
                     return after
                 packed = Packed.of_sizes(messages, np.full(count, longest))
                 times = partial(self._times, f'SELECT timestamp {rows_of_range}', ids)
                 yield Part(packed, np.full(count, topic_id), times)
             return until
-        except sqlite3.Error:
+        except sqlite3.Error:  # damage, or more bytes than the limit
             return after
         finally:
             self._limit_length(limit_before)
@@ -316,8 +321,9 @@ class SqliteFile(StorageFile):
         """
         Yield the Parts of ranges of a few ids, to the first readable one behind damage.
 
-        Ids that a range lacks are counted, because a damaged id ends a search without an error.
-        Return the last id of the range, None where nothing behind the damage can be read.
+        `after`: id of the last good row. Ids that a range lacks count as lost, because a damaged id
+        ends a search without an error. Return the last id of the range, None where nothing behind
+        the damage can be read.
         """
         statement = _statement(wanted, set())
         after = max(after, 0)  # the first id of a recorder is 1
@@ -335,10 +341,12 @@ class SqliteFile(StorageFile):
             rows = [row for row in readable if row[1] not in unwanted]
             if rows:
                 yield from self._usable(rows, wanted)
+            # Rows again, after lost ones: the damage is passed.
             if readable and n_lost:
                 self._lose('unreadable rows', n_lost)
                 return after
-            # The damage was in the batch after the first id: after a batch it is passed.
+            # No id is lost, but the damage was in the batch after the first id: it is passed after
+            # as many rows.
             if n_readable > BATCH_ROWS:
                 return after
         return None
@@ -350,7 +358,7 @@ class SqliteFile(StorageFile):
         Rows that cannot be used are counted in `lost` and left out.
         """
         _, topic_ids, times, messages = zip(*rows, strict=True)
-        # Usual rows at once, without a test of each.
+        # Usual rows at once, without a test of each; else those of `_usable_rows`.
         packed = None
         if self._cut_page is None:
             with suppress(TypeError):  # of a message that is None, text or a number

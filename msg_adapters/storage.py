@@ -136,6 +136,7 @@ class StorageFile:
             return np.full(len(topic_ids), -1)
         ids = np.array(sorted(number_of))
         numbers = np.array([number_of[topic_id] for topic_id in ids.tolist()])
+        # `place`: where the id of a message is among the sorted ids, if it is one of them.
         place = np.minimum(np.searchsorted(ids, topic_ids), len(ids) - 1)
         return np.where(ids[place] == topic_ids, numbers[place], -1)
 

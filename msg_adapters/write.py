@@ -67,12 +67,14 @@ def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarra
     """
     count = struct.pack('<I', len(joints.names))
     no_items = bytes(4)  # count of an empty sequence
+    # The frame_id, which is empty, and the names; the length of a string is aligned to 4 bytes.
     # Joined once: a sum that grows by each of many names needs quadratic time.
     names = [_padded(_string(name), 4) for name in joints.names]
     head = b''.join([_padded(_string(''), 4), count, *names])
+    # Doubles are aligned to 8 bytes: after the first ones the 4 bytes of a count need 4 more.
     velocity = [no_items]
     if with_velocity and joints.names:
-        velocity = [count + bytes(4), joints.velocity]  # doubles are aligned to 8 bytes
+        velocity = [count + bytes(4), joints.velocity]
     return _table(
         joints.stamp_ns,
         _padded(head + count, 8 if joints.names else 4),
