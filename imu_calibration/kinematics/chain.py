@@ -528,10 +528,9 @@ def _lean(
         sag[step.third] = step.sense * joint.sag
         lean += np.stack([cross(up, sag), cross(up_rate, sag), cross(up_acceleration, sag)])
 
-    # Two small turns about the coordinate axes across the joint.
+    # Two small turns about the coordinate axes across the joint: the components of v, v', v''.
     for across in ((step.third + 1) % 3, (step.third + 2) % 3):
-        position, velocity, acceleration = lean[:, across]
-        columns = _turn(columns, across, position, velocity, acceleration)
+        columns = _turn(columns, across, *lean[:, across])
     return columns
 
 

@@ -409,6 +409,6 @@ def joint_to_mapping(joint: Joint) -> dict[str, Any]:
         list(LIMITS[joint.type])[:3], (ends, limits.speed, limits.acceleration), strict=True
     ):
         if value is not None:
-            # Twelve decimals of a degree, so that values survive reading and writing.
+            # Ten decimals, so that values survive reading and writing.
             item[key] = np.round(np.asarray(value) / unit, 10).tolist()
     return item

@@ -68,7 +68,8 @@ def _with_velocity(
     trend.add_to(pieces, knots)
     _, rate, acceleration = evaluate_pieces(knots, pieces, time, derivatives=2)[:, :, 0]
     trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof)
-    # Information of velocities at the edge of the band, relative to positions.
+    # At the edge of the band the noise of the positions is this noise of rates. Velocities with
+    # more than three times as much add little information.
     if not trusted or fit.noise_sd * fit.bandwidth / knots.step < 0.3 * velocity_sd:
         return fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
@@ -109,13 +110,15 @@ class Trend:
         """
         centre = 0.5 * (time[0] + time[-1])
         degree = min(2, len(np.unique(time)) - 1)
+        # Powers of a time between -1 and 1, against rounding.
         scale = max(time[-1] - centre, 1e-9) ** np.arange(degree + 1)
         powers = np.vander(time - centre, degree + 1, increasing=True) / scale
         factors = np.zeros((3, position.shape[1]))
         factors[: degree + 1] = (
             np.linalg.solve(powers.T @ powers, powers.T @ position) / scale[:, None]
         )
-        factors[:, still] = np.array([[1.0], [0.0], [0.0]]) * position[0, still]
+        factors[:, still] = 0.0
+        factors[0, still] = position[0, still]
         return cls(centre, factors)
 
     def column(self, joint: int) -> 'Trend':
@@ -131,6 +134,8 @@ class Trend:
 
     def add_to(self, pieces: np.ndarray, knots: Knots) -> None:
         """Add the parabolas to the polynomials between the knots, in place."""
+        # With u in steps from the begin t of an interval, and the step h:
+        # f(t + h u) = f(t) + h f'(t) u + h^2 f_2 u^2.
         starts = knots.start + knots.step * np.arange(knots.n_intervals)
         pieces[0] += self.at(starts)
         pieces[1] += knots.step * self.at(starts, 1)
@@ -165,17 +170,21 @@ def check_velocity(
     good = np.isfinite(velocity)
     if good.mean() < 0.9 or not np.any(velocity[good]):
         return False, np.inf
+    # Least squares for (offset, scale, lag), with columns of unit rms.
     columns = np.stack([np.ones(good.sum()), rate[good], -acceleration[good]], axis=1)
-    size = np.sqrt(np.mean(columns**2, axis=0))
-    if size.min() < 1e-12:
+    rms = np.sqrt(np.mean(columns**2, axis=0))
+    if rms.min() < 1e-12:
         return False, np.inf
-    normal = np.linalg.pinv((columns / size).T @ (columns / size))
-    estimate = normal @ ((columns / size).T @ velocity[good]) / size
+    scaled = columns / rms
+    inverse = np.linalg.pinv(scaled.T @ scaled)
+    estimate = inverse @ (scaled.T @ velocity[good]) / rms
     noise_sd = np.sqrt(np.mean((velocity[good] - columns @ estimate) ** 2))
-    error = noise_sd * np.sqrt(np.diag(normal) * good.sum() / max(dof, 4.0)) / size
-    limit = np.array([VELOCITY_SCALE * size[1], VELOCITY_SCALE, VELOCITY_LAG])
-    # Offset, scale and lag differ from 0, 1 and 0 by less than the limits, at two sds too.
-    trusted = bool(np.all(np.abs(estimate - [0.0, 1.0, 0.0]) + 2 * error < limit))
+    # Their sd: of the samples only `dof` are independent, at least four.
+    estimate_sd = noise_sd * np.sqrt(np.diag(inverse) * good.sum() / max(dof, 4.0)) / rms
+    # They differ from 0, 1 and 0 by less than the limits, at two sds too. The offset is compared
+    # with the rms rate.
+    limit = np.array([VELOCITY_SCALE * rms[1], VELOCITY_SCALE, VELOCITY_LAG])
+    trusted = bool(np.all(np.abs(estimate - [0.0, 1.0, 0.0]) + 2 * estimate_sd < limit))
     return trusted, float(noise_sd)
 
 
@@ -264,15 +273,20 @@ def fit_joint_curve(
     time = np.asarray(time, float)
     position = np.asarray(position, float)
     _check(time, position)
+    # 1. Positions without jumps, and knots. Repeated stamps have one knot.
     if np.any(np.abs(np.diff(position, axis=0)) > np.pi):
         position = np.unwrap(position, axis=0)
-
-    # Repeated stamps have one knot. Joints at rest need no spline, only their constant.
     stamps = time[np.concatenate([[True], np.diff(time) > 0])]
     knots = _place_knots(stamps)
+
+    # 2. What the fit leaves unchanged: a trend, which is the constant of a joint at rest, and the
+    #    least noise.
     still = np.all(position == position[0], axis=0)
     floor = _noise_floor(position, noise_sd)
     trend = Trend.through(time, position, still)
+
+    # 3. A spline through the positions of each moving joint minus the trend, then with velocities.
+    #    Fewer stamps have the trend only.
     coefficients = np.zeros((knots.n_coefficients, position.shape[1]))
     bandwidth = np.zeros(position.shape[1])
     noise = floor.copy()
@@ -297,6 +311,8 @@ def fit_joint_curve(
                 )
             coefficients[:, joint] = fit.coefficients
             bandwidth[joint] = fit.bandwidth / (2 * np.pi * knots.step)
+
+    # 4. The polynomial of each interval, with the trend.
     pieces = piece_coefficients(coefficients)
     trend.add_to(pieces, knots)
     return JointCurve(knots, pieces, noise, bandwidth)

@@ -281,6 +281,7 @@ def limits_of(table: Table) -> MotionLimits:
                 fastest[row, column] = value / abs(factor)
                 origins[column][row + 1] = _origin(joint, key)
 
+    # Defaults: columns of `usual` are the joints, rows their speed and acceleration.
     usual = np.array([USUAL[bool(turning)] for turning in turns]).T
     speed, acceleration = np.where(np.isfinite(fastest), fastest, usual)
     without_range = ~turns & ~np.isfinite(lower)
@@ -353,6 +354,7 @@ def limit_words(table: Table, limits: MotionLimits) -> list[str]:
     for k, (name, origins) in enumerate(zip(table.joint_names, limits.origins, strict=True)):
         range_origin, speed_origin, acceleration_origin = origins
         factor, unit = (180 / np.pi, 'deg') if limits.turns[k] else (1.0, 'm')
+        # An endless joint has a range where `limits` are narrower: endless, here -90 to 90 deg.
         parts = []
         if is_endless[k]:
             parts.append('endless')

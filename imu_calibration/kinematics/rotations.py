@@ -210,8 +210,9 @@ def align(direction: np.ndarray) -> np.ndarray:
     if z < 0 and across < 1e-24:
         return np.diag([1.0, -1.0, -1.0])
     turn = skew([y, -x, 0.0])
-    # 1 + z cancels when z is near -1.
-    return np.eye(3) + turn + turn @ turn / (1 + z if z > 0 else across / (1 - z))
+    # The same number, as 1 + z cancels when z is near -1.
+    one_plus_z = 1 + z if z > 0 else across / (1 - z)
+    return np.eye(3) + turn + turn @ turn / one_plus_z
 
 
 EARTH_RATE = 7.292115e-5
@@ -335,6 +336,7 @@ def gravity_of_settings(gravity: float, latitude_deg: float, height: float) -> t
         Above the ellipsoid, m, used with the latitude.
 
     """
+    # A known gravity excludes the place, as `local_gravity` refuses both together.
     place = () if gravity or latitude_deg > 90 else (latitude_deg, height)
     value, sd = local_gravity(gravity or None, *place)
     return value or 0.0, sd

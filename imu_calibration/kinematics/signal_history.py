@@ -94,6 +94,8 @@ def autoregressive(drive: np.ndarray, decay: float, before: ArrayLike) -> np.nda
     """
     from scipy.linalg.blas import dtbsv
 
+    # The value before the first is part of the first drive. Rows of `band`: the diagonal, then the
+    # band below it; `diag`: the diagonal is one.
     drive = np.array(drive, float)
     band = np.tile([[1.0], [-decay]], (1, len(drive)))
     drive[:1] += decay * np.asarray(before)

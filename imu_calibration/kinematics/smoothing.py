@@ -26,7 +26,11 @@ def _piece_matrix() -> np.ndarray:
     Return the polynomials of the six basis functions on an interval, shape (6 powers, 6 bases).
 
     ``basis_a(u) = sum_k M[k, a] u^k`` with u from 0 to 1 in the interval; basis a has the
-    coefficient with number ``interval + a``.
+    coefficient with number ``interval + a``. It is ``B(u + 5 - a)`` of the uniform B-spline::
+
+        B(x) = sum_s (-1)^s C(6, s) max(x - s, 0)^5 / 5!
+
+    whose terms ``(u + 5 - a - s)^5`` are expanded in powers of u.
     """
     matrix = np.zeros((SPLINE_ORDER, SPLINE_ORDER))
     for basis in range(SPLINE_ORDER):
@@ -113,6 +117,7 @@ def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.n
 
     Shape (6, n_coefficients), in the format of `scipy.linalg.solveh_banded`.
     """
+    # Band d has ``sum B_j B_(j + d)`` over the instants at column j.
     size = knots.n_coefficients
     bands = np.zeros((SPLINE_ORDER, size))
     for first in range(SPLINE_ORDER):
@@ -129,6 +134,7 @@ def penalty_bands(weights: np.ndarray) -> np.ndarray:
 
     D is the matrix of the third differences of the coefficients.
     """
+    # Third difference k has the factors `_THIRD_DIFFERENCE` of the coefficients k to k + 3.
     bands = np.zeros((SPLINE_ORDER, len(weights) + 3))
     for first in range(4):
         for second in range(first, 4):
@@ -185,6 +191,8 @@ def _horner(
         Zeros; receives the derivatives over the factorial of their order.
 
     """
+    # Each power is one step of Horner's rule, for the value and for each derivative, whose
+    # coefficients are the values of the order below. Before DEGREE - power steps it is zero.
     for power in range(DEGREE, -1, -1):
         for order in range(min(DEGREE - power, len(taylor) - 1), 0, -1):
             taylor[order] *= place
@@ -258,11 +266,13 @@ class PenalisedSpline:
         """Weight of each row in the mean squared residual, shape (n_rows,)."""
         self.density = self.n_rows / self.n_coefficients
         """Rows per knot."""
+        # The bands below the diagonal occur above it too.
         is_diagonal = np.arange(SPLINE_ORDER) == 0
         self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(is_diagonal, 1.0, 2.0)
         """Mean of each band of the normal matrix, on both sides of the diagonal, shape (6,)."""
         # Without a penalty the normal matrix is singular where there are no readings: a hole of m
-        # knots has eigenvalues of about (pi / m)^6 times the penalty.
+        # knots has eigenvalues of about (pi / m)^6 times the penalty, which must exceed 1e-13 of
+        # the other ones, the rows per knot.
         empty = self.bands[0] < 1e-9 * self.density
         hole = np.max(np.diff(runs_of(empty)), initial=0) + SPLINE_ORDER
         self.least_decade = max(_COARSE_DECADES[0], 6 * np.log10(hole / np.pi) - 13)
@@ -411,6 +421,7 @@ def _squares_by_spectrum(spline: PenalisedSpline, values: np.ndarray) -> Squares
     """
     pilot = _penalty(spline, _PILOT_DECADE)
     coefficients, pilot_squares = spline.fit(values, pilot)
+    # Power |d|^2 of the third differences at each frequency, per coefficient.
     taper = _taper(len(coefficients) - 3)[:, None]
     power = np.abs(np.fft.rfft(taper * np.diff(coefficients, 3, axis=0), axis=0)) ** 2 / np.sum(
         taper**2
@@ -423,6 +434,7 @@ def _squares_by_spectrum(spline: PenalisedSpline, values: np.ndarray) -> Squares
     power[1:] *= 2.0
     if len(taper) % 2 == 0:
         power[-1] /= 2.0
+    # A sum over the frequencies is then the mean over the rows.
     power /= len(taper) * spline.density
 
     @lru_cache(None)

@@ -103,6 +103,8 @@ def integrate_turn(
     to_last = (mat_ji @ mat_ik.transpose(1, 2, 0).reshape(3, -1)).reshape(3, 3, -1)
     # psi = sum over samples of weight @ delta rate, with rate = inverse @ centred.
     weight = _per_sample(_times_jacobian(to_last, vectors), step, rate, slopes)
+    # by_inverse[i, r, c] is the derivative of psi_i by inverse[r, c], whose own derivative is
+    # ``-inverse @ (change of matrix) @ inverse``. by_reading: of psi by a reading, (3, 3, n).
     by_inverse = (weight.reshape(9, -1) @ centred.T).reshape(3, 3, 3)
     by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
     by_reading = inverse.T @ weight
@@ -140,6 +142,7 @@ def _rotation_vectors(rate: np.ndarray, step: np.ndarray, slopes: np.ndarray) ->
     """
     first = rate[:, :-1]
     second = rate[:, 1:]
+    # Of each sample, by the rates of the sample itself, the one before and the one after.
     slope = slopes[1] * rate
     slope[:, 1:] += slopes[0][1:] * first
     slope[:, :-1] += slopes[2][:-1] * second
@@ -182,6 +185,9 @@ def _per_sample(
     derivative of psi by the rotation vector of each step, shape (3, 3, n - 1). Its rows r are
     multiplied from the right by a cross-product matrix: ``r^T [w x] = (r x w)^T``.
     """
+    # The vector of a step from w0 to w1 is h/2 (w0 + w1) + h^2/12 (w0 x w1 - (w1' - w0')): first
+    # its derivative by w0 (sample m) and w1 (m + 1), then by the slopes, which are weighted sums of
+    # the rates of the sample, the one before and the one after.
     half = 0.5 * step * gain
     by_vector = MAGNUS_SECOND * step**2 * gain
     weight, by_slope = np.zeros((2, 3, 3, len(step) + 1))
@@ -233,6 +239,7 @@ def _running_quaternion(factors: np.ndarray) -> np.ndarray:
     """
     if factors.shape[1] < 2:
         return factors
+    # Column k of `pairs` is the product up to factor 2 k + 1; times factor 2 k + 2 it is the next.
     pairs = _running_quaternion(_multiply(factors[:, :-1:2], factors[:, 1::2]))
     product = factors.copy()  # the first one is complete
     product[:, 1::2] = pairs

@@ -179,6 +179,7 @@ class Table:
     """Reference point in the frame of the inner link, m; None: its origin, where the axes meet."""
 
     def __post_init__(self) -> None:
+        # 1. All fields, as given, must be those of a valid description.
         joints = tuple(self.joints)
         _require_joints(joints)
         values = {item.name: getattr(self, item.name) for item in fields(self)}
@@ -188,6 +189,7 @@ class Table:
             TABLE,
             mapping({'up': direction, 'mount_rpy_deg': THREE_NUMBERS}, {**_NUMBERS, **mount}),
         )
+        # 2. Texts become numbers, lists become tuples, and `up` a unit vector.
         checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up)}
         for name in _NUMBERS:
             checked[name] = None if values[name] is None else float(values[name])
@@ -253,12 +255,13 @@ class Table:
         """
         if gravity is None:
             return cls(**description)
-        # A measured gravity replaces that of a latitude in the description. A gravity that follows
-        # from a latitude is used only if the description has neither.
-        excluding = ('gravity',) if gravity_sd == 0 else ('gravity', 'latitude')
-        if all(description.get(name) is None for name in excluding):
+        # The gravity is used unless the description states one that is at least as good: a stated
+        # one in any case, that of a latitude if this one follows from a latitude too.
+        stronger = ('gravity',) if gravity_sd == 0 else ('gravity', 'latitude')
+        if all(description.get(name) is None for name in stronger):
             sd = description.get('gravity_sd') or gravity_sd or None
             return cls(**{**description, 'gravity': gravity, 'gravity_sd': sd})
+        # Otherwise it is only compared with that of the description.
         table = cls(**description)
         if abs(table.gravity_value - gravity) > SAME_GRAVITY:
             raise InputError(
@@ -287,7 +290,7 @@ class Table:
         """Names of the joints with readings, from the base outwards, and of their errors."""
         turning = [joint.source for joint in self.joints if joint.turns]
         # A zero that affects only the first or the last axis is the azimuth, or belongs to the
-        # mount.
+        # mount. A joint that others follow is listed once for each axis that it turns.
         not_separate = [name for name in turning[:1] + turning[-1:] if turning.count(name) == 1]
         # A mimic joint is read from the same source as another one.
         read = tuple(dict.fromkeys(joint.source for joint in self.joints))

@@ -423,12 +423,14 @@ def _with_limits(joints: Sequence[Joint], entries: Iterable[Any], link: str) -> 
         joint = by_name[name]
         limits = mapping({'name': text()}, LIMITS[joint.type], closed=True)
         require(entry, replace(SITE, name=f"limits of joint '{name}'"), limits)
+        # Limits that the entry gives replace those of the robot description. A range and endless
+        # exclude each other, so that either one removes the other.
         given = limits_from_mapping(entry, joint.type)
         changes: dict[str, Any] = {}
         for key, value in vars(given).items():
             if key != 'described' and value is not None and value is not False:
                 changes[key] = value
-        if given.endless or given.lower is not None:  # a range and endless exclude each other
+        if given.endless or given.lower is not None:
             changes = {'lower': None, 'upper': None, 'endless': False} | changes
         changes['described'] = joint.limits.described - set(changes)
         by_name[name] = replace(joint, limits=replace(joint.limits, **changes))
