@@ -49,7 +49,7 @@ from imu_calibration.preprocessing.sensor_join import (
     join_sensors,
 )
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
-from imu_calibration.preprocessing.value_checks import force_error, samples_per_second
+from imu_calibration.preprocessing.value_checks import force_error, median_step, samples_per_second
 from msg_adapters.csv_lines import plain_lines, sensor_of_label
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.storages import suffixes
@@ -1806,18 +1806,11 @@ def _time_unit(values: np.ndarray) -> str | None:
     """Return the unit in which the median step is that of an IMU, or None."""
     if values.dtype.kind == 'M':
         return 'ns'
-    median_step = _median_step(values)
+    usual_step = median_step(values)
     for unit, low, high in PERIODS:
-        if low <= median_step <= high:
+        if low <= usual_step <= high:
             return unit
     return None
-
-
-def _median_step(values: np.ndarray) -> float:
-    """Return the median of the positive steps; 0.0 without any."""
-    steps = np.diff(values)
-    steps = steps[steps > 0]
-    return float(np.median(steps)) if len(steps) else 0.0
 
 
 SAMPLE_TIME_FINE = ('sample time fine', 'sampletimefine')
@@ -1830,7 +1823,7 @@ Median step of SampleTimeFine: from it on microseconds (Xsens DOT, at most 250 H
 
 def _unit_of_sample_time_fine(values: np.ndarray) -> str:
     """Return the unit of a column SampleTimeFine of an Xsens log."""
-    return 'us' if _median_step(values) >= SLOWEST_TICKS else '100us'
+    return 'us' if median_step(values) >= SLOWEST_TICKS else '100us'
 
 
 def _require_time_of_turns(time: Columns, rate: Columns, imu: ImuSamples, path: Path) -> None:

@@ -145,9 +145,7 @@ class ImuStream:
         """Return the covariances of (force, rate), each (3, 3), and keep their bytes for `take`."""
         self._rate_cov = data[self._rate_cov_part]
         self._force_cov = data[self._force_cov_part]
-        force_cov = np.array(self._nine.unpack_from(self._force_cov)).reshape(3, 3)
-        rate_cov = np.array(self._nine.unpack_from(self._rate_cov)).reshape(3, 3)
-        return force_cov, rate_cov
+        return self.unpacked(self._force_cov), self.unpacked(self._rate_cov)
 
     def orientation(self, data: bytes) -> tuple[tuple[float, ...], bytes]:
         """Return (quaternion x, y, z, w; its covariance as bytes)."""
@@ -155,8 +153,8 @@ class ImuStream:
         return self._four.unpack_from(data, self._body), data[covariance_start : self._rate_at]
 
     def unpacked(self, covariance: bytes) -> np.ndarray:
-        """Return the matrix in the bytes of a covariance, shape (3, 3)."""
-        return np.array(self._nine.unpack(covariance)).reshape(3, 3)
+        """Return the matrix at the begin of the bytes of a covariance, shape (3, 3)."""
+        return np.array(self._nine.unpack_from(covariance)).reshape(3, 3)
 
     def packed(self, covariance: np.ndarray) -> bytes:
         """Return a covariance, (3, 3), as bytes."""

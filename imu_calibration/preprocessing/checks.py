@@ -168,7 +168,7 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         )
 
 
-def _sensor_parts(parts):
+def _sensor_parts(parts: Sequence[FrozenPart]) -> list[FrozenPart]:
     """Return the `FrozenPart` of sensors, joined as 'IMU' where both are frozen at one time."""
     by_span: dict[tuple[float, float], FrozenPart] = {}
     for part in parts:
@@ -306,7 +306,7 @@ def _times(count: int) -> str:
     return 'once' if count == 1 else f'{count} times'
 
 
-def _fast_streams(evidence):
+def _fast_streams(evidence: RecordingEvidence) -> list[tuple[str, StreamStatistics]]:
     """Return (message type, StreamStatistics) of the IMU and the joints."""
     streams = []
     for name in ('imu', 'joints'):

@@ -153,11 +153,11 @@ def without_overflows(
         stamps = _without_overflows_in_gaps(stamps)
     elif counter_ns is not None:
         places = np.flatnonzero(np.diff(stamps.stamp_ns) < -LEAST_STEP_NS)
-        sizes = [
-            _size_in_gap(counter_ns[place], counter_ns[place + 1], search.sizes_ns)
-            for place in places
-        ]
-        stamps = stamps.without(places[np.array(sizes, bool)], [size for size in sizes if size])
+        sizes_ns = np.zeros(len(places), np.int64)
+        for k, place in enumerate(places):
+            sizes_ns[k] = _size_in_gap(counter_ns[place], counter_ns[place + 1], search.sizes_ns)
+        is_overflow = sizes_ns > 0
+        stamps = stamps.without(places[is_overflow], sizes_ns[is_overflow])
     return _without_unknown_counter(stamps)
 
 
@@ -171,6 +171,7 @@ def _without_overflows_in_gaps(stamps: CounterStamps) -> CounterStamps:
     stamp_ns = stamps.stamp_ns
     steps = np.diff(stamp_ns)
     period = np.median(steps[steps > 0])
+    # The stamps after k steps back, and the one after that is still before k.
     back = np.flatnonzero(steps[:-1] < -LOST_PERIODS * period)
     continues = back[stamp_ns[back + 2] < stamp_ns[back]]
     return stamps.without(continues, np.full(len(continues), stamps.size_ns))

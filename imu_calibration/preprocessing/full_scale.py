@@ -100,6 +100,7 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
         stop = next_rest[0]
         if stop <= start:
             continue
+        # From the last chunk of one rest to the first of the next: stop - start + 1 steps.
         span = chunks.time[stop] - chunks.time[start - 1]
         has_gap = span >= 1.5 * usual_duration * (stop - start + 1)
         if has_gap or not is_whole[start:stop].all() or span >= MAX_TURN_SECONDS:
@@ -169,6 +170,7 @@ class Extremes:
             self.level = float(largest)
             self.count = 0
             self.n_jumps = 0
+        # Samples at the largest value, and those of them that follow a much smaller one.
         near = values[values > NEAR_LARGEST_SHARE * self.level]
         is_below = near < self.level
         self.count += len(near) - int(np.count_nonzero(is_below))
@@ -178,10 +180,10 @@ class Extremes:
             self.n_jumps += int(np.count_nonzero(value_before < (1 - JUMP) * largest))
 
         # Count the largest of the values below, in bounded memory.
-        near = near[is_below]
-        if len(near) > MAX_NEAR_OUTPUTS:
-            near = np.partition(near, len(near) - MAX_NEAR_OUTPUTS)[-MAX_NEAR_OUTPUTS:]
-        for value, count in zip(*np.unique(near, return_counts=True)):
+        below = near[is_below]
+        if len(below) > MAX_NEAR_OUTPUTS:
+            below = np.partition(below, len(below) - MAX_NEAR_OUTPUTS)[-MAX_NEAR_OUTPUTS:]
+        for value, count in zip(*np.unique(below, return_counts=True)):
             self._count_below[float(value)] = self._count_below.get(float(value), 0) + int(count)
         self._count_below = dict(sorted(self._count_below.items(), reverse=True)[:COUNTED_OUTPUTS])
 
@@ -350,6 +352,7 @@ def _fit(pairs: _ChunkPairs, rate: np.ndarray) -> _TurnFit:
 
     The 3 (m + 1) unknowns are the rows of (matrix, offset).
     """
+    # Row (sample, i) and column (j, k) of the design: lever[sample, i, j] inputs[sample, k].
     lever = skew(pairs.direction) * pairs.seconds[:, None, None]
     inputs = np.column_stack([rate, np.ones(len(rate))])
     width = inputs.shape[1]
@@ -359,6 +362,7 @@ def _fit(pairs: _ChunkPairs, rate: np.ndarray) -> _TurnFit:
     inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(3 * width))
     solution = inverse @ (design.T @ target)
     residual = float(((target - design @ solution) ** 2).sum())
+    # Columns of the matrix without the offset, which is the last input.
     n_spare = max(len(target) - 3 * width, 1)
     sd = CHUNK_SD_FACTOR * np.sqrt(np.diag(inverse) * residual / n_spare)
     column_sd = np.linalg.norm(sd.reshape(3, width)[:, :-1], axis=0)

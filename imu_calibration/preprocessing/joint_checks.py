@@ -131,6 +131,7 @@ def _repeating_spans(
     steps of a coarse gyroscope.
     """
     is_repeated = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
+    # A gyroscope that often repeats readings is coarse, and has the smallest step between them.
     step = np.zeros(3)
     if np.concatenate(is_repeated).mean() > OFTEN:
         step = np.min([smallest_step(window.rate_s) for window in windows], axis=0)
@@ -139,6 +140,7 @@ def _repeating_spans(
     spans = []
     for window, repeated, rate in zip(windows, is_repeated, expected):
         turns = np.linalg.norm(rate, axis=1) > MIN_TURN_RATE
+        # Samples `start` to `stop` - 1 are equal to the sample after them.
         for start, stop in runs_of(np.append(repeated.all(axis=1), False)):
             first = float(window.time[start])
             last = float(window.time[stop - 1])
@@ -161,6 +163,7 @@ def _unsaturated(windows: Sequence[Window]) -> list[Window]:
     The missing part of a saturated rate may lie along the axis of a joint that rests.
     """
     rates = np.concatenate([window.rate_s for window in windows])
+    # Whether each reading is the smallest, or the largest, of its axis, shape (2, n, 3).
     ends = np.stack([rates.min(axis=0), rates.max(axis=0)])
     at_end = rates == ends[:, None]
     # Of noisy readings one is the largest; an end of the range is reached again and again.
@@ -305,6 +308,7 @@ def _product_sums(accumulator: Any, model: SensorModel, sensor: str) -> ProductS
     The rates are without their mean in windows, weighted by samples; those of the samples within
     windows are added.
     """
+    # Columns of a row: those of the model, of which `part` are the reference; then the readings.
     part = model.columns_of(sensor, Role.LINEAR)
     is_gyroscope = sensor == 'gyroscope'
     rows = [row for row in accumulator.rows if is_gyroscope or row.kind == 'static']
@@ -314,6 +318,7 @@ def _product_sums(accumulator: Any, model: SensorModel, sensor: str) -> ProductS
     means = np.array([row.sensors[sensor].mean for row in rows])
     if is_gyroscope:
         means = means - weight @ means / weight.sum()  # the bias
+    # Sums of products of all columns. Within windows they follow from triangular factors.
     total = (means * weight[:, None]).T @ means
     if is_gyroscope:
         for (name, _), factor in accumulator.within.items():
@@ -322,7 +327,6 @@ def _product_sums(accumulator: Any, model: SensorModel, sensor: str) -> ProductS
         samples = sum(accumulator.samples.values())
         if np.trace(total[part, part]) < TESTED_RATE**2 * max(samples, 1):
             return None
-    # The last three columns are the measured readings.
     return ProductSums(
         cross=total[-3:, part], reference=total[part, part], measured=total[-3:, -3:]
     )

@@ -1,13 +1,18 @@
 """Errors of a table description that explain rates which the joints do not explain."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.rotations import nearest_rotation, rotation, rpy_from_rotation
+from imu_calibration.kinematics.rotations import (
+    Reference,
+    nearest_rotation,
+    rotation,
+    rpy_from_rotation,
+)
 from imu_calibration.kinematics.table import Table, axis_error_directions
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.window import MotionReadings, Window, motion_readings
@@ -62,7 +67,7 @@ def _correction(
     )
 
 
-def _residual(rate, reference):
+def _residual(rate: np.ndarray, reference: Reference) -> np.ndarray:
     """
     Return ``w - b - M r - D r'`` with b, M and D of least squares, rad/s, shape (n, 3).
 
@@ -72,7 +77,7 @@ def _residual(rate, reference):
     return rate - design @ np.linalg.lstsq(design, rate, rcond=1e-6)[0]
 
 
-def _share(residual, measured):
+def _share(residual: np.ndarray, measured: np.ndarray) -> float:
     """Return ``sum |residual|^2 / sum |measured - mean|^2``, the unexplained share."""
     return float((residual**2).sum() / ((measured - measured.mean(axis=0)) ** 2).sum())
 
@@ -94,7 +99,9 @@ def is_unexplained(windows: Sequence[Window], expected: Sequence[np.ndarray]) ->
     return _share(residual, measured) > LARGEST_UNEXPLAINED
 
 
-def _sensor_fit(windows, expected):
+def _sensor_fit(
+    windows: Sequence[Window], expected: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (measured rates, matrix, bias) of ``measured = M r + b`` with least squares."""
     measured = np.concatenate([window.rate_s for window in windows])
     design = np.insert(np.concatenate(expected), 0, 1.0, axis=1)
@@ -183,7 +190,7 @@ def _correction_of_several(readings: MotionReadings, table: Table) -> Correction
     """Return the change of all zeros and axes together that explains most of the rates."""
     n_zeros = len(table.joint_names.zeros)
 
-    def changed(angles):
+    def changed(angles: np.ndarray) -> tuple[Table, JointMotion]:
         """Return table and motion with changed zeros, then two angles of each axis, rad."""
         changed_table = table
         for k, axis_angles in enumerate(angles[n_zeros:].reshape(-1, 2)):
@@ -197,7 +204,7 @@ def _correction_of_several(readings: MotionReadings, table: Table) -> Correction
     return _correction('several of them are changed', readings, *changed(angles))
 
 
-def _fit_angles(residual, n_parameters):
+def _fit_angles(residual: Callable[[np.ndarray], np.ndarray], n_parameters: int) -> np.ndarray:
     """Return the angles x, rad, with the least ``sum |residual(x)|^2``, from almost zero."""
     from scipy.optimize import least_squares  # here, because its import is slow
 
@@ -205,23 +212,23 @@ def _fit_angles(residual, n_parameters):
     return least_squares(lambda x: residual(x).ravel(), start, max_nfev=MAX_EVALUATIONS).x
 
 
-def _shifted(motion, table, zeros):
+def _shifted(motion: JointMotion, table: Table, zeros: np.ndarray) -> JointMotion:
     """Return the motion with `zeros`, rad, added to the angles of the joints that have one."""
     position = motion.position.copy()
     position[:, [table.joint_names.index(name) for name in table.joint_names.zeros]] += zeros
     return replace(motion, position=position)
 
 
-def _turned_axis(table, joint, angles):
+def _turned_axis(table: Table, joint: int, angles: np.ndarray) -> np.ndarray:
     """Return the axis of a joint, turned by two angles about the directions across it, rad."""
     axis = np.array(table.joints[joint].axis)
     return rotation(angles @ axis_error_directions(axis)) @ axis
 
 
-def _fit_axis(readings, table, joint):
+def _fit_axis(readings: MotionReadings, table: Table, joint: int) -> np.ndarray:
     """Return the axis of one joint that explains most of the rates, any unit vector."""
 
-    def residual(angles):
+    def residual(angles: np.ndarray) -> np.ndarray:
         turned_table = with_axis(table, joint, _turned_axis(table, joint, angles))
         return _rate_residual(readings, turned_table, readings.motion)
 
@@ -229,7 +236,7 @@ def _fit_axis(readings, table, joint):
     return np.round(axis) if _is_coordinate_axis(axis) else axis
 
 
-def _is_coordinate_axis(axis):
+def _is_coordinate_axis(axis: np.ndarray) -> bool:
     """Return whether a unit vector is a coordinate axis, or the fit of one."""
     return np.linalg.norm(axis - np.round(axis)) < SAME_AXIS
 
@@ -241,7 +248,7 @@ def _other_axes(axis: np.ndarray) -> Iterator[np.ndarray]:
             yield candidate
 
 
-def _spans_three(rates):
+def _spans_three(rates: np.ndarray) -> bool:
     """Return whether rates, shape (n, 3), span three directions."""
     sizes = np.linalg.svd(rates - rates.mean(axis=0), compute_uv=False)
     return bool(sizes[-1] > LEAST_SPAN * sizes[0])

@@ -65,20 +65,23 @@ class AxisMatch:
 
         For the reference axes with motion.
         """
-        return [(i, j, sign) for i, j, sign in _wrong_axes(self.matrix) if seen[j, j] > 0.5]
+        return _wrong_axes(self.matrix, seen)
 
     def words(self, seen: np.ndarray) -> str:
         """Return these exchanges in words; '' where no exchange of axes explains the matrix."""
         return ', '.join(_axis_phrases(self.matrix, seen)) if self.agreement > MIN_MATCH else ''
 
 
-def _wrong_axes(matrix: np.ndarray) -> list[tuple[int, int, float]]:
+def _wrong_axes(matrix: np.ndarray, seen: np.ndarray) -> list[tuple[int, int, float]]:
     """
     Return (row, column, sign) of the entries of a signed permutation that differ from the identity.
+
+    In the columns of the reference axes with motion, which are `seen`.
     """
     entries = []
     for i, j in np.argwhere(matrix):
-        if i != j or matrix[i, j] < 0:
+        is_changed = i != j or matrix[i, j] < 0
+        if is_changed and seen[j, j] > 0.5:
             entries.append((int(i), int(j), float(matrix[i, j])))
     return entries
 
@@ -307,10 +310,9 @@ def _joint_phrases(names: Sequence[str], order: list[int], signs: list[float]) -
 def _axis_phrases(axes: np.ndarray, seen: np.ndarray = np.eye(3)) -> tuple[str, ...]:
     """Return a phrase for each wrong axis of a permutation, of reference axes with motion."""
     phrases = []
-    for i, j, sign in _wrong_axes(axes):
-        if seen[j, j] > 0.5:
-            minus = 'minus ' if sign < 0 else ''
-            phrases.append(f"measured {'xyz'[i]} is {minus}the reference's {'xyz'[j]}")
+    for i, j, sign in _wrong_axes(axes, seen):
+        minus = 'minus ' if sign < 0 else ''
+        phrases.append(f"measured {'xyz'[i]} is {minus}the reference's {'xyz'[j]}")
     return tuple(phrases)
 
 
@@ -364,17 +366,14 @@ def same_motion(sums: ProductSums, windows: list[Window], table: Table) -> Check
     # Other checks report units, signs and axes.
     if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:
         return a_period_late(windows, table) if explained < 1.0 - SHARE_TIE else None
-    # An IMU that rests, that is late or that moves otherwise.
-    key = 'imu_topic'
-    cause = 'this IMU does not turn when the table does; give the topic of the IMU on the table'
-    if np.trace(sums.measured) > MIN_RATE_GAIN * np.trace(sums.reference):
-        cause = _delay_cause(windows, table)
-        key = None
-    elif gain > MIN_RATE_GAIN:
+    # An IMU that rests, that is late, or that moves otherwise.
+    turns = np.trace(sums.measured) > MIN_RATE_GAIN * np.trace(sums.reference)
+    if not turns and gain > MIN_RATE_GAIN:
         return None
-    if not cause:
-        key = 'imu_topic'
-        cause = (
+    delay_cause = _delay_cause(windows, table) if turns else ''
+    cause = 'this IMU does not turn when the table does; give the topic of the IMU on the table'
+    if turns:
+        cause = delay_cause or (
             'its motion is not that of the table; give the topic of the IMU on the table, and'
             ' check the names of the joints and both clocks'
         )
@@ -383,7 +382,7 @@ def same_motion(sums: ProductSums, windows: list[Window], table: Table) -> Check
         REFUSE,
         'the gyroscope must measure the motion of the joints, they explain '
         f'{100 * min(explained, 1.0):.0f} % of its rates at a gain of {gain:.2g}: {cause}',
-        key=key,
+        key=None if delay_cause else 'imu_topic',
     )
 
 
@@ -520,7 +519,8 @@ def _estimate_delay(windows: Sequence[Window], table: Table) -> _DelayEstimate:
     max_lag = min(int(LARGEST_SHIFT / rates.period), len(rates.measured) // 2)
     shares = _shares_explained(rates, max_lag)
 
-    # Index of the delay zero, and of the largest share within the range of a lag.
+    # `shares` has the delay zero at index `zero`, and the range of a lag up to `reach` from it, in
+    # which the largest share is that of `peak_near_zero`.
     zero = RESOLVED * max_lag
     reach = int(RESOLVED * LEAST_SHIFT / rates.period)
     shares_near_zero = np.abs(shares[zero - reach : zero + reach + 1])
@@ -531,20 +531,19 @@ def _estimate_delay(windows: Sequence[Window], table: Table) -> _DelayEstimate:
     is_peak = (inner >= shares[:-2]) & (inner >= shares[2:])
     peaks = 1 + np.flatnonzero(is_peak & (inner >= shares.max() - SHARE_TIE))
     best = int(peaks[np.argmin(np.abs(peaks - zero))] if len(peaks) else np.argmax(shares))
-    shares_of_other_sign = (
-        shares[zero + reach + 1 :] if best < zero else shares[: max(zero - reach, 0)]
-    )
-    ambiguous = (
-        # A peak, not the slope of one beyond the range of a lag.
-        0 < peak_near_zero - zero + reach < 2 * reach
-        and shares[best] < 1.0 - SHARE_TIE
-        and shares_of_other_sign.max(initial=-1.0) > shares[best] - SHARE_TIE
-    )
+    # A peak inside the range of a lag, not the slope of one beyond; a best delay that does not
+    # explain everything; and delays of the other sign, beyond the range, that are as good.
+    has_inner_peak = 0 < peak_near_zero - zero + reach < 2 * reach
+    is_incomplete = shares[best] < 1.0 - SHARE_TIE
+    shares_of_other_sign = shares[: max(zero - reach, 0)]
+    if best < zero:
+        shares_of_other_sign = shares[zero + reach + 1 :]
+    has_rival = shares_of_other_sign.max(initial=-1.0) > shares[best] - SHARE_TIE
     return _DelayEstimate(
         seconds=(best - zero) * rates.period / RESOLVED,
         share=float(shares[best]),
         share_near_zero=float(shares[peak_near_zero]),
-        ambiguous=bool(ambiguous),
+        ambiguous=bool(has_inner_peak and is_incomplete and has_rival),
     )
 
 

@@ -122,7 +122,7 @@ class RecordingEvidence:
                 stuck[:, column] = scan.in_long_runs(same & other_moves)
         return stuck
 
-    def _at_end(self, column):
+    def _at_end(self, column: int) -> np.ndarray:
         """Return in which chunks an output is at a clipping limit: clipped, not frozen."""
         mean = self.chunks.mean[:, column]
         at_end = np.zeros(len(mean), bool)
@@ -414,6 +414,6 @@ def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         )
 
 
-def _numbers(values):
+def _numbers(values: np.ndarray) -> str:
     """Return numbers with three digits, separated by commas."""
     return ', '.join(f'{value:.3g}' for value in values)

@@ -94,6 +94,7 @@ def quiet_beside_joints(
     """
     cells = Cells(force_s, rate_s, period)
     quiet = quiet_samples(cells, ratio=ratio, longest=longest, floor=floors[0], resting=resting)
+    # The means are tested even where they are not needed, because this updates their floor.
     width = 2 * int(round(BELOW / period / 2)) + 1
     means_are_quiet = quiet_samples(
         Cells(low_passed(force_s, width), low_passed(rate_s, width), period),
@@ -103,6 +104,7 @@ def quiet_beside_joints(
         resting=resting,
         spans=SPANS[1:],
     )
+    # Not needed: all is quiet where the joints rest, or a slow IMU has no vibration to remove.
     if quiet[resting].all() or width < 3:
         return quiet
     return quiet | (means_are_quiet & _steady(cells, ratio=ratio, resting=resting))
@@ -195,9 +197,9 @@ def quiet_samples(
         width = cells.width(min(span, longest))
         variance = cells.variance(width)
         running_floor = floor.update(span, _chunk_floor(variance, width, at_rest))
+        # The floor of this span. At rest the variance hardly grows with the span; otherwise the
+        # quietest part was moving as well. Without any rest so far no sample is quiet.
         if running_floor is not None:
-            # At rest the variance hardly grows with the span; otherwise the quietest part was
-            # moving as well.
             span_floor = np.minimum(running_floor, _GROWTH * shorter_floor)
         elif np.isinf(shorter_floor).all():
             return np.zeros(cells.edges[-1], bool)
@@ -275,7 +277,9 @@ class Cells:
         for values in (force_s, rate_s):
             sums = []
             squares = np.zeros(len(self.edges) - 1)
-            for axis in values.T:  # one at a time: a long recording is large
+            # `reduceat` sums from each edge to before the next one. One axis at a time, because a
+            # long recording is large.
+            for axis in values.T:
                 centred = axis - axis.mean()
                 sums.append(np.add.reduceat(centred, self.edges[:-1]))
                 squares += np.add.reduceat(np.square(centred, out=centred), self.edges[:-1])

@@ -257,7 +257,7 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
     if len(chunks) < LEAST_CHUNKS:
         return np.zeros(len(chunks), bool)
     quiet = np.ones(len(chunks), bool)
-    for part in (slice(0, 3), slice(3, 6)):
+    for part in SENSOR_COLUMNS.values():
         scatter = np.linalg.norm(chunks.sd[:, part], axis=1)
         quiet &= scatter <= 3.0 * np.quantile(scatter, 0.1) + 1e-3 * np.median(scatter)
     turn = np.linalg.norm(np.diff(unit_rows(chunks.mean[:, :3]), axis=0), axis=1)
@@ -348,10 +348,12 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
             flags = np.zeros(len(chunks), bool)
         constant[sensor] = flags
     frozen = {sensor: in_long_runs(flags) for sensor, flags in constant.items()}
-    # The noise at rest, from chunks in which neither sensor is constant.
+    # The noise at rest, from chunks in which neither sensor is constant; only needed for a sensor
+    # that may be frozen.
     rest = None
     if np.logical_or(*frozen.values()).any():
         rest = find_rest(chunks.select(~np.logical_or(*constant.values())))
+    # Without a verdict on a sensor:
     for sensor, part in SENSOR_COLUMNS.items():
         if (
             # The noise at rest is not known, or is zero, or is below the steps of the converter.

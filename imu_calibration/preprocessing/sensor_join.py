@@ -260,8 +260,9 @@ def _gravity_windows(accelerometer: SensorStream) -> _GravityWindows | None:
     direction = unit_rows(np.where(has_direction, accelerometer.values, 1.0))
 
     start = np.arange(0, len(time) - 2 * half, half)
+    # Without a gap: of a slow sensor a window has two periods, which may be jittered.
     longest = 2.0 * DELAY_WINDOW + 4e-9 * accelerometer.period_ns
-    start = start[time[start + 2 * half] - time[start] < longest]  # without a gap
+    start = start[time[start + 2 * half] - time[start] < longest]
     stop = start + 2 * half
     return _GravityWindows(
         start=time[start],
@@ -289,7 +290,8 @@ def _delay_within(
     windows = windows.select(largest[rotation[largest] > 0.0])
     cost = _DelayCost(gyroscope, time, windows)
 
-    # The least residual, first among widely spaced delays, then near the best of them.
+    # The least residual among delays of decreasing distance: those within `reach`, then those
+    # within one step of the best one.
     best = 0.0
     half_range = reach
     steps = [WIDE_STEP, DELAY_STEP] if reach > MAX_DELAY else [DELAY_STEP]
@@ -381,11 +383,13 @@ class _DelayCost:
             turned[:, axis] = np.interp(stop + delay, self._time, self._integral[:, axis])
             turned[:, axis] -= np.interp(start + delay, self._time, self._integral[:, axis])
         turned[:, 3] = stop - start
+        # Sums over a part: (9, n) @ (n, 16) are the products of [u x].T [u x] (j, k) with those of
+        # `turned` (l, m), as (j, k, l, m).
         products = (turned[:, :, None] * turned[:, None, :]).reshape(-1, 16)
         normal = np.empty((DELAY_PARTS, 12, 12))
         applied = np.empty((DELAY_PARTS, 12))
         for number, part in enumerate(self._parts):
-            # Unknown 4 j + l is the number (j, l) of (A, b): N[(j, l), (k, m)].
+            # Unknown 4 j + l is the number (j, l) of (A, b): N has rows (j, l) and columns (k, m).
             blocks = (self._cross_squares[number] @ products[part]).reshape(3, 3, 4, 4)
             normal[number] = blocks.transpose(0, 2, 1, 3).reshape(12, 12)
             applied[number] = (self._cross_changes[number] @ turned[part]).reshape(12)

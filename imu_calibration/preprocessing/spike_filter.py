@@ -65,7 +65,7 @@ class SpikeFilter:
         """Samples with a spike so far."""
         self._reset()
 
-    def _reset(self):
+    def _reset(self) -> None:
         """Discard all samples and the noise: the next sample begins a stream."""
         # Samples without a decision.
         self._buffered: Any = None
@@ -102,7 +102,7 @@ class SpikeFilter:
         self._reset()
         return passed
 
-    def _decide(self, count):
+    def _decide(self, count: int) -> list[ImuSamples]:
         """Return the first `count` of the buffered samples, without spikes, in a list."""
         if not count:
             return []
@@ -112,7 +112,8 @@ class SpikeFilter:
         is_spike = self._spikes(rows)
         self.dropped += int(np.count_nonzero(is_spike))
         self._buffered = self._buffered.select(slice(count, None))
-        # Drop the rows that no later test needs, in whole chunks, and their noise.
+        # Drop the rows that no later test needs, in whole chunks. The noise sds that are kept are
+        # those of as many chunks as the rows and the next `SPIKE_REACH` ones span, and of two more.
         n_old_chunks = max((rows[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0)
         self._readings = self._readings[n_old_chunks * NOISE_SAMPLES :]
         self._first_row += n_old_chunks * NOISE_SAMPLES
@@ -121,7 +122,7 @@ class SpikeFilter:
         ]
         return [samples.select(~is_spike) if is_spike.any() else samples]
 
-    def _spikes(self, rows):
+    def _spikes(self, rows: np.ndarray) -> np.ndarray:
         """
         Return which samples have a spike in one of their six readings, bool, shape (n,).
 
@@ -130,35 +131,35 @@ class SpikeFilter:
         values = self._readings
         if len(values) < 2 * SPIKE_REACH + 1:
             return np.zeros(len(rows), bool)
+        # 1. Second differences of all stored rows; the two ends have those of their neighbours.
         second = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
         second = np.vstack([second[:1], second, second[-1:]])
         self._add_noise(second)
 
-        # Candidates exceed the noise of the chunk before; the last of the noise sds is the newest.
-        chunk = np.maximum((self._first_row + rows) // NOISE_SAMPLES - 1, 0)
-        n_noise = len(self._noise_sds)
-        noise_row = np.clip(chunk - self._n_chunks + n_noise, 0, n_noise - 1)
-        limits = LARGE_SDS * self._noise_sds[noise_row]  # of all readings, shape (n, 6)
-        # Each candidate is one reading: an index into `rows`, and a column.
+        # 2. Candidates exceed the noise of the chunk before. Each is one reading: an index into
+        #    `rows`, and a column.
+        limits = self._limits_at(rows)
         candidate, column = np.nonzero(second[rows] > _CANDIDATE / LARGE_SDS * limits)
         is_spike = np.zeros(len(rows), bool)
         if not len(candidate):
             return is_spike
         row = rows[candidate]
 
-        # A knock affects two neighbours on either side, and several columns.
+        # 3. A knock affects two neighbours on either side, and several columns. Rows without two
+        #    neighbours on each side are not tested for one.
         inner = np.clip(row, 2, len(values) - 3)
         is_knock = _is_knock(values[inner[:, None] + [-2, -1, 1, 2]], limits[candidate])
         is_knock &= inner == row
 
-        # During vibration, as at the first touch of a hand, the previous noise does not apply; a
-        # spike affects three second differences, two in six.
+        # 4. During vibration, as at the first touch of a hand, the previous noise does not apply:
+        #    it is the median of the second differences around, of which a spike affects three, two
+        #    spikes six. `window` has the rows around each candidate, shape (m, 17).
         first = np.clip(row - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
         window = first[:, None] + np.arange(2 * SPIKE_REACH + 1)
-        shaking = LARGE_SDS * _NORMAL * np.median(second[window[:, 1:-1], column[:, None]], axis=1)
-        limit = np.maximum(limits[candidate, column], shaking)
+        median_around = np.median(second[window[:, 1:-1], column[:, None]], axis=1)
+        limit = np.maximum(limits[candidate, column], LARGE_SDS * _NORMAL * median_around)
 
-        # The nine readings around each candidate, and its place among them.
+        # 5. The nine readings around each candidate, (m, 9), and its place among them.
         first = np.clip(row - SPIKE_NEIGHBOURS, 0, len(values) - 2 * SPIKE_NEIGHBOURS - 1)
         around = values[first[:, None] + np.arange(2 * SPIKE_NEIGHBOURS + 1), column[:, None]]
         place = row - first
@@ -166,12 +167,22 @@ class SpikeFilter:
         is_spike[candidate[~is_knock & is_outlier]] = True
         return is_spike
 
-    def _add_noise(self, second):
+    def _limits_at(self, rows: np.ndarray) -> np.ndarray:
+        """Return `LARGE_SDS` noise sds of the chunk before each of some rows, shape (n, 6)."""
+        # The last of the noise sds is that of the newest chunk; there may be fewer than chunks.
+        chunk = np.maximum((self._first_row + rows) // NOISE_SAMPLES - 1, 0)
+        n_noise = len(self._noise_sds)
+        noise_row = np.clip(chunk - self._n_chunks + n_noise, 0, n_noise - 1)
+        return LARGE_SDS * self._noise_sds[noise_row]
+
+    def _add_noise(self, second: np.ndarray) -> None:
         """
         Estimate the noise sd of each complete chunk, at least the step of the converter.
 
         `second`: second differences of the rows, shape (n, 6).
         """
+        # 1. The complete chunks without an estimate, each shape (NOISE_SAMPLES, 6). The last row
+        #    has no second difference yet.
         start = self._n_chunks * NOISE_SAMPLES - self._first_row
         count = (len(second) - 1 - start) // NOISE_SAMPLES if len(second) > NOISE_SAMPLES else 0
         if self._n_chunks == 0 and count == 0:  # a stream that ended before
@@ -183,16 +194,17 @@ class SpikeFilter:
             values = self._readings[rows].reshape(count, NOISE_SAMPLES, 6)
         if not len(chunks):
             return
-        # Smallest step until each chunk, (n_chunks, 6), infinite before the first change.
+        # 2. Smallest step until each chunk, (n_chunks, 6), infinite before the first change.
         change = np.abs(np.diff(values, axis=1))
         steps = np.where(change > 0, change, np.inf).min(axis=1)
         steps = np.minimum.accumulate(np.vstack([self._smallest_step, steps]))[1:]
-        # A constant output (clipped, frozen, coarse) has no noise estimate: the previous one is
-        # kept.
+        # 3. Noise of each chunk. A constant output (clipped, frozen, coarse) has none: the last one
+        #    above zero is kept. Row 0 is the newest earlier estimate.
         estimates = np.vstack([self._noise_sds[-1:], _NORMAL * _median(chunks)])
         number = np.arange(len(estimates))[:, None]
         last_known = np.maximum.accumulate(np.where(estimates > 0, number, 0))
         estimates = np.take_along_axis(estimates, last_known, axis=0)[1:]
+        # 4. At least the step of the converter, and the rounding of the readings.
         noise = np.maximum(
             np.maximum(estimates, np.where(np.isfinite(steps), steps, 0.0)),
             NOISE_ROUNDING * np.abs(_median(values)),
@@ -202,7 +214,7 @@ class SpikeFilter:
         self._smallest_step = steps[-1]
 
 
-def _median(values):
+def _median(values: np.ndarray) -> np.ndarray:
     """
     Return the median along axis 1.
 
@@ -213,7 +225,7 @@ def _median(values):
     return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
 
 
-def _is_knock(neighbours, limit):
+def _is_knock(neighbours: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """
     Return where two or more of the six columns deviate in the neighbours as well, shape (m,).
 
@@ -232,7 +244,7 @@ def _is_knock(neighbours, limit):
     return np.count_nonzero(deviation > SHARED * limit, axis=1) >= 2
 
 
-def _contradicted(around, place, limit):
+def _contradicted(around: np.ndarray, place: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """
     Return where readings deviate from the cubic through two neighbours on either side, (m,).
 
@@ -259,12 +271,13 @@ def _contradicted(around, place, limit):
     return is_deviating & (apart < PREDICTION_SHARE * deviation + PREDICTION_MARGIN * limit)
 
 
-def _off_the_median(around, place, limit):
+def _off_the_median(around: np.ndarray, place: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """
     Return where readings deviate from the median of nine, which two further outliers do not move.
 
-    By far more than the spread of the middle ones, and without a smaller deviation of a neighbour,
-    which indicates a knock. Arguments as for `_contradicted`.
+    The deviation is `SPIKE_SPREADS` times the range of the nine without the two lowest and the two
+    highest, and no neighbour has a smaller deviation, which would indicate a knock. Arguments as
+    for `_contradicted`.
     """
     ordered = np.sort(around, axis=1)
     deviations = np.abs(around - ordered[:, [SPIKE_NEIGHBOURS]])

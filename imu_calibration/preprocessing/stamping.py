@@ -160,6 +160,7 @@ def _regular_line(step: np.ndarray, usual: float) -> StampLine | None:
     is_multiple = np.abs(step / usual - n_periods) <= WHOLE_STEP_SHARE
     is_late = (n_periods < MOST_LOST) & ~is_multiple
     n_periods[(step <= MAX_REGULAR_STEP * usual) | is_late] = 1.0
+    # Without repeated stamps, and without long gaps, in which the number of periods is uncertain.
     used = (step > 0) & (n_periods <= MOST_LOST)
     return StampLine(REGULAR, float(step[used].sum() / n_periods[used].sum()))
 
@@ -439,7 +440,7 @@ class CountedClock:
         # A block needs the next stamps too, which decide whether samples were lost.
         n_needed = 1 if final else CLOCK_BLOCK + LOSS_REACH
         while len(self._waiting_ns) >= n_needed:
-            # A block and the stamps ahead of it end at a pause.
+            # A block and the stamps ahead of it end at a pause, or where the stamps end.
             steps = np.diff(self._waiting_ns[: CLOCK_BLOCK + LOSS_REACH])
             pauses = np.flatnonzero(steps > PAUSE_NS)
             end = int(pauses[0]) + 1 if len(pauses) else len(self._waiting_ns)
@@ -447,6 +448,7 @@ class CountedClock:
             ahead_end = min(CLOCK_BLOCK + LOSS_REACH, end)
             self._add_block(self._waiting_ns[:block_end], self._waiting_ns[block_end:ahead_end])
             self._waiting_ns = self._waiting_ns[block_end:]
+            # The pause follows this block: counting restarts.
             if len(pauses) and end <= CLOCK_BLOCK:
                 self._finish()
         if final:
@@ -607,9 +609,11 @@ class SampleTimes:
             return samples
         samples = self._without_repeated(samples)
         ready = []
+        # In parts that end with a block, as the stamps are reviewed after complete blocks.
         while len(samples):
-            part = samples.select(slice(0, CLOCK_BLOCK - self._n_since_block))
-            samples = samples.select(slice(CLOCK_BLOCK - self._n_since_block, None))
+            n_missing = CLOCK_BLOCK - self._n_since_block
+            part = samples.select(slice(0, n_missing))
+            samples = samples.select(slice(n_missing, None))
             self._n_since_block = (self._n_since_block + len(part)) % CLOCK_BLOCK
             stamps_ns = np.concatenate([self._stamps_ns, part.stamp_ns])
             self._stamps_ns = stamps_ns[-STAMP_HISTORY:]
@@ -675,23 +679,7 @@ class SampleTimes:
         After a complete block the use of the stamps may be reviewed.
         """
         if self._is_unclassified:
-            self._buffered = part.after(self._buffered)
-            stamp_ns = self._buffered.stamp_ns
-            is_full = len(stamp_ns) >= STAMP_HISTORY
-            line = None
-            if len(stamp_ns) > MIN_PERIOD_STEPS:
-                # Before it is full, regular stamps only are recognised, by the first ones.
-                line = describe_stamps(stamp_ns if is_full else stamp_ns[: MIN_PERIOD_STEPS + 1])
-            if line is None and not is_full:
-                return []
-            self._is_unclassified = False
-            self._set_line(line)
-            if self._counted_clock is not None:
-                return self._timed_by_clock()
-            buffered = self._buffered
-            self._buffered = None
-            return [self._ordered(buffered)]
-
+            return self._classify(part)
         ready = self._with_times(part)
         if not self._n_since_block:
             self._n_since_review = (self._n_since_review + 1) % BLOCKS_PER_REVIEW
@@ -702,6 +690,28 @@ class SampleTimes:
             if is_due:
                 ready += self._set_line(describe_stamps(self._stamps_ns))
         return ready
+
+    def _classify(self, part: ImuSamples) -> list:
+        """
+        Buffer the first samples until the use of their stamps is known, then return them.
+
+        Regular stamps are recognised by the first few, others by `STAMP_HISTORY` samples.
+        """
+        self._buffered = part.after(self._buffered)
+        stamp_ns = self._buffered.stamp_ns
+        is_full = len(stamp_ns) >= STAMP_HISTORY
+        line = None
+        if len(stamp_ns) > MIN_PERIOD_STEPS:
+            line = describe_stamps(stamp_ns if is_full else stamp_ns[: MIN_PERIOD_STEPS + 1])
+        if line is None and not is_full:
+            return []
+        self._is_unclassified = False
+        self._set_line(line)
+        if self._counted_clock is not None:
+            return self._timed_by_clock()
+        buffered = self._buffered
+        self._buffered = None
+        return [self._ordered(buffered)]
 
     def _with_times(self, part: ImuSamples) -> list:
         """Return `part` with its stamps, or the samples whose times the clock determines now."""
@@ -751,7 +761,8 @@ class SampleTimes:
         """
         Compute times from now on if stamps are counted according to a line, else use the stamps.
 
-        Return the samples whose times were to be computed with the line before.
+        Return the samples that wait for their times, computed by the clock of the line before; []
+        where this clock continues.
         """
         if line is None:
             return []

@@ -304,7 +304,7 @@ class MotionChunks:
         stop_ns = start_ns + self._chunk_ns
         last_ns = stop_ns + self._margin_ns
 
-        # Phases and quietness of the samples of the chunk and its margins.
+        # 1. Phases and quietness of the samples of the chunk and its margins.
         imu = self._imu.between(first_ns, last_ns)
         time = self._seconds(imu.stamp_ns)
         period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
@@ -321,7 +321,7 @@ class MotionChunks:
             resting=joints.phase == STILL,
         )
 
-        # From here on samples of the chunk only.
+        # 2. From here on samples of the chunk only.
         core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
         imu = imu.select(core)
         joints = joints.select(core)
@@ -333,35 +333,37 @@ class MotionChunks:
         self._previous_ns = int(imu.stamp_ns[-1])
         self._previous_is_lost = bool(is_lost[-1])
 
+        # 3. Motion of the joints, and what effects need of the temperature and the vibration.
+        temperature = self._temperature_at(imu.stamp_ns, last_ns)
         position, joint_rate, acceleration, jerk = self._joint_derivatives(
             joints.level, time, joints.phase, runs
         )
-        temperature = self._temperature_at(imu.stamp_ns, last_ns)
-        vibration = self._vibration.of(period, imu.force_s)
         motion = JointMotion(
             time + self.time_origin,
             position,
             joint_rate,
             acceleration,
             jerk,
-            temperature.branch,
-            vibration,
-            temperature.rate,
+            thermal_branch=temperature.branch,
+            vibration=self._vibration.of(period, imu.force_s),
+            temperature_rate=temperature.rate,
         )
         samples = PhasedSamples(
-            imu.stamp_ns,
-            imu.force_s,
-            imu.rate_s,
-            motion,
-            temperature.temperature_c,
-            joints.phase,
-            quiet[core],
-            after_gap,
-            after_loss,
-            joints.step,
-            imu.corrected,
-            imu.absent,
+            stamp_ns=imu.stamp_ns,
+            force_s=imu.force_s,
+            rate_s=imu.rate_s,
+            motion=motion,
+            temperature_c=temperature.temperature_c,
+            phase=joints.phase,
+            quiet=quiet[core],
+            after_gap=after_gap,
+            after_loss=after_loss,
+            joint_step=joints.step,
+            corrected=imu.corrected,
+            absent=imu.absent,
         )
+
+        # 4. Samples without joints are dropped and counted.
         if not is_lost.any():
             return samples
         is_edge = self._at_edge(imu.stamp_ns, longest_step, final)

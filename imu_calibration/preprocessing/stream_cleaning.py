@@ -233,6 +233,7 @@ class StreamCheck:
         self._possible_stray = None
         if not len(samples):
             return samples
+        # `stamps`: of the samples, after the one before them if there is one.
         if self._stamp_before_ns is None:
             stamps = samples.stamp_ns
             is_stray = _strays(stamps)
@@ -242,7 +243,7 @@ class StreamCheck:
             stamps = np.append(self._stamp_before_ns, samples.stamp_ns)
             is_stray = _strays(stamps)[1:]
 
-        # The last sample has no later neighbour yet.
+        # The last sample has no later neighbour yet: it waits if it is far from the one before.
         if len(stamps) == 1 or abs(stamps[-1] - stamps[-2]) > BACKWARD_RESET_NS:
             n_decided = len(samples) - 1
             self._possible_stray = samples.select(slice(n_decided, None))

@@ -1,6 +1,7 @@
 """State of the streams of a live session from header stamps: rates, silence, dropped samples."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -115,7 +116,7 @@ class StreamWatch:
             self._lost_at = now
         self._lost = lost
 
-    def _apart_for(self, lead, now):
+    def _apart_for(self, lead: float, now: float) -> float:
         """
         Return the time for which the stamps of the streams have differed, s.
 
@@ -158,7 +159,7 @@ class StreamWatch:
         word, text = self._health(silent, now, stamping)
         return StreamState(word, text, values, silent, coming, unusable, stamping)
 
-    def _recent_losses(self, now, beginning=''):
+    def _recent_losses(self, now: float, beginning: str = '') -> str:
         """Return the recently dropped samples, of reasons with a beginning, in words; or ''."""
         if self._lost_at is None or now - self._lost_at >= RECENT_SECONDS:
             return ''
@@ -168,7 +169,9 @@ class StreamWatch:
             if reason.startswith(beginning)
         )
 
-    def _health(self, silent, now, stamping):
+    def _health(
+        self, silent: Sequence[str], now: float, stamping: StampLine | None
+    ) -> tuple[StreamHealth, str]:
         """Return the `StreamHealth` and the line that describes it; `silent`: silent streams."""
         if silent:
             missing = ' and no '.join(MESSAGES[name] for name in silent)

@@ -138,8 +138,9 @@ def two_clusters(outputs: np.ndarray) -> np.ndarray:
     changes = (upper[:, 1:] != upper[:, :-1]).sum(axis=1)
     separate &= changes >= LEAST_CLUSTER
 
-    # All outputs of a sample belong to one sensor: labels agree with the ones of the first separate
-    # output, except for their sign.
+    # All outputs of a sample belong to one sensor: each output divides the samples of a run as the
+    # first separate output does, with equal or exchanged clusters. Shape of `label`: (n, n_samples,
+    # 1).
     reference = np.argmax(separate, axis=1)[:, None, None]
     label = np.take_along_axis(
         upper, np.broadcast_to(reference, (len(upper), upper.shape[1], 1)), axis=2

@@ -10,6 +10,7 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import (
     SI_ACCELEROMETER,
+    SI_UNITS,
     UNIT_SIZES,
     RawReadings,
     SensorUnit,
@@ -23,7 +24,7 @@ from imu_calibration.core.units import (
     significant,
     unit_of_rest,
 )
-from imu_calibration.preprocessing.full_scale import FACTORS, Turning, nearest_power
+from imu_calibration.preprocessing.full_scale import FACTORS, Extremes, Turning, nearest_power
 from imu_calibration.preprocessing.on_table import MIN_MATCH, match_axes
 from imu_calibration.preprocessing.recording_evidence import (
     GOOD,
@@ -35,8 +36,6 @@ from imu_calibration.preprocessing.recording_evidence import (
 )
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
-CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
-"""Sensor, its columns in (force x, y, z, rate x, y, z), and their SI unit."""
 GRAVITY_SHARE = 0.02
 """Share by which gravity at rest may differ from the local one."""
 LINEAR = 0.8
@@ -131,7 +130,7 @@ def force_error(
             f' {where} is {raw_length:.4g}: '
         )
         remedy = 'give the recording that the unit belongs to'
-    # Unit in which the readings have the length of gravity; '' for none, and for m/s^2.
+    # 1. A unit in which the readings have the length of gravity; '' for none, and for m/s^2.
     unit = unit_of_rest(raw_length)
     if not stated.is_si and _is_force(raw_length):
         unit = unit or 'm/s^2'
@@ -144,6 +143,7 @@ def force_error(
             code='force_unit',
             value=unit,
         )
+    # 2. Increments over one sample, which have the length of gravity per second.
     gravity_ratio = length * per_second / STANDARD_GRAVITY
     if is_wrong and stated.is_si and abs(gravity_ratio - 1.0) < INCREMENT_AGREEMENT:
         return InputError(
@@ -153,6 +153,7 @@ def force_error(
             code='increments',
             value=f'{per_second:.4g}',
         )
+    # 3. Hardly any force at rest, then any other length that is not gravity.
     if length < LINEAR:
         return InputError(
             f'{requirement}it is probably acceleration without gravity, as phones compute it;'
@@ -198,9 +199,15 @@ def increments_error(per_second: float, readings: RawReadings) -> InputError | N
 
 def samples_per_second(stamp_ns: np.ndarray) -> float:
     """Return one over the median step between stamps, (n,), Hz; 0 where none advances."""
-    steps = np.diff(stamp_ns)
+    step_ns = median_step(stamp_ns)
+    return 1e9 / step_ns if step_ns else 0.0
+
+
+def median_step(values: np.ndarray) -> float:
+    """Return the median of the positive steps from value to value, shape (n,); 0.0 without any."""
+    steps = np.diff(values)
     steps = steps[steps > 0]
-    return 1e9 / float(np.median(steps)) if len(steps) else 0.0
+    return float(np.median(steps)) if len(steps) else 0.0
 
 
 def refuse_units(imu: ImuSamples, readings: RawReadings = RawReadings()) -> None:
@@ -278,16 +285,19 @@ def _unit_by_turns(evidence: RecordingEvidence, turning: Turning) -> Iterator[Ch
     elif scale_range(ratio) is IMPOSSIBLE:
         yield wrong_rate_unit(f'{observed}counts or volts?; {convert}')
     else:
+        axes = _axes(turning.axes)
+        about = f' about {axes}' if axes else ''
         yield CheckFinding(
             'rate_unit',
             GOOD,
-            f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}',
+            f'angular rate in rad/s: gravity rotates according to the rates{about}',
         )
 
 
-def _unit_of_ratio(ratio):
+def _unit_of_ratio(ratio: float) -> str:
     """Return the unit of rates that are `ratio` times the true ones in rad/s; '' for none."""
     for unit, size in UNIT_SIZES['gyroscope'].items():
+        # The turns of gravity give the ratio to a few tenths; units differ by more.
         if 0.6 < ratio * size < 1.6:
             return unit
     return ''
@@ -307,24 +317,17 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     )
     if scale_range(factor) is not USUAL:
         observed += ': is their unit right? If it is'
+    cause = 'the scale of the driver is wrong; correct it, or check that the IMU was at rest'
     if abs(np.log2(factor)) % 1 == 0:
-        yield CheckFinding(
-            'full_scale',
-            WARNING,
-            f'{observed}, the driver converts for {factor:.3g} times the full-scale range that is'
+        cause = (
+            f'the driver converts for {factor:.3g} times the full-scale range that is'
             ' set; correct its setting (a calibration would include the factor in the matrix, and'
-            ' be wrong after the correction)',
+            ' be wrong after the correction)'
         )
-    else:
-        yield CheckFinding(
-            'full_scale',
-            WARNING,
-            f'{observed}, the scale of the driver is wrong; correct it, or check that the IMU was'
-            ' at rest',
-        )
+    yield CheckFinding('full_scale', WARNING, f'{observed}, {cause}')
 
 
-def _full_scale_factor(evidence):
+def _full_scale_factor(evidence: RecordingEvidence) -> float | None:
     """
     Return measured over true rates if a wrong full-scale range may explain the ratio, else None.
     """
@@ -335,9 +338,10 @@ def _full_scale_factor(evidence):
         factor = nearest_power(1.0 / evidence.turning.factor)
         if np.log2(factor) % 1 != 0:
             return None
-    if factor is None or factor == 1.0 or not FACTORS[0] < factor < FACTORS[-1]:
+    if factor is None or factor == 1.0:
         return None
-    return factor
+    # A factor at or beyond the ends of the tested ones is that of another unit.
+    return factor if FACTORS[0] < factor < FACTORS[-1] else None
 
 
 def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -352,20 +356,18 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 'handedness', GOOD, 'accelerometer and gyroscope share right-handed axes'
             )
         return
-    exchanges = ', '.join(
-        f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's"
-        f' {"xyz"[i]}'
-        for i, j, sign in match.exchanges(turning.seen)
-    )
+    phrases = []
+    for i, j, sign in match.exchanges(turning.seen):
+        minus = 'minus ' if sign < 0 else ''
+        phrases.append(f"the gyroscope's {'xyz'[j]} is {minus}the accelerometer's {'xyz'[i]}")
+    exchanges = ', '.join(phrases)
     if not exchanges or match.agreement < MIN_MATCH:
         exchanges = 'no exchange of axes makes them fit'
-    kinds = {
-        (True, False): 'one is turned against the other',
-        (False, True): 'one of them is left-handed',
-    }
-    kind = kinds.get(
-        (match.turned, match.mirrored), 'turned or left-handed, not separable in this recording'
-    )
+    kind = 'turned or left-handed, not separable in this recording'
+    if not match.mirrored:
+        kind = 'one is turned against the other'
+    elif not match.turned:
+        kind = 'one of them is left-handed'
     yield CheckFinding(
         'handedness',
         REFUSE,
@@ -381,23 +383,8 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
     The finding of a sensor has the number of clipped readings of each axis, at both ends together.
     """
-    for sensor, part, unit in CHANNELS:
-        has_noise = evidence.quiet_range[part] > VISIBLE_NOISE_STEPS * evidence.resolution[part]
-        least_end = _least_end(evidence, sensor, has_noise)
-        # The reading that the sensor repeats in each frozen chunk, shape (n_frozen_chunks, 3).
-        frozen_readings = evidence.chunks.mean[evidence.frozen[sensor], part]
-        n_of_axes = np.zeros(3, int)
-        range_end = 0.0
-        for axis, ends in enumerate(evidence.ends[part]):
-            # The largest readings upwards, and those downwards with the other sign.
-            for sign, end in zip((1, -1), ends):
-                # Without visible noise the largest reading must have been reached by large steps.
-                if end.level <= least_end[axis] or not (has_noise[axis] or end.jumped):
-                    continue
-                n_clipped = _n_clipped(end, sign * frozen_readings[:, axis], evidence.chunks.size)
-                if n_clipped:
-                    n_of_axes[axis] += n_clipped
-                    range_end = max(range_end, end.level)
+    for sensor, unit in SI_UNITS.items():
+        n_of_axes, range_end = _clipped_readings(evidence, sensor)
         if n_of_axes.any():
             listed = ', '.join(f'{axis} {n}' for axis, n in zip('xyz', n_of_axes, strict=True) if n)
             customary = f' ({range_end / STANDARD_GRAVITY:.1f} g)'
@@ -413,7 +400,33 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             )
 
 
-def _least_end(evidence, sensor, has_noise):
+def _clipped_readings(evidence: RecordingEvidence, sensor: str) -> tuple[np.ndarray, float]:
+    """
+    Return the number of clipped readings of each axis, shape (3,), and the end of their range.
+
+    The end is 0 without any.
+    """
+    part = SENSOR_COLUMNS[sensor]
+    has_noise = evidence.quiet_range[part] > VISIBLE_NOISE_STEPS * evidence.resolution[part]
+    least_end = _least_end(evidence, sensor, has_noise)
+    # The reading that the sensor repeats in each frozen chunk, shape (n_frozen_chunks, 3).
+    frozen_readings = evidence.chunks.mean[evidence.frozen[sensor], part]
+    n_of_axes = np.zeros(3, int)
+    range_end = 0.0
+    for axis, ends in enumerate(evidence.ends[part]):
+        # The largest readings upwards, and those downwards with the other sign.
+        for sign, end in zip((1, -1), ends):
+            # Without visible noise the largest reading must have been reached by large steps.
+            if end.level <= least_end[axis] or not (has_noise[axis] or end.jumped):
+                continue
+            n_clipped = _n_clipped(end, sign * frozen_readings[:, axis], evidence.chunks.size)
+            if n_clipped:
+                n_of_axes[axis] += n_clipped
+                range_end = max(range_end, end.level)
+    return n_of_axes, range_end
+
+
+def _least_end(evidence: RecordingEvidence, sensor: str, has_noise: np.ndarray) -> np.ndarray:
     """
     Return the reading of each axis above which its range may end, m/s^2 or rad/s, shape (3,).
 
@@ -426,7 +439,7 @@ def _least_end(evidence, sensor, has_noise):
     return np.where(has_noise, least_end, LEAST_END_PER_GRAVITY * rest_force)
 
 
-def _n_clipped(end, frozen_readings, chunk_size):
+def _n_clipped(end: Extremes, frozen_readings: np.ndarray, chunk_size: int) -> int:
     """
     Return how many readings of an axis are clipped at an end of its range.
 
@@ -449,7 +462,7 @@ def _n_clipped(end, frozen_readings, chunk_size):
     return end.n_clipped if not n_frozen or end.n_clipped > n_frozen + 2 * chunk_size else 0
 
 
-def _is_force(length):
+def _is_force(length: float) -> bool:
     """Return whether a length can be that of gravity in m/s^2."""
     return scale_range(length / STANDARD_GRAVITY) is not IMPOSSIBLE
 
@@ -461,7 +474,7 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         # With few attitudes, a steady spin about the vertical is not distinguishable from rest
         return
     biases = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
-    for sensor, _, unit in CHANNELS:
+    for sensor, unit in SI_UNITS.items():
         size = float(np.linalg.norm(biases[sensor]))
         if size > MOST_BIAS[sensor]:
             customary = f'{size / DEG:.0f} deg/s'
@@ -523,8 +536,10 @@ def dead_band(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every message carries a new measurement."""
+    # Samples while both sensors are frozen repeat readings too, and are reported by `frozen`.
     n_frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
     share = (evidence.n_repeated - n_frozen) / max(evidence.n_samples, 1)
+    # Without noise a sensor repeats its readings at rest.
     has_noise = True
     for sensor, part in SENSOR_COLUMNS.items():
         if sensor not in evidence.absent:
@@ -543,7 +558,7 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The step of the converter is finer than the noise."""
     if evidence.rest is None:
         return
-    for sensor, part, unit in CHANNELS:
+    for sensor, part in SENSOR_COLUMNS.items():
         step = evidence.resolution[part]
         extent = evidence.rest.range[part]
         # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
@@ -552,7 +567,7 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         if coarse.any():
             size = step[coarse].max()
             customary = f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
-            if unit == 'rad/s':
+            if sensor == 'gyroscope':
                 customary = f'{size / DEG:.2g} deg/s'
             yield CheckFinding(
                 'resolution',
@@ -583,11 +598,6 @@ def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         )
 
 
-def _axes(flags):
+def _axes(flags: np.ndarray) -> str:
     """Return the letters of the axes with a true flag, shape (3,)."""
     return ', '.join(np.array(list('xyz'))[np.asarray(flags, bool)])
-
-
-def _about(flags):
-    """Return ' about x, y' for the axes with a true flag; '' for none."""
-    return f' about {_axes(flags)}' if np.any(flags) else ''

@@ -303,7 +303,7 @@ def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | No
     return *joined_motion(windows), np.concatenate(rows)
 
 
-def _mean_motion(motion):
+def _mean_motion(motion: JointMotion) -> JointMotion:
     """
     Return the motion of a rest in one row: mean position, and slope where it is significant.
 
@@ -317,21 +317,24 @@ def _mean_motion(motion):
     slope = time @ position / max(time @ time, 1e-12)
     scatter = (position - time[:, None] * slope).std(axis=0)
     distance = np.abs(slope) * (time[-1] - time[0])
-    # One encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no
-    # creep.
+    # Creep is a distance of more than 8 sds: one encoder step in mid-window, which is no creep, has
+    # a distance of 1.5 steps and a scatter of a quarter of a step. Below 1e-6 it is rounding.
     slope = np.where((distance > 8 * scatter) & (distance > 1e-6), slope, 0.0)
     zero = np.zeros((1, len(mean)))
-    branch = motion.thermal_branch
-    temperature_rate = motion.temperature_rate
+
+    def mean_row(values: np.ndarray | None) -> np.ndarray | None:
+        """Return the mean of rows as one row; None for unknown ones."""
+        return None if values is None else values.mean(axis=0, keepdims=True)
+
     return JointMotion(
         motion.time.mean(keepdims=True),
         mean[None],
         slope[None],
         zero,
         zero,
-        None if branch is None else branch.mean(keepdims=True),
-        motion.vibration.mean(axis=0, keepdims=True),
-        None if temperature_rate is None else temperature_rate.mean(keepdims=True),
+        mean_row(motion.thermal_branch),
+        mean_row(motion.vibration),
+        mean_row(motion.temperature_rate),
     )
 
 

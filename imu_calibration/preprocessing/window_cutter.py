@@ -94,13 +94,13 @@ def joint_phases(
     if still.any():
         long_half = _half_width(min(LONGEST_SPAN, settings.static_minimum), period, half)
         long_lines = _LineFits.of(time, rows, long_half)
-        still &= _widened(
-            _is_slow(long_lines, settings.static_rate, period, step, noise), long_lines.half
-        )
+        is_slow = _is_slow(long_lines, settings.static_rate, period, step, noise)
+        still &= any_within(is_slow, long_half, long_half)
     if still.all():
         return np.full(len(time), STILL, np.int8), level
 
-    # Turn at a constant rate. In motion the steps of the encoders are noise too.
+    # Turn at a constant rate. In motion the steps of the encoders are noise too, and white noise is
+    # that of the readings in motion.
     noise = np.maximum(
         np.maximum(noise, step / np.sqrt(12)), _white_noise(rows, 0.5, ~still)[:, None]
     )
@@ -143,11 +143,6 @@ def _slope_gain(half: int, period: float) -> float:
     """Return the sd of a slope over ``2 half + 1`` readings for noise of one, 1/s."""
     n = 2 * half + 1
     return np.sqrt(12 / n) / (n * period)
-
-
-def _widened(mask: np.ndarray, half: int) -> np.ndarray:
-    """Return a mask of the readings with a marked one within `half` readings."""
-    return any_within(mask, half, half)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,16 +224,19 @@ def _is_steady(
     change = np.maximum(settings.spin_rate_variation * np.abs(high + low) / 2, settings.static_rate)
     is_constant = high - low <= change + 2 * slope_error
 
-    # A rate that swings by `change` within the span of a line moves the readings by `swing`.
+    # A rate that swings by `change` within the span of a line moves the readings by `swing`, which
+    # is allowed in addition to the noise.
     swing = change * RATE_SPAN / (2 * np.pi)
     mean_square = uniform_filter1d(lines.residual**2, 2 * lines.half + 1, axis=1, mode='nearest')
     rms = np.sqrt(np.maximum(mean_square, 0.0))
     is_even = maximum_filter1d(rms - swing, size, axis=1, mode='nearest') <= 3 * noise
-    return _widened(np.all(is_constant & is_even, axis=0), half)
+    return any_within(np.all(is_constant & is_even, axis=0), half, half)
 
 
 def _window_sums(rows: np.ndarray, half: int) -> np.ndarray:
     """Return the sums of each row over ``2 half + 1`` values about each one, fewer at the ends."""
+    # Running sums, with zeros before the first value and the total after the last one, so that the
+    # sum about value k is sums[k + 2 half + 1] - sums[k].
     n = rows.shape[1]
     sums = np.empty((len(rows), n + 2 * half + 1))
     sums[:, : half + 1] = 0.0
@@ -503,6 +501,7 @@ class WindowCutter:
 
         Undecided is a short run at the end, unless the samples are the `final` ones.
         """
+        # Runs of one phase, and the phase before each of them.
         starts, stops = _runs(samples.phase, samples.after_gap).T
         time = samples.time
         settings = self._settings
@@ -518,6 +517,7 @@ class WindowCutter:
             # The samples before belong to the same run, which was long enough.
             if phase_before[k] == run_phase[k]:
                 continue
+            # A steady turn settles after another phase, before its shortest window begins.
             needed = self._short_rest
             if run_phase[k] == STEADY:
                 needed = settings.spin_minimum
@@ -526,6 +526,7 @@ class WindowCutter:
             if time[stop - 1] - time[start] > needed:
                 continue
 
+            # A short run: at the end it is undecided, a steady turn becomes motion.
             is_last = k + 1 == len(starts)
             if is_last and not final:
                 return phase[:start]

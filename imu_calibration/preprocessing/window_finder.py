@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +20,15 @@ from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import QuietFloor
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT, MotionChunks
-from imu_calibration.preprocessing.stream_cleaning import NO_RANGES, STREAMS, BlockCleaner, Watcher
+from imu_calibration.preprocessing.stream_cleaning import (
+    NO_RANGES,
+    STREAMS,
+    BlockCleaner,
+    CleanedBlock,
+    Watcher,
+)
 from imu_calibration.preprocessing.window import (
+    PhasedSamples,
     UnusedReason,
     Window,
     WindowKind,
@@ -133,7 +141,7 @@ class MotionGatherer:
             windows += self._next_epoch() + self._work()
         return windows + self._end_epoch() + self._cutter.push(None, final=True)
 
-    def _has_later_epoch(self):
+    def _has_later_epoch(self) -> bool:
         """Return whether samples of a later epoch are in a queue."""
         queued = chain.from_iterable(self._queue.values())
         return any(epoch > self._epoch for epoch, _ in queued)
@@ -164,7 +172,7 @@ class MotionGatherer:
             windows += self.push(block)
         return windows + self.finish()
 
-    def _enqueue(self, cleaned):
+    def _enqueue(self, cleaned: CleanedBlock) -> None:
         """Append cleaned samples to the queues of their streams."""
         for name in STREAMS:
             for epoch, samples in getattr(cleaned, name):
@@ -172,7 +180,7 @@ class MotionGatherer:
                     samples = self._turns.unwrap(samples)
                 self._queue[name].append((epoch + self._epoch_shift[name], samples))
 
-    def _work(self):
+    def _work(self) -> list[Window]:
         """
         Return the windows that the queued samples of this epoch complete.
 
@@ -181,13 +189,7 @@ class MotionGatherer:
         windows = []
         while True:
             for name in STREAMS:
-                for epoch, part in self._queue[name]:
-                    if epoch == self._epoch:
-                        self._chunks.add(**{name: part})
-                # Samples of an earlier epoch are dropped: temperatures that arrived after its end.
-                self._queue[name] = [
-                    (epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch
-                ]
+                self._add_queued(name)
             windows += self._cut(self._chunks.take())
             if not self._epoch_is_over():
                 # Temperatures of an epoch that the other streams do not begin are bounded.
@@ -197,7 +199,21 @@ class MotionGatherer:
                 return windows
             windows += self._next_epoch()
 
-    def _epoch_is_over(self):
+    def _add_queued(self, stream: str) -> None:
+        """
+        Add the queued samples of this epoch to its chunks; those of later epochs remain queued.
+
+        Samples of an earlier epoch are dropped: temperatures that arrived after its end.
+        """
+        later = []
+        for epoch, part in self._queue[stream]:
+            if epoch == self._epoch:
+                self._chunks.add(**{stream: part})
+            elif epoch > self._epoch:
+                later.append((epoch, part))
+        self._queue[stream] = later
+
+    def _epoch_is_over(self) -> bool:
         """
         Return whether the clocks of IMU and joints were both reset, or one of them for good.
 
@@ -206,7 +222,7 @@ class MotionGatherer:
         queues = [self._queue['imu'], self._queue['joints']]
         return all(queues) or any(queue and _span(queue) > JOINT_WAIT for queue in queues)
 
-    def _next_epoch(self):
+    def _next_epoch(self) -> list[Window]:
         """Return the remaining windows of this epoch, and begin the next one."""
         windows = self._end_epoch()
         old = self._chunks
@@ -218,7 +234,7 @@ class MotionGatherer:
             self._continue_streams(old)
         return windows
 
-    def _continue_streams(self, old):
+    def _continue_streams(self, old: MotionChunks) -> None:
         """
         Move the streams whose clocks were not reset to the new epoch.
 
@@ -230,11 +246,11 @@ class MotionGatherer:
             if not self._queue[name]:
                 self._epoch_shift[name] = self._epoch - self.cleaner.epoch(name)
 
-    def _end_epoch(self):
+    def _end_epoch(self) -> list[Window]:
         """Return the windows of all remaining chunks of this epoch."""
         return self._cut(self._chunks.take(final=True))
 
-    def _cut(self, chunks):
+    def _cut(self, chunks: Iterable[PhasedSamples]) -> list[Window]:
         """Return the windows that are complete with these `PhasedSamples`."""
         windows = []
         for chunk in chunks:
@@ -245,19 +261,20 @@ class MotionGatherer:
 class _Unwrapper:
     """Removes jumps of joint angles by full turns, sample by sample."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         # Last position as read, rad, shape (1, n_joints); None before the first.
-        self._last_position = None
+        self._last_position: np.ndarray | None = None
         # Full turns that are subtracted from it, shape (n_joints,).
-        self._turns = 0
+        self._turns: Any = 0
 
-    def unwrap(self, joints):
+    def unwrap(self, joints: JointSamples) -> JointSamples:
         """Return the joints without jumps of more than half a turn."""
         if not len(joints):
             return joints
         before = joints.position[:1] if self._last_position is None else self._last_position
         step = np.diff(np.concatenate([before, joints.position]), axis=0)
         self._last_position = joints.position[-1:].copy()
+        # Turns of each reading: those before, and the steps rounded to full turns, (n, n_joints).
         turns = self._turns + np.cumsum(np.rint(step / (2 * np.pi)).astype(np.int64), axis=0)
         self._turns = turns[-1]
         if not turns.any():
@@ -267,7 +284,7 @@ class _Unwrapper:
         )
 
 
-def _span(queue):
+def _span(queue: list[tuple[int, Any]]) -> float:
     """Return the time from the first to the last sample in a queue, s."""
     first = queue[0][1].stamp_ns[0]
     last = queue[-1][1].stamp_ns[-1]

@@ -60,7 +60,7 @@ class WrapFilter:
         """Samples removed so far."""
         self._begin()
 
-    def _begin(self):
+    def _begin(self) -> None:
         """Begin a stream."""
         # The newest samples: decided ones, which are neighbours, and then those without a decision.
         self._newest: ImuSamples | None = None
@@ -91,11 +91,12 @@ class WrapFilter:
         self._begin()
         return passed
 
-    def _pass_on(self, stop, spans):
+    def _pass_on(self, stop: int, spans: list[WrappedSpan]) -> list[ImuSamples]:
         """Return the undecided samples before row `stop` that are outside of all spans."""
         if stop <= self._n_decided:
             return []
         assert self._newest is not None
+        # 1. Decide: without the spans and the margins after them.
         part = self._newest.select(slice(self._n_decided, stop))
         wrapped = part.stamp_ns <= self._until_ns
         for span in spans:
@@ -107,7 +108,8 @@ class WrapFilter:
             self._until_ns = max(self._until_ns, until_ns)
             self._returned_ns[span.column] = span.return_ns
         self.dropped += int(np.count_nonzero(wrapped))
-        # Drop decided samples that are no neighbours of later ones.
+        # 2. Drop decided samples that are no neighbours of later ones. Their largest readings are
+        #    needed further.
         first = max(stop - KEPT_NEIGHBOURS, 0)
         if first:
             dropped = self._newest.select(slice(0, first))
@@ -118,7 +120,7 @@ class WrapFilter:
             return []
         return [part.select(~wrapped) if wrapped.any() else part]
 
-    def _spans(self, samples):
+    def _spans(self, samples: ImuSamples) -> tuple[list[WrappedSpan], int | None]:
         """
         Return the list of `WrappedSpan`, and the stamp of the first step that may still return, ns.
         """
@@ -139,7 +141,7 @@ class WrapFilter:
         return spans, min(open_steps, default=None)
 
 
-def _returns(stamp_ns, up):
+def _returns(stamp_ns: np.ndarray, up: np.ndarray) -> tuple[list[tuple[int, int]], int | None]:
     """
     Return the stamps (step, opposite step) of one column, ns; and that of a last single step.
 
