@@ -99,8 +99,10 @@ class AllanSums:
             return
         present = np.ones(len(values), bool) if present is None else present
         if self._offset is None:
+            # The stretch begins with a sample that is present.
             if not present.any():
                 return
+            # The level of its first samples, a thousand at most.
             self._offset = values[present][:1000].mean(axis=0)
         self._length += len(values)
         rows = np.ascontiguousarray((values - self._offset).T)
@@ -109,6 +111,7 @@ class AllanSums:
         for k, level in enumerate(self._levels):
             if k:
                 rows, counts = level.halved(rows, counts)
+            # No pair is complete: nothing new for this rate and all lower ones.
             if not rows.shape[1]:
                 return
             level.push(rows, counts, 2.0**k, self.squares, self.terms)
@@ -197,14 +200,29 @@ class _Level:
         Add the second differences that end in the new samples to `squares` and `terms`.
 
         With the cumulative sums S, m times the difference of means that ends in sample k is ``S(k)
-        - 2 S(k - m) + S(k - 2 m)``. Each new sample is the sum of `size` original ones.
+        - 2 S(k - m) + S(k - 2 m)``.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (n_columns, n)
+            New samples of this rate, zero where missing; each is a sum of `size` original ones.
+        counts : ndarray, shape (n,)
+            Share of each sample that is present.
+        size : float
+        squares : ndarray, shape (n_scales, n_columns)
+            Sums of `AllanSums`, changed in place.
+        terms : ndarray, shape (n_scales,)
+            Numbers of `AllanSums`, changed in place.
+
         """
+        # Column k of the sums includes k samples; the new ones begin at column `n_before`.
         n_before = self.sums.shape[1]
         self.sums = np.concatenate([self.sums, self.sums[:, -1:] + np.cumsum(rows, axis=1)], axis=1)
         self.counts = np.concatenate([self.counts, self.counts[-1] + np.cumsum(counts)])
         end = self.sums.shape[1]
         all_present = self.counts[-1] - self.counts[0] == len(self.counts) - 1
         for row, m in zip(self.index, self.factors):
+            # The first new sample with 2 m samples up to it.
             first = max(n_before, 2 * m)
             if first >= end:
                 continue
@@ -282,6 +300,7 @@ class SampleGrid:
         before = stamp_ns[0] - round(self._period_ns) if self._last_ns is None else self._last_ns
         step = np.diff(stamp_ns, prepend=before) / self._period_ns
         self._last_ns = int(stamp_ns[-1])
+        # Steps of a clock: long ones have lost samples. Otherwise losses delay all later stamps.
         if np.median(np.abs(step - 1.0)) <= MAX_STEP_JITTER:
             return np.maximum(np.rint(step), 1).astype(np.int64)
         return 1 + _n_lost(step)
@@ -307,6 +326,7 @@ def _n_lost(step: np.ndarray) -> np.ndarray:
         return lost
     delay = np.cumsum(step - 1.0)
     median_delay = np.median(delay[: n_windows * size].reshape(n_windows, size), axis=1)
+    # Nearly a whole period later from one window to the next: less is jitter.
     for k in np.flatnonzero(np.diff(median_delay) > 0.75):
         first = k * size
         longest = first + int(np.argmax(step[first : first + 2 * size]))
@@ -417,9 +437,10 @@ class RestReader:
         The sinks `detrended` receive the samples without trends, `raw` the samples with trends.
         """
         outliers = RestOutliers()
-        for (epoch, _), pieces in groupby(self._pieces(outliers), key=itemgetter(0, 1)):
+        # All pieces of a part at rest follow each other.
+        for (epoch, _), pieces in groupby(self._pieces(outliers), key=itemgetter(0)):
             grid = SampleGrid(self.period)
-            for *_, imu in pieces:
+            for _, imu in pieces:
                 values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
                 steps = grid.steps(imu.stamp_ns)
                 trend = self.detrending.at(self.time_of(epoch, imu.stamp_ns))
@@ -432,8 +453,8 @@ class RestReader:
                 sink.end_stretch()
         return outliers
 
-    def _pieces(self, outliers: RestOutliers) -> Iterator[tuple[int, int, ImuSamples]]:
-        """Yield (epoch, number of the part, accepted samples of the part in the next block)."""
+    def _pieces(self, outliers: RestOutliers) -> Iterator[tuple[tuple[int, int], ImuSamples]]:
+        """Yield ((epoch, number of a part), accepted samples of the part in the next block)."""
         bounds = []  # ns, shape (n_parts, 2) for each epoch
         for parts in self.parts:
             ends = [(part.first_ns, part.end_ns) for part in parts]
@@ -444,7 +465,7 @@ class RestReader:
                 rows_of_parts = np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()
                 for number, (first, last) in enumerate(rows_of_parts):
                     if last > first:
-                        yield epoch, number, imu.select(slice(first, last))
+                        yield (epoch, number), imu.select(slice(first, last))
 
     def curve(self) -> AllanCurve:
         """Return the Allan variances of the parts, at averaging times with at least one term."""
@@ -452,19 +473,23 @@ class RestReader:
         factors = averaging_factors(round(longest / self.period))
         detrended = AllanSums(factors, 6)
         faults = FaultSearch()
-        raw = AllanSums(factors, 6) if any(self.detrending.trends) else None
-        outliers = self.read(detrended, raw=(faults,) if raw is None else (raw, faults))
+        raw = detrended
+        raw_sinks: list[Sink] = [faults]
+        if any(self.detrending.trends):
+            raw = AllanSums(factors, 6)
+            raw_sinks.append(raw)
+        outliers = self.read(detrended, raw=raw_sinks)
         usable = detrended.terms > 0
         variance, terms = detrended.by_stretch()
         variance = variance[:, usable]
         terms = terms[:, usable]
         parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
         return AllanCurve(
-            self.period,
-            detrended.factors[usable],
-            detrended.variance()[usable],
-            (raw or detrended).variance()[usable],
-            tuple(detrended.lengths),
-            parts,
-            faults.result(outliers.share),
+            period=self.period,
+            factors=detrended.factors[usable],
+            variance=detrended.variance()[usable],
+            raw=raw.variance()[usable],
+            lengths=tuple(detrended.lengths),
+            parts=parts,
+            faults=faults.result(outliers.share),
         )

@@ -317,16 +317,18 @@ def _axis(section: Mapping[str, Any], k: int, deviation: Sequence[float]) -> Axi
         if name in terms and terms[name].status != DETERMINED:
             record_for[name] = values[k]
 
+    # Parts that a document may omit.
     oscillation = (section.get('oscillation') or [None] * 3)[k]
+    scatter = (section.get('scatter_between_rests') or [0.0] * 3)[k]
     return AxisFigures(
         terms,
         tuple(form),
-        tuple(tuple(other) for other in section['also_possible'][k]),
-        _terms(section.get('alternatives') or {}, k),
-        float(section['shortest_averaging_time'][k]),
-        float(section['excess'][k]),
-        None if oscillation is None else (float(oscillation[0]), float(oscillation[1])),
-        float((section.get('scatter_between_rests') or [0.0] * 3)[k]),
+        others=tuple(tuple(other) for other in section['also_possible'][k]),
+        alternatives=_terms(section.get('alternatives') or {}, k),
+        shortest=float(section['shortest_averaging_time'][k]),
+        excess=float(section['excess'][k]),
+        oscillation=None if oscillation is None else (float(oscillation[0]), float(oscillation[1])),
+        scatter=float(scatter),
         trends=tuple(trends),
         record_for=record_for,
         sample_sd=float(section['sample_sd'][k]),
@@ -347,6 +349,7 @@ def _term(name: str, entry: Mapping[str, Any], k: int) -> Term:
     """Return the figure of axis k in an entry of `_entry`; raises DocumentError."""
     value = entry['value'][k]
     status = entry['status'][k]
+    # An end without a number is infinite: `_entry` writes null for it.
     lower, upper = entry['interval95'][k]
     interval = (math.inf if lower is None else lower, math.inf if upper is None else upper)
     if status is None or interval[0] > interval[1]:
@@ -416,7 +419,12 @@ def position_sd(
     """
     Return the standard deviation of the position by each process of one axis, m.
 
-    Shape (n_processes,).
+    Shape (n_processes,). With the means m_k of the sensor's noise over blocks of h seconds, the
+    bias b, which is the mean over the alignment, and the time u_k from the middle of a block to the
+    end of the run::
+
+        accelerometer: position = sum_k u_k h (m_k - b)
+        gyroscope:     position = sum_k g u_k^2 h / 2 (m_k - b)    tilt turns gravity into it
 
     Parameters
     ----------
@@ -433,15 +441,18 @@ def position_sd(
         m/s^2.
 
     """
-    after = int(
+    # Blocks of the run and of the alignment, of the same length.
+    n_run = int(
         np.ceil(min(MAX_RUN_BLOCKS, MAX_NAVIGATION_BLOCKS * seconds / (seconds + alignment)))
     )
-    step = seconds / after
-    before = max(round(alignment / step), 1)
-    until_end = (after - np.arange(after) - 0.5) * step
+    step = seconds / n_run
+    n_alignment = max(round(alignment / step), 1)
+
+    # Weights of the blocks in the position, the alignment first; their sum is zero.
+    until_end = (n_run - np.arange(n_run) - 0.5) * step
     weights = until_end * step if sensor == 'accelerometer' else 0.5 * gravity * until_end**2 * step
-    weights = np.concatenate([np.full(before, -weights.sum() / before), weights])
-    lag = np.arange(before + after) * step
+    weights = np.concatenate([np.full(n_alignment, -weights.sum() / n_alignment), weights])
+    lag = np.arange(n_alignment + n_run) * step
     variances = [
         weights @ toeplitz(mean_covariance(process, lag, step)) @ weights for process in processes
     ]

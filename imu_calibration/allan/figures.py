@@ -61,6 +61,7 @@ class AxisFigures(AxisNoise):
             if term is None or term.value is None:
                 continue
             if name == GAUSS_MARKOV:
+                # A time without a value (in a document only): the shortest that is possible.
                 time = self.terms[TIME_KEY]
                 process = gauss_markov(time.value or time.interval[0])
             else:

@@ -117,6 +117,7 @@ class ToneSearch:
         The test is an F test of one ordinate of the spectrum against the mean of those around it;
         its probability is multiplied by the number of tested frequencies.
         """
+        # Ordinates in the range of the search, each with all its neighbours.
         bins = np.arange(LINE_NEIGHBOUR_BINS, len(self._power) - LINE_NEIGHBOUR_BINS)
         hertz = 1 / (max(self._n_blocks, 1) * self._block_seconds)
         bins = bins[(bins * hertz >= 0.5 * self._frequency) & (bins * hertz <= 2 * self._frequency)]
@@ -125,6 +126,7 @@ class ToneSearch:
         below = np.arange(-LINE_NEIGHBOUR_BINS, -LINE_HALF_BINS)
         above = np.arange(LINE_HALF_BINS + 1, LINE_NEIGHBOUR_BINS + 1)
         offsets = np.concatenate([below, above])
+        # Mean of the neighbours outside the lobe of a line, shape (n_bins,).
         around = self._power[bins[:, None] + offsets].mean(axis=1)
         ratio = self._power[bins] / around
         best = int(np.argmax(ratio))
@@ -134,7 +136,8 @@ class ToneSearch:
         if not f_sf(ratio[best], freedom, freedom_around) * len(bins) < LINE_P_VALUE:
             return None
 
-        # The line is spread over its lobe; means over blocks lower its amplitude by a sinc.
+        # A sine of amplitude a has the sum 1.5 a^2 / 2 over its lobe, in addition to the noise.
+        # Means over blocks of T s lower the amplitude by sin(pi f T) / (pi f T).
         lobe = np.arange(bins[best] - LINE_HALF_BINS, bins[best] + LINE_HALF_BINS + 1)
         power = self._power[lobe]
         frequency = float(power @ lobe / power.sum()) * hertz
@@ -453,7 +456,7 @@ def _without_scatter(curve: AllanCurve, skipped: set[str]) -> dict[str, str]:
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
     """Return the content of noise.yaml: the figures of all axes and the excluded parts."""
     record = result.record
-    times = RecordingTimes(result.record.curve.period)
+    times = RecordingTimes(record.curve.period)
     axes_of_sensor: dict[str, list[AxisFigures]] = {sensor: [] for sensor in SENSORS}
     for number, axis in enumerate(result.axes):
         if axis is None:
@@ -484,11 +487,11 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
     return NoiseFigures(
         tuple(axes_of_sensor['accelerometer']),
         tuple(axes_of_sensor['gyroscope']),
-        1.0 / record.curve.period,
-        record.survey.frame_id,
-        recording,
-        tuple(float(tau) for tau in record.curve.tau),
-        {'software': f'imu_calibration {__version__}'} | (provenance or {}),
+        rate=1.0 / record.curve.period,
+        frame_id=record.survey.frame_id,
+        recording=recording,
+        tau=tuple(float(tau) for tau in record.curve.tau),
+        provenance={'software': f'imu_calibration {__version__}'} | (provenance or {}),
     )
 
 
@@ -523,20 +526,15 @@ def _record_for(axis: AxisNoise, times: RecordingTimes) -> dict[str, float | Non
         is_needed = name in (WHITE.name, RANDOM_WALK.name, *axis.form) and name in PROCESSES
         if not is_needed or term.status == DETERMINED or not np.isfinite(term.interval[1]):
             continue
-        # The fitted model, with this process if it is not part of it.
-        processes = list(axis.fit.processes)
-        coefficients = list(axis.fit.coefficients)
-        if name not in axis.fit.names:
-            processes.insert(0, PROCESSES[name])
-            coefficients.insert(0, 0.0)
-        index = [process.name for process in processes].index(name)
-        coefficients[index] = (term.value or term.interval[1]) ** 2
+        # The fitted model, with this process first if it is not part of it.
+        fitted = dict(zip(axis.fit.processes, axis.fit.coefficients))
+        coefficients = fitted if name in axis.fit.names else {PROCESSES[name]: 0.0} | fitted
+        coefficients[PROCESSES[name]] = (term.value or term.interval[1]) ** 2
         # Processes of zero size have no relative sd.
-        positive = [j for j in range(len(processes)) if coefficients[j] > 0]
+        positive = {process: value for process, value in coefficients.items() if value > 0}
+        processes = tuple(positive)
         needed[name] = times.needed(
-            tuple(processes[j] for j in positive),
-            np.array([coefficients[j] for j in positive]),
-            positive.index(index),
+            processes, np.array(list(positive.values())), processes.index(PROCESSES[name])
         )
     return needed
 
@@ -574,11 +572,11 @@ def _blocks(surveyed: Survey, parts: list[list[StillPart]], clock: _Clock) -> Bl
     times = []
     means = []
     numbers = []  # of the part of each block
-    seconds = 0.0
+    seconds = 0.0  # of a block, by the last epoch with a part; all chunks are about as long
     for epoch, (chunks, parts_of_epoch) in enumerate(zip(surveyed.epochs, parts)):
         for part in parts_of_epoch:
             first = part.chunks.start
-            n_blocks = (part.chunks.stop - first) // size
+            n_blocks = (part.chunks.stop - first) // size  # an incomplete last one is not used
             used = slice(first, first + n_blocks * size)
             middle = chunks.time[used].reshape(n_blocks, size).mean(axis=1)
             times.append(clock.time(epoch, chunks.first_ns + middle * 1e9))

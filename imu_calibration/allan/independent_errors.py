@@ -59,8 +59,11 @@ def excess_of_errors(deviation: np.ndarray, readings_per_mean: int) -> Excess:
     counts = np.histogram(np.abs(deviation) / all_sd, HISTOGRAM_EDGES)[0].astype(float)
     with_errors, without = _log_likelihoods(counts)
     best = float(with_errors.max())
+
+    # The smallest sd that is nearly as likely as the best one, in sds of the readings.
     smallest_noise = float(NOISE_SDS[np.argmax(2.0 * (best - with_errors) <= BOUND)])
     observed = 1.0 / smallest_noise**2
+    # observed = ratio^2 (m - 1) / (m - 2 + ratio^2), of deviations from the mean of a block.
     square = (readings_per_mean - 2) * observed / (readings_per_mean - 1 - observed)
     significance = np.sqrt(max(2.0 * (best - float(without.max())), 0.0))
     return Excess(float(np.sqrt(max(square, 1.0))), float(significance))
@@ -70,21 +73,18 @@ def _log_likelihoods(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the log likelihood of each `NOISE_SDS`, (with the likeliest errors, without errors).
 
-    `counts` are the numbers of readings in the bins of the histogram.
+    `counts` are the numbers of readings in the bins of the histogram. For each sd and each kind of
+    error, Newton's method finds the share p of errors that maximises the sum of ``log((1 - p) f + p
+    h)``, with the probabilities f of a bin without an error and h with one.
     """
-    some = counts > 0
-    counts = counts[some]
-    no_error, changes = (densities[..., some] for densities in _densities())
-    share = np.full(changes.shape[:2], 0.5 * LARGEST_SHARE)
+    occupied = counts > 0
+    counts = counts[occupied]
+    no_error, changes = (probabilities[..., occupied] for probabilities in _densities())
+    share = np.full(changes.shape[:2], 0.5 * LARGEST_SHARE)  # shape (n_noise, n_kinds)
     for _ in range(NEWTON_STEPS):
-        # d/dp of log((1 - p) f + p h) = (h - f) / density
-        slope = share[..., None] * changes
-        slope += no_error[:, None]
-        np.divide(changes, slope, out=slope)
-        gradient = slope @ counts
-        slope *= slope
-        curvature = slope @ counts
-        share = np.clip(share + gradient / curvature, 0.0, LARGEST_SHARE)
+        # First derivative (h - f) / density of the logarithm; the second is minus its square.
+        slope = changes / (no_error[:, None] + share[..., None] * changes)
+        share = np.clip(share + slope @ counts / (slope**2 @ counts), 0.0, LARGEST_SHARE)
     density = no_error[:, None] + share[..., None] * changes
     return (np.log(density) @ counts).max(axis=1), np.log(no_error) @ counts
 
@@ -96,12 +96,15 @@ def _densities() -> tuple[np.ndarray, np.ndarray]:
 
     The shapes are (n_noise, n_bins) and (n_noise, n_kinds, n_bins).
     """
+    # Readings of N(size, width^2), in sds of the noise, with kinds in the order: no error, one size
+    # (either sign, of which absolute values are the same), normal error.
     edges = HISTOGRAM_EDGES / NOISE_SDS[:, None, None]
     sizes = np.r_[0.0, SIZES, np.zeros_like(WIDE)][:, None]
     widths = np.r_[1.0, np.ones_like(SIZES), WIDE][:, None]
+    # Probability of an absolute value below each edge, shape (n_noise, n_kinds + 1, n_edges).
     below = ndtr((edges - sizes) / widths) - ndtr((-edges - sizes) / widths)
     probability = np.maximum(np.diff(below, axis=-1), LEAST_PROBABILITY)
-    # Errors of all sizes up to one.
+    # A further kind: errors of all sizes up to each of `SIZES`.
     of_each_size = probability[:, 1 : 1 + len(SIZES)]
     uniform = np.cumsum(of_each_size, axis=1) / np.arange(1, len(SIZES) + 1)[:, None]
     no_error = probability[:, :1]

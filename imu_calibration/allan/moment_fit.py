@@ -373,12 +373,14 @@ def coefficient_interval(
     scores = [_ScoreOfCoefficient(moments, fit, excess, fit.names.index(name)) for fit in fits]
     averaged = _AveragedScore(scores, np.asarray(weights, float) / np.sum(weights))
 
-    # From the estimate in steps of its relative sd, or from a thousandth of the largest value that
-    # the curve allows.
+    # From the estimate in steps of its relative sd, which is infinite for 0 and is limited; or from
+    # a thousandth of the largest value that the curve allows.
     limit = float(np.min(moments.target / moments.design((best.processes[index],))[:, 0]))
     middle = max(best.coefficients[index], 1e-3 * limit)
     step = min(scores[0].relative_sd(), 1.5)
     lower = 0.0
+    # The lower end is 0 unless the test rejects 0. An only process cannot be 0: no variance would
+    # be expected.
     is_only_process = not np.any(np.delete(best.coefficients, index))
     if best.coefficients[index] > 0 and (is_only_process or averaged.tails(0.0)[0] < TAIL):
         lower = _crossing(lambda value: averaged.tails(value)[0] - TAIL, middle, -step)
@@ -403,6 +405,7 @@ def time_interval(
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
     scores = [_ScoreOfTime(moments, fit, excess) for fit in fits]
     averaged = _AveragedScore(scores, np.asarray(weights, float) / np.sum(weights))
+    # The first rejected times above and below that of the best fit.
     upper = _first_rejected(times[best + 1 :], lambda time: averaged.tails(time)[1] < TAIL)
     lower = _first_rejected(times[:best][::-1], lambda time: averaged.tails(time)[0] < TAIL)
     return 0.0 if lower is None else lower, np.inf if upper is None else upper
@@ -594,7 +597,13 @@ def _third_moment(weights: np.ndarray, covariance: np.ndarray, expected: np.ndar
 
 
 def pearson_tails(score: float, skewness: float) -> tuple[float, float]:
-    """Return (probability above, probability below) of a standardised Pearson III distribution."""
+    """
+    Return (probability above, probability below) of a standardised Pearson III distribution.
+
+    With ``k = 4 / skewness^2``, ``k + sign(skewness) score sqrt(k)`` has the gamma distribution of
+    shape k.
+    """
+    # Nearly normal: the shape would be very large.
     if abs(skewness) < 1e-3:
         return float(ndtr(-score)), float(ndtr(score))
     shape = 4.0 / skewness**2
@@ -608,8 +617,10 @@ def _crossing(function: Callable[[float], float], start: float, step: float) -> 
     """
     Return the argument at which a function that is positive at `start` becomes negative.
 
-    The logarithm of the argument grows by steps, the first of 2 `step`, which are then bisected.
-    Without a crossing it is 0 or infinite, by the sign of `step`.
+    The logarithm of the argument changes by 2 `step`, then by steps of 1.6 times the one before,
+    until the function is negative; Brent's method finds the zero in the last step. The result is
+    `start` if the function is not positive there; without a crossing it is 0 or infinite, by the
+    sign of `step`.
     """
     from scipy.optimize import brentq  # here, because its import is slow
 

@@ -85,11 +85,14 @@ class RestOutliers:
     def _decide(self, stop: int) -> ImuSamples:
         """Return the samples up to row `stop` without outliers; their last rows become context."""
         assert self._buffered is not None
+        # The search uses the context on both sides; only the rows from `_n_before` on are decided.
         context = self._buffered.select(slice(0, min(stop + CONTEXT_SAMPLES, len(self._buffered))))
         values = np.hstack([context.force_s, context.rate_s])
         decided = slice(self._n_before, stop)
         outlying = outliers(values)
         samples = self._buffered.select(decided)
+
+        # Count and replace.
         self._n_samples += len(samples)
         self._n_readings += np.count_nonzero(outlying[decided], axis=0)
         n_samples = int(np.count_nonzero(outlying[decided].any(axis=1)))
@@ -97,6 +100,8 @@ class RestOutliers:
             self.replaced += n_samples
             values = self._without(values, outlying)[decided]
             samples = replace(samples, force_s=values[:, :3], rate_s=values[:, 3:])
+
+        # The last decided rows remain, as context of the next piece.
         first = max(stop - CONTEXT_SAMPLES, 0)
         self._n_before = stop - first
         self._buffered = self._buffered.select(slice(first, None))
@@ -172,5 +177,8 @@ def outliers(values: np.ndarray) -> np.ndarray:
         typical_change = np.median(changes) if len(changes) else np.inf
         scatter[column] = max(scatter[column], typical_change)
     far = deviation > FAR * scatter
-    around = uniform_filter1d(far.astype(float), 2 * CONTEXT_SAMPLES + 1, axis=0, mode='constant')
-    return far & (around * (2 * CONTEXT_SAMPLES + 1) < MOST_AROUND + 0.5)
+
+    # Number of far readings around each, which is a whole number up to rounding.
+    width = 2 * CONTEXT_SAMPLES + 1
+    n_around = width * uniform_filter1d(far.astype(float), width, axis=0, mode='constant')
+    return far & (n_around < MOST_AROUND + 0.5)

@@ -341,7 +341,7 @@ def _lags(short: np.ndarray, long: np.ndarray, length: float) -> np.ndarray:
     inside the other, and where the slope of the number of pairs of terms in the longest stretch
     (`length` samples) changes.
     """
-    # Around one end, in samples: dense near it, then growing by a factor.
+    # Around one end, in samples: dense within 3 averaging times, then growing by a factor.
     largest_ratio = MAX_LAG_RATIO * float((long / short).max())
     n_far = int(np.log(largest_ratio) / np.log(LAG_GROWTH)) + 1
     far = 3.0 * LAG_GROWTH ** np.arange(1, n_far + 1)
@@ -351,7 +351,8 @@ def _lags(short: np.ndarray, long: np.ndarray, length: float) -> np.ndarray:
     for k in range(3):
         parts.append(short - k * long + local)
 
-    # The number of pairs is linear between these lags; see `ScaleCovariance._pair_weight`.
+    # The number of pairs is linear between these lags (`ScaleCovariance._pair_weight`), with two
+    # more on the way to each, because the correlations are not linear.
     n_short = _n_terms(length, short)
     n_long = _n_terms(length, long)
     for bend in (-n_short, n_long - n_short, n_long):

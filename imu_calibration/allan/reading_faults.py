@@ -102,6 +102,8 @@ class FaultSearch:
         """Add the next samples of a rest, shape (n, 6)."""
         self._n_periods += len(present)
         self._n_missing += int(np.count_nonzero(~present))
+
+        # Pairs of neighbours, the last sample of the call before included.
         rows = values[present]
         if self._last is not None:
             rows = np.vstack([self._last, rows])
@@ -111,11 +113,13 @@ class FaultSearch:
         if len(rows) < 2:
             return
         difference = np.diff(rows, axis=0)
+        # Which axes repeat their reading, up to rounding, shape (n_pairs, 6).
         same = np.abs(difference) <= ROUNDING * np.abs(rows).max(axis=0)
         self._n_pairs += len(same)
         self._n_same_axis += same.sum(axis=0)
         steps = np.where(same, np.inf, np.abs(difference))
         self._smallest_step = np.minimum(self._smallest_step, steps.min(axis=0))
+        # A sensor repeats where all its axes do.
         for k, sensor in enumerate(SENSORS):
             repeats = same[:, SENSOR_COLUMNS[sensor]].all(axis=1)
             self._n_same_sensor[k] += repeats.sum()
@@ -143,6 +147,7 @@ class FaultSearch:
             self._run_length[k] += n_pairs
             return
         lengths = np.diff(changes, prepend=-1).astype(float)
+        # The first run began before this call; its last reading begins the first pair too.
         lengths[0] += self._run_length[k] - 1.0
         self._n_runs[k] += len(lengths)
         self._run_sum[k] += lengths.sum()
@@ -167,6 +172,7 @@ class FaultSearch:
         """
         if not self._n_pairs:
             return NO_FAULTS
+        # A sensor repeats readings if its axes do so together; a coarse axis repeats by chance.
         share = self._n_same_sensor / self._n_pairs
         largest_axis_share = self._n_same_axis.reshape(2, 3).max(axis=1) / self._n_pairs
         repeats = (share > NAMED_REPEATED_SHARE) & (share > TOGETHER * largest_axis_share)
@@ -175,6 +181,8 @@ class FaultSearch:
         mean_square = np.maximum(self._run_squares, 1.0) / n_runs
         mean = np.maximum(self._run_sum, 1.0) / n_runs
         repetition = np.sqrt(mean_square) / mean
+
+        # The largest excess of each axis; it is named if it is significant and not small.
         ratios = np.ones(6)
         named = np.zeros(6, bool)
         for column, excesses in enumerate(self._excesses()):
@@ -183,11 +191,11 @@ class FaultSearch:
                 if excess.sds > NAMED_EXCESS_SDS and excess.ratio > 1.0 + NAMED_EXCESS:
                     named[column] = True
         return ReadingFaults(
-            ratios,
-            named,
-            np.where(repeats, share, 0.0),
-            np.where(repeats, np.maximum(repetition, 1.0), 1.0),
-            np.minimum(replaced + self._n_missing / self._n_periods, MOST_LEFT_OUT),
+            tails=ratios,
+            named=named,
+            repeated=np.where(repeats, share, 0.0),
+            repetition=np.where(repeats, np.maximum(repetition, 1.0), 1.0),
+            missing=np.minimum(replaced + self._n_missing / self._n_periods, MOST_LEFT_OUT),
         )
 
     def _excesses(self) -> list[list[Excess]]:

@@ -277,8 +277,11 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
             )
         for _, samples in cleaned.temperature:
             temperature.push(samples)
+
+    # Samples that were not used.
     dropped = Counter(cleaner.lost)
     for reason, count in preflight.streams['imu'].dropped.items():
+        # A count of jumps, which drop no sample.
         if reason != 'clock reset':
             dropped[reason] += count
     if outliers.replaced:

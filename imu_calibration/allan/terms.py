@@ -334,35 +334,37 @@ class AxisNoise:
 
 def identify_axis(moments: Moments) -> AxisNoise:
     """Return the noise of one axis from its Allan variances."""
+    # Averaging times of the fit, the scatter between rests, and the form.
     moments, excess = _fit_range(moments)
     moments = replace(moments, scatter=scatter_of(moments))
     choice = choose_form(moments, excess)
     best = choice.best
     rivals = choice.rivals
 
-    # Figures of the best form; upper limits of flicker and random walk without them.
-    fast = tuple(name for name in (QUANTISATION.name,) if name in best.names)
+    # Figures of the best model; upper limits of flicker and random walk without them.
     terms: dict[str, Term] = {}
-    for name in (*fast, WHITE.name, *best.form):
+    for name in best.names:
         terms |= _figures(choice, name, excess)
     for name in {FLICKER.name, RANDOM_WALK.name} - set(best.form):
         terms[name] = _held(_figures(choice.widened(name), name, excess)[name])
 
-    # Figures of the processes in other forms.
+    # Figures of the processes in other forms. A Gauss-Markov process that fits nearly as well is
+    # included: its price may exclude it from the rivals.
     alternatives: dict[str, Term] = {}
-    for other in (*rivals, *filter(None, [choice.close(GAUSS_MARKOV)])):
+    with_gauss_markov = choice.close(GAUSS_MARKOV)
+    for other in rivals if with_gauss_markov is None else (*rivals, with_gauss_markov):
         for name in set(other.form) - set(best.form) - set(alternatives):
             alternatives |= _figures(choice, name, excess)
     return AxisNoise(
         _doubted(terms, best, rivals),
         best.form,
-        tuple(rival.form for rival in rivals),
-        alternatives,
-        float(moments.scales.tau[moments.used][0]),
-        excess,
-        _hump(moments, best) if excess > 1 else None,
-        moments.scatter,
-        best,
+        others=tuple(rival.form for rival in rivals),
+        alternatives=alternatives,
+        shortest=float(moments.scales.tau[moments.used][0]),
+        excess=excess,
+        oscillation=_hump(moments, best) if excess > 1 else None,
+        scatter=moments.scatter,
+        fit=best,
     )
 
 

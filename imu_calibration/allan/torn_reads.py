@@ -107,6 +107,9 @@ def excess_of_torn_reads(readings: np.ndarray, step: float) -> Excess:
     # Does tearing differ from a filter, and how well is its share known?
     if pages.sensitivity < LEAST_SENSITIVITY:
         return NO_EXCESS
+    # Variance of the share of n pairs in one page, times n, with the shares p of the pages and
+    # their sum of squares c. These and the correlation are estimated from the same readings, which
+    # subtracts their parts: c - c^2 - 2 (sum p^3 - c^2) - A_1^2.
     chance = pages.chance
     cubes = np.sum(pages.probabilities**3)
     same_variance = max(chance + chance**2 - 2.0 * cubes - pages.coefficients[0] ** 2, 0.0)
@@ -158,11 +161,11 @@ def _pages(page: np.ndarray, counts: np.ndarray) -> _Pages:
         coefficients[order - 1] = np.sum(moments**2) / factorial
         before, polynomial = polynomial, z * polynomial - order * before
     return _Pages(
-        np.bincount(index) / n,
-        float(np.mean(page[1:] == page[:-1])),
-        float(np.mean(z[1:] * z[:-1])),
-        float(np.mean(first_step * deviation) / variance),
-        coefficients,
+        probabilities=np.bincount(index) / n,
+        same=float(np.mean(page[1:] == page[:-1])),
+        correlation=float(np.mean(z[1:] * z[:-1])),
+        page_correlation=float(np.mean(first_step * deviation) / variance),
+        coefficients=coefficients,
     )
 
 

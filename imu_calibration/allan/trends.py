@@ -238,6 +238,8 @@ class TrendSearch:
         """
         design = np.column_stack([self._constants, self.columns(trends)])
         target = self.blocks.mean[:, axis]
+        # For all variance ratios r: QR of the whitened design, of shape (r, n, p), with columns of
+        # similar size, and the weighted sum of squared residuals.
         norms = np.linalg.norm(design, axis=0)
         basis, triangle = np.linalg.qr(self._whitenings @ (design / norms))
         white = self._whitenings @ target
@@ -250,6 +252,8 @@ class TrendSearch:
         )
         log_determinants = self._log_determinant_of_ratio + _log_determinants(triangle)
         best = int(np.argmin(log_determinants + freedom * np.log(squares)))
+
+        # Values R^-1 Q' y, and their covariance R^-1 R^-T with the variance of the residuals.
         root = np.linalg.inv(triangle[best])
         values = root @ projected[best] / norms
         sd = np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / norms
@@ -298,6 +302,7 @@ class TrendSearch:
                 remaining_trace = np.sum(detrended @ covariance * detrended)
                 trace = np.sum(difference @ covariance * difference)
                 shares[k] = remaining_trace / trace
+        # Not nearly zero: the model of the Allan variances is multiplied by it.
         return np.clip(shares, 0.02, 1.0)
 
     def _differences(self, count: int) -> np.ndarray:
@@ -392,5 +397,7 @@ class Parts:
         if not known.any():
             return 0.0
         between = (squares - freedom * chance * total)[known] / squares_per_level[known]
+        # Inverse variances up to a factor: the sum of squares with `freedom` degrees of freedom has
+        # the variance 2 freedom (chance total)^2.
         precision = (squares_per_level / (chance * total))[known] ** 2 / freedom[known]
         return float(np.sqrt(max(np.sum(precision * between) / precision.sum(), 0.0)))
