@@ -145,13 +145,12 @@ class StampedDerivative:
         if self._newest is not None:
             step = (stamp_ns - self._newest) / self._period_ns
             if not MIN_REGULAR_STEP < step <= MAX_REGULAR_STEP:
+                # A duplicate or late sample.
                 if step <= 0 and stamp_ns - self._newest > -RESET_NS:
                     return self.alpha
-                if (
-                    step <= 0
-                    or (step > MAX_REGULAR_STEP and abs(step - round(step)) <= WHOLE_GAP_SHARE)
-                    or step > MAX_LATE_STEP
-                ):
+                is_reset = step <= 0
+                is_whole = step > MAX_REGULAR_STEP and abs(step - round(step)) <= WHOLE_GAP_SHARE
+                if is_reset or is_whole or step > MAX_LATE_STEP:
                     self._bridge_gap(step, x, y, z)
         self._newest = stamp_ns
         self._add(x, y, z)
@@ -245,7 +244,9 @@ class StampedDerivative:
         ends = [*starts[1:], len(values)]
         for start, end in zip(starts, ends):
             for k in range(start, end):
-                # From here on the window contains regular samples of this stretch only.
+                # From here on the window contains regular samples of this stretch only: its first
+                # one, after an irregular step, has left it. The newest stamp is another one if the
+                # sample before was late and did not enter.
                 if k == start + self.taps + 1 and self._newest == stamp_ns[k - 1]:
                     self._push_regular(stamp_ns, values, k, end, out)
                     full[k:end] = True
@@ -262,12 +263,14 @@ class StampedDerivative:
 
         Requires regular steps also between the samples of the window before `start`.
         """
+        # Slope of a full window, with the weights of the newest to the oldest sample.
         taps = self.taps
         index = (taps - 1) / 2 - np.arange(taps)
         stretch = values[start - taps + 1 : end]
         out[start:end] = np.stack(
             [np.convolve(axis, index * self._scale[taps], 'valid') for axis in stretch.T], axis=1
         )
+        # The state after the last sample.
         self._newest = int(stamp_ns[end - 1])
         self.alpha = tuple(out[end - 1].tolist())
         self._window = deque(map(tuple, values[end - taps : end].tolist()))
@@ -336,6 +339,7 @@ class TimedDerivative:
             self.alpha = NO_SLOPE
             self.n_used = 0
             return self.alpha
+        # As many equal steps have about this Sxx, and with it this noise.
         share = min(float(spread) / self._full_spread, 1.0)
         self.n_used = min(max(round(self.taps * share ** (1 / 3)), 2), self.taps)
         values = np.array(self._values)[::-1]

@@ -237,10 +237,19 @@ def compensated_samples(
             ' provide imu/temperature',
             code='temperature_missing',
         )
+    readings = Reference(
+        time=np.zeros(len(force_s)),
+        mat_sn=np.broadcast_to(np.eye(3), (len(force_s), 3, 3)),
+        force_s=force_s,
+        rate_s=rate_s,
+        alpha_s=alpha_s,
+        gravity=0.0,
+        temperature_c=temperature_c,
+        branch=thermal_branch,
+        shaking=vibration,
+    )
     with np.errstate(over='ignore', invalid='ignore'):
-        force, rate, last_step = _invert(
-            model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch, vibration)
-        )
+        force, rate, last_step = _invert(model, values, readings)
     is_diverged = last_step > CONVERGED
     force[is_diverged] = np.nan
     rate[is_diverged] = np.nan
@@ -252,20 +261,16 @@ def compensated_samples(
 
 
 def _invert(
-    model: SensorModel,
-    values: np.ndarray,
-    force_s: np.ndarray,
-    rate_s: np.ndarray,
-    alpha_s: np.ndarray,
-    conditions: tuple[np.ndarray | None, ...],
+    model: SensorModel, values: np.ndarray, readings: Reference
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Return true force, true rate, and the size of the last fixed-point step of each sample.
 
     Shapes (n, 3), (n, 3), (n,). The step is infinite where it overflows, and NaN for a reading that
-    is not finite. `conditions` are temperature, thermal branch and vibration.
+    is not finite. `readings` has the measured force and rate in place of the true ones.
     """
-    measured = {'accelerometer': force_s, 'gyroscope': rate_s}
+    measured = {'accelerometer': readings.force_s, 'gyroscope': readings.rate_s}
+    # First guess: bias and matrix inverted, without the other effects.
     inverse = {}
     true = {}
     for sensor in SENSORS:
@@ -274,26 +279,19 @@ def _invert(
         assert matrix is not None and bias is not None, 'every model has both'
         inverse[sensor] = np.linalg.inv(matrix)
         true[sensor] = (measured[sensor] - bias) @ inverse[sensor].T
-    attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
     for _ in range(MAX_INVERSION_STEPS):
-        change = np.zeros(len(force_s))
+        change = np.zeros(len(readings))
         for sensor in ('gyroscope', 'accelerometer'):
-            ref = Reference(
-                np.zeros(len(force_s)),
-                attitude,
-                true['accelerometer'],
-                true['gyroscope'],
-                alpha_s,
-                0.0,
-                *conditions,
-            )
-            residual = measured[sensor] - sensor_output(model, sensor, values, ref=ref)
+            motion = replace(readings, force_s=true['accelerometer'], rate_s=true['gyroscope'])
+            residual = measured[sensor] - sensor_output(model, sensor, values, ref=motion)
             step = residual @ inverse[sensor].T
             true[sensor] = true[sensor] + step
             change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))
+        # No more than rounding.
         if np.max(change, initial=0.0) < 1e-14:
             break
-    is_finite = np.isfinite(force_s).all(axis=1) & np.isfinite(rate_s).all(axis=1)
+    # Finite readings have no finite step where the iteration overflowed.
+    is_finite = np.isfinite(np.hstack([readings.force_s, readings.rate_s])).all(axis=1)
     change = np.where(np.isnan(change) & is_finite, np.inf, change)
     return true['accelerometer'], true['gyroscope'], change
 
@@ -351,6 +349,8 @@ def outside_conditions(
     """
     Return lines on a largest rate (rad/s) and temperatures outside the range of the calibration.
     """
+    # A tenth and 0.1 rad/s above the largest calibrated rate are tolerated, and 5 K outside the
+    # calibrated temperatures.
     lines = []
     calibrated_rate = calibration.conditions.get('largest_rate')
     if calibrated_rate is not None and fastest > 1.1 * calibrated_rate + 0.1:

@@ -202,7 +202,7 @@ class Uncertainty:
         Return the central difference of the corrected (force, rate) by one input, shape (6,).
 
         Sample and step are in (force, rate, derivative), shape (9,); the step has one element that
-        is not zero. `conditions` are temperature, thermal branch and vibration.
+        is not zero. `conditions` are warming (K), thermal branch and three of vibration.
         """
         above = self._kernel(*(sample + step).tolist(), *conditions)
         below = self._kernel(*(sample - step).tolist(), *conditions)
@@ -215,18 +215,19 @@ class Uncertainty:
         Return d(measured force, rate) / d(parameters), shape (6, n_params).
 
         At the true force and rate, shape (6,), with the angular acceleration, shape (3,).
+        `conditions` as in `_slope`.
         """
-        temperature = np.full(1, self._model.temperature_ref_c + conditions[0])
+        warming, branch, *vibration = conditions
         ref = Reference(
-            np.zeros(1),
-            np.eye(3)[None],
-            true[None, :3],
-            true[None, 3:],
-            alpha[None],
-            0.0,
-            temperature,
-            np.full(1, conditions[1]),
-            np.array([conditions[2:]]),
+            time=np.zeros(1),
+            mat_sn=np.eye(3)[None],
+            force_s=true[None, :3],
+            rate_s=true[None, 3:],
+            alpha_s=alpha[None],
+            gravity=0.0,
+            temperature_c=np.full(1, self._model.temperature_ref_c + warming),
+            branch=np.full(1, branch),
+            shaking=np.array([vibration]),
         )
         sensor_slopes = []
         for sensor, slopes in zip(SENSORS, self._slopes):

@@ -410,7 +410,8 @@ class CalibrationHealth:
         self._known_covariance = parameter_covariance + np.diag(drift_variances)
         """Covariance of corrected (force, rate) at rest from parameters and drift, shape (6, 6)."""
 
-        # Gravity at the place of calibration differs from that here, unless it is given.
+        # Gravity at the place of calibration differs from that here; a given gravity is known to a
+        # tenth of the difference between places.
         stated = options.gravity or calibration.conditions.get('gravity')
         self._gravity = float(stated or STANDARD_GRAVITY)
         self._gravity_site_share = (

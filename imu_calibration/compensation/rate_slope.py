@@ -336,6 +336,7 @@ class RateSlope:
         out = np.empty(values.shape)
         start = 0
         while start < len(values):
+            # Regular samples at once, then one sample that `push` has to process.
             stop = self._end_of_regular(stamp_ns, values, start)
             if stop > start:
                 assert isinstance(self._tracker, StampedDerivative), (
@@ -504,29 +505,30 @@ class RateSlope:
             noise_gain = (d / l)^2 sum (weights of a_k - a_(k-l))^2
         """
         # Without a derivative the error is its size.
-        recent = np.array(list(self._recent)).reshape(-1, 3)
+        stored = np.array(list(self._recent)).reshape(-1, 3)
         if self.line is None:
             return self._size_at_start()
         if self.derivative is None or self._tracker is None:
-            if len(recent) < stamping.MIN_PERIOD_STEPS and self._size_before is not None:
+            if len(stored) < stamping.MIN_PERIOD_STEPS and self._size_before is not None:
                 return self._size_before
-            return self._size(recent)
+            return self._size(stored)
         n_used = self._tracker.n_used
         if not n_used:
-            return replace(self._size(recent), weights=np.zeros(1))
+            return replace(self._size(stored), weights=np.zeros(1))
 
         # A window with fewer samples has a shorter delay.
         recent = self._recent_slopes(self._tracker)
         weights = CausalDerivative(n_used, self._tracker.period).weights
         delay = (n_used - 1) / 2  # in samples
-        lag = max(round(delay + 0.01), 1)
+        lag = max(round(delay + 0.01), 1)  # half samples are rounded up
         change = _without_unknown(recent[lag:] - recent[:-lag])
         if not len(change):
-            if not len(_without_unknown(recent)):
-                # The first slope of a stream shows the size of the motion, with its own noise.
-                slope = np.array(self._slope)
-                return SlopeError(np.outer(slope, slope), float(weights @ weights), weights)
-            return replace(self._size(recent), weights=weights)
+            # No two slopes of full windows are a lag apart: their size, if there is one.
+            if len(_without_unknown(recent)):
+                return replace(self._size(recent), weights=weights)
+            # The first slope of a stream shows the size of the motion, with its own noise.
+            slope = np.array(self._slope)
+            return SlopeError(np.outer(slope, slope), float(weights @ weights), weights)
 
         # The change over the delay, from that over the lag.
         share = (delay / lag) ** 2
@@ -552,6 +554,7 @@ class RateSlope:
 
         Its covariance is ``N / Sxx``, ``Sxx = sum((t - mean t)^2)``, N the covariance of the rate.
         """
+        # The newest stamps and the rates that were stored with them.
         n = min(len(self._stamps), len(self._recent))
         stamps = np.array(list(self._stamps)[len(self._stamps) - n :], np.int64)
         readings = np.array(list(self._recent)[len(self._recent) - n :]).reshape(-1, 3)
@@ -592,6 +595,8 @@ class RateSlope:
                 weights = self.derivative.weights
                 return SlopeError(_mean_square(slopes), float(weights @ weights))
             return self._size_before or SlopeError(POSSIBLE**2 * np.eye(3))
+
+        # Differences of rates, by the mean step between their stamps.
         step = np.diff(np.array(list(self._stamps)[-len(recent) :], np.int64))
         step = step[np.abs(step) <= PAUSE_NS]
         period = max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
@@ -613,6 +618,7 @@ class RateSlope:
         """
         self._undecided_ns = step_ns + (self._undecided_ns if self._undecided_rates else 0)
         self._undecided_rates.append(reading)
+        # Time that the undecided samples may need if none between them is lost.
         most_ns = self._max_step_ns + 1e9 * tracker.period * (len(self._undecided_rates) - 1)
         none_lost = -RESET_NS < step_ns and self._undecided_ns <= most_ns
         if not none_lost:
@@ -621,7 +627,8 @@ class RateSlope:
             is_undecided = step_ns > 0 and is_within_window
             if is_undecided and 2 * len(self._undecided_rates) <= tracker.taps:
                 return self._slope
-            self._n_counted += tracker.taps  # numbers with a gap of a window restart the derivative
+            # Samples are lost: numbers with a gap of a window restart the derivative.
+            self._n_counted += tracker.taps
         slope = self._slope
         for x, y, z in self._undecided_rates:
             self._n_counted += 1
@@ -652,22 +659,22 @@ class RateSlope:
                 line = describe_stamps(last_block)
             if line is None and len(stamps) == REVIEWED_STAMPS:
                 line = describe_stamps(stamps)
-        if line is None:
+        if line is None:  # too few stamps
             if self.line is None:
                 self._notify()  # so that the covariances contain the size of the derivative
             return
 
-        # Independent steps appear counted in one of four reviews.
-        if (
-            self.line is not None
-            and (self.line.word, line.word) == (IRREGULAR, COUNTED)
-            and self._tracker is not None
-        ):
+        # Independent steps appear counted in one of four reviews: several must agree.
+        word_before = None if self.line is None else self.line.word
+        becomes_counted = word_before == IRREGULAR and line.word == COUNTED
+        if becomes_counted and self._tracker is not None:
             self._n_agreeing += 1
             if self._n_agreeing < AGREE:
                 return
         self._n_agreeing = 0
-        if self.line is None or line.word != self.line.word or not self._is_kept_for(line):
+
+        # Another class or another period.
+        if line.word != word_before or not self._is_kept_for(line):
             self.settle(line)
         self._n_until_review = CLOCK_BLOCK
 
