@@ -225,6 +225,7 @@ def _refuse_large(events: Iterable[Any], name: str, aliases: bool) -> None:
         kind = type(event).__name__
         if kind.startswith(('Stream', 'Document')):
             continue
+        # The end of the innermost list or mapping: its size for later aliases.
         if kind.endswith('EndEvent'):
             part = open_parts.pop()
             sizes[part.anchor] = count - part.count_at_start
@@ -237,11 +238,12 @@ def _refuse_large(events: Iterable[Any], name: str, aliases: bool) -> None:
             )
         if open_parts and open_parts[-1].keys is not None:
             _check_key(event, open_parts[-1], name)
+        # A text or number, an alias of an earlier part, or the start of a list or mapping.
         count += sizes[event.anchor] if kind == 'AliasEvent' else 1
         if kind == 'ScalarEvent':
             sizes[event.anchor] = 1
             _check_scalar(event, name)
-        elif kind != 'AliasEvent':  # the start of a list or mapping
+        elif kind != 'AliasEvent':
             keys = set() if kind == 'MappingStartEvent' else None
             open_parts.append(_OpenPart(event.anchor, count, keys))
         _require_at_most(len(open_parts), MAX_DOCUMENT_DEPTH, name, 'levels')

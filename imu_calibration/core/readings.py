@@ -294,6 +294,7 @@ def unit_of(sensor: str, text: str) -> SensorUnit:
         per = _spelled(sensor, counts[2])
         number = _positive(counts[1])
         if per in sizes and 0.0 < number < LARGEST_SCALE:
+            # Brackets around deg/s, as in the option; none around m/s^2.
             label = per if per.isalpha() or sensor == 'accelerometer' else f'({per})'
             return SensorUnit(f'counts:{counts[1]}/{label}', number / sizes[per])
     raise InputError(
@@ -397,6 +398,7 @@ def _axes_matrix(axes: str) -> np.ndarray:
         letter = part.removeprefix('-')
         if letter in ('x', 'y', 'z'):
             matrix[row, 'xyz'.index(letter)] = -1.0 if part.startswith('-') else 1.0
+    # The determinant is 0 unless each letter occurs once.
     if len(parts) != 3 or abs(abs(np.linalg.det(matrix)) - 1.0) > 0.5:
         raise _axes_error(axes)
     return matrix
@@ -439,8 +441,10 @@ def _sensor_unit(sensor: str, entry: Mapping[str, Any], place: str) -> SensorUni
     scale = _number_or_none(entry.get('scale'))
     offset = _number_or_none(entry.get('offset'))
     unit = entry.get('unit')
+    # By scale and offset only.
     if unit is None:
         return _of_scale(sensor, 1.0 if scale is None else scale, 0.0 if offset is None else offset)
+    # By a unit: counts need a scale, any other unit has one, which a stated scale repeats.
     increments = INCREMENTS_PATTERN.fullmatch(unit)
     if unit == COUNTS or (increments and increments[2] == COUNTS):
         if scale is None:

@@ -38,6 +38,7 @@ def _times_of(time: ArrayLike) -> np.ndarray:
 
 def _stamps_of_any(time: np.ndarray) -> np.ndarray:
     """Return stamps of times in s, or of integers with the steps of nanoseconds; ns, int64."""
+    # The typical step shows the unit of integers.
     is_integer = np.issubdtype(time.dtype, np.integer)
     steps = np.diff(time.astype(np.int64) if is_integer else time)
     step = float(np.median(np.abs(steps))) if len(steps) else LEAST_STEP
@@ -51,6 +52,7 @@ def _stamps_of_any(time: np.ndarray) -> np.ndarray:
         )
     if not in_ns:
         return stamps_of(time)
+    # In integers, because floats do not hold nanoseconds since 1970.
     time_ns = time.astype(np.int64)
     start_ns = int(time_ns[0]) if time_ns[0] > EPOCH * 10**9 else FIRST_NS
     return start_ns + (time_ns - time_ns[0])
