@@ -213,8 +213,12 @@ class CosineScores:
         inverse = self._inverse(group)
         walk = self.walk[:SLOW_WAVES]
         shifts = self.shifts[:, group]
+        # Squares of the faster cosines in units of their noise, each expected to be the number of
+        # parameters.
         fast = np.einsum('ki,kij,kj->k', shifts, inverse, shifts)[SLOW_WAVES:]
         fast_dof = fast.size * len(group)
+
+        # The score of the slow cosines, and its expectation.
         inverse = inverse[:SLOW_WAVES]
         shifts = shifts[:SLOW_WAVES]
         score = walk @ (np.einsum('kij,kj->ki', inverse, shifts) ** 2).sum(axis=1)

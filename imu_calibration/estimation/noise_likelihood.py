@@ -208,6 +208,7 @@ def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
     """
     if not count:
         return 0.0, normal
+    # A = S L L' S with the roots S of its diagonal, so that the factor L is accurate.
     scale = np.sqrt(np.maximum(normal.diagonal()[:count], 1e-300))
     scaled = normal[:count, :count] / (scale[:, None] * scale)
     scaled.flat[:: count + 1] += JITTER
@@ -229,6 +230,7 @@ def profile_each(normal: np.ndarray) -> np.ndarray:
 
     With few parameters the calls for one matrix after the other would take most of the time.
     """
+    # Each matrix A is scaled to a unit diagonal, as in `eliminate`.
     information = normal[:, :-1, :-1]
     right = normal[:, :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum('kii->ki', information), 1e-300))

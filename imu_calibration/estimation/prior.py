@@ -45,6 +45,7 @@ def make_prior(model: SensorModel) -> Prior:
         for component in range(3):
             gauge[component, arms[:, component]] = 1 / GAUGE_SD
         rows.append(gauge)
+        # Each of three independent arms less their mean: 2/3 of the variance.
         sd = sd.copy()
         sd[arms.ravel()] *= np.sqrt(2 / 3)
     rows.append(zero_sum_rows(model))

@@ -49,7 +49,7 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
     first_band = np.argmax(rows != 0, axis=1) // BAND_COLUMNS
     factor = np.zeros((width, width))
     carried = rows[:0]
-    for band in range(-(-width // BAND_COLUMNS)):
+    for band in range(-(-width // BAND_COLUMNS)):  # rounded up
         # The rows that begin in this band, and the remainder of the rows before it.
         stacked = np.concatenate([carried, rows[first_band == band]])
         used = np.flatnonzero(stacked.any(axis=0))
@@ -60,7 +60,8 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
         part = triangular(stacked[:, used])
         reflected = np.zeros((len(part), width))
         reflected[:, used] = part
-        # The rows of the columns up to this band are final; the rows below them are carried on.
+        # Row k of the part begins in column `used[k]`. Those that begin up to this band are final,
+        # because all other rows begin later; the rows below them are carried on.
         n_final = min(int(np.searchsorted(used, (band + 1) * BAND_COLUMNS)), len(part))
         factor[used[:n_final]] = reflected[:n_final]
         carried = reflected[n_final:]
@@ -98,6 +99,7 @@ def scaled_lstsq(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     scale = np.linalg.norm(matrix, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     q, r, order = scipy.linalg.qr(matrix / scale, mode='economic', pivoting=True)
+    # Columns beyond the rank depend on the ones before, and get the value 0.
     diagonal = np.abs(np.diag(r))
     rank = int((diagonal > 1e-15 * diagonal[0]).sum()) if len(diagonal) else 0
     solved = np.zeros((matrix.shape[1],) + right.shape[1:])

@@ -213,10 +213,12 @@ def replace_weak(
         candidates = [k for k in candidates if posterior[k, k] > smallest[k]]
         if not candidates:
             break
+        # The least significant difference from its prior.
         ratio = [(moved[k] - prior[k]) ** 2 / posterior[k, k] / limits[k] for k in candidates]
         least = int(np.argmin(ratio))
         if ratio[least] >= 1.0:
             break
+        # All parameters, and the posterior, given that one at its prior.
         k = candidates.pop(least)
         slope = posterior[:, k] / posterior[k, k]
         moved = moved + slope * (prior[k] - moved[k])

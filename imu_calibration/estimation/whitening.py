@@ -179,8 +179,10 @@ class _Filter:
         self._driven_by = decay[1:] * gain[:-1]
         """Factors ``d_k g_(k-1)`` of the row before in the states, shape (n - 1, m)."""
 
-        # All states from one banded system, s_k - F_k s_(k-1) = d_k g_(k-1) y_(k-1). Element (i, j)
-        # of -F_k is on the diagonal that is `width + i - j` below the main one.
+        # All states from one banded system, s_k - F_k s_(k-1) = d_k g_(k-1) y_(k-1), with the m
+        # states of each row of the chain next to each other. Element (i, j) of -F_k multiplies
+        # state j of the row before in the equation of state i: it is `width + i - j` below the
+        # diagonal, in each column j + m k but that of the last row.
         self._bands = np.zeros((2 * width, width * (len(variance) - 1)))
         """Its unit lower triangle in the band storage of LAPACK, shape (2 m, m (n - 1))."""
         self._bands[0] = 1.0
@@ -192,6 +194,7 @@ class _Filter:
     def forward(self, values: np.ndarray) -> np.ndarray:
         """Return the innovations of rows, shape (n, q), which it overwrites."""
         if len(values) > 1:
+            # States of all rows but the first, shape (m (n - 1), q); their sum is the prediction.
             driven = (self._driven_by[:, :, None] * values[:-1, None, :]).reshape(
                 -1, values.shape[1]
             )
