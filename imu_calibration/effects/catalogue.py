@@ -167,6 +167,8 @@ def term(
     except InputError as error:
         raise error.named(f"effect '{name}'") from error
     has_time_constant = 'time constant' in uses
+
+    # The arguments as plain data, from which documents make the effect again.
     definition = {
         'sensor': sensor,
         'column': column if isinstance(column, str) else list(columns),
@@ -183,7 +185,7 @@ def term(
     motions = [motions for quantity, motions in QUANTITY_MOTIONS if quantity in uses]
     abscissas = [abscissa for quantity, abscissa in DRAWN_AGAINST.items() if quantity in uses]
 
-    # The values and their prior.
+    # The values and their prior. A time constant has that of `bias_drift`, 1000 s for 300 s.
     amplitude_sd = PRIOR_TOLERANCES * tolerance if prior_sd is None else prior_sd
     fields: dict[str, Any] = {
         'components': VECTOR,

@@ -184,6 +184,7 @@ def columns(references: References, sensor: str) -> np.ndarray:
             key='temperature_topic',
             code='temperature_missing',
         )
+    # Blocks in the order of the layout; the columns of a warp include those of its lever matrix.
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     parts = []
     for name in layout.rows:
@@ -205,18 +206,25 @@ def _warp_columns(references: References, effect: Effect, sensor: str) -> list[n
     model = references.model
     if effect.derivative is not None:
         return [effect.derivative(references.at(sensor))]
+
+    # To first order a lag near zero is a delay of the clock, whose references are known already.
     clock = model.find('reference', Role.DELAY)
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
-        effect = clock  # to first order a lag near zero is a delay of the clock
+        effect = clock
+
     # A search folds the arms and needs many warps: forward differences halve the references, with
     # an error of the curvature over a step. Candidate effects are evaluated with a delay in place
     # of a filter.
     folded_arms = model.folded_arms
     in_search = folded_arms is not None
     roughly = in_search and not np.any(model.point_of(effect))
+
+    # Lever-arm terms change only where there are arms.
     with_arms = sensor == 'accelerometer' and bool(model.arms)
     if folded_arms is not None and not folded_arms.any():
         with_arms = False
+
+    # Difference quotient by each parameter.
     inputs = []
     levers = []
     steps = _steps(effect, model.point_of(effect), forward=in_search)
@@ -331,6 +339,7 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     """
     layout = model.layout(sensor)
     step = 1e-30
+    # Only the coefficients that depend on a value are computed at its step.
     jacobian = np.zeros((layout.width, 3, len(values)))
     sensor_values = model.values_of(sensor, values.astype(complex))
     readers = _readers(model, sensor_values, layout)

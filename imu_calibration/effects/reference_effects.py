@@ -68,6 +68,10 @@ def _second_order() -> tuple[tuple[float, float], ...]:
     ``1 / (1 + d s + d^2 s^2 / 2)`` has the impulse response ``2 e^-x sin x``, x = t / d, whose
     moments of order k over k! follow from the denominator. The weights match the first five: the
     error is 6e-5 where frequency times delay is 0.3 rad, and joints' noise is not amplified.
+
+    With the moments m_k and delays x_j up to 3.5, ``sum_j weight_j x_j^k = m_k`` for k = 0 ... 4.
+    The series of the response is ``sum_k m_k (-d s)^k / k!``; its product with the denominator is
+    1, so that ``m_k = k m_(k-1) - k (k - 1) / 2 m_(k-2)``.
     """
     moments = [1.0, 1.0]
     for order in range(2, 5):
