@@ -61,6 +61,7 @@ def temperature_courses(time: np.ndarray, temperature: np.ndarray) -> Iterator[T
     yield TemperatureCourse('temperature rate', rate, within)
     for lag in TEMPERATURE_LAGS:
         known = time - time[0] >= lag
+        # At a longer lag the temperature would be known for less than half of the windows.
         if 2 * np.count_nonzero(known) < len(time):
             return
         earlier = np.interp(time - lag, time, warm)

@@ -27,6 +27,18 @@ last again.
 """
 
 
+@dataclass(frozen=True, eq=False)
+class FitsOfHalves:
+    """Fits of the same parameters to parts of the rows."""
+
+    first: ParameterFit
+    """To the first half."""
+    second: ParameterFit
+    """To the second half."""
+    both: ParameterFit
+    """To all rows."""
+
+
 def squares_of_folds(normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """
     Return ``sum_f w_f' N_pf w_f``, the residual sums of squares over f folds, shape (p,).
@@ -152,9 +164,7 @@ class Evidence:
         fall = max(self.loss(smaller) - self.loss(larger), 0.0)
         return float(chi2_sf(fall, len(larger) - len(smaller)))
 
-    def fits_of_halves(
-        self, used: Sequence[int]
-    ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
+    def fits_of_halves(self, used: Sequence[int]) -> FitsOfHalves:
         """Return the fits of parameters to the first and second half of the rows, and to both."""
         raise NotImplementedError
 
@@ -208,7 +218,7 @@ For halves of equal precision: values that differ by half of the joint estimate.
 """
 
 
-def agree(halves: Sequence[ParameterFit], whole: ParameterFit, at: Sequence[int]) -> bool:
+def agree(fits: FitsOfHalves, at: Sequence[int]) -> bool:
     """
     Return whether the estimates of some parameters from two halves agree within their precision.
 
@@ -223,19 +233,19 @@ def agree(halves: Sequence[ParameterFit], whole: ParameterFit, at: Sequence[int]
 
     Parameters
     ----------
-    halves, whole
-        (values, covariance) of the same parameters, fitted to each half and to both.
+    fits : FitsOfHalves
     at : sequence of int
-        Indices of the parameters under test.
+        Indices of the parameters under test among the fitted ones.
 
     """
     at = list(at)
-    (first, first_cov), (second, second_cov) = halves
+    first, first_cov = fits.first
+    second, second_cov = fits.second
     difference = (first - second)[at]
     covariance = (first_cov + second_cov)[np.ix_(at, at)]
     chi2_difference = float(difference @ np.linalg.solve(covariance, difference))
 
-    joint, joint_cov = whole
+    joint, joint_cov = fits.both
     value = joint[at]
     chi2_effect = float(value @ np.linalg.solve(joint_cov[np.ix_(at, at)], value))
 

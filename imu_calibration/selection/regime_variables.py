@@ -125,7 +125,7 @@ class Variable:
         Return values near an edge at which a range of bins may begin (`end` 0) or end (1).
 
         They are middles between values in the bins on both sides of the edge, at most
-        `MOST_BOUNDS` of them, evenly spread, and the edge itself. None where the range is open.
+        `MOST_BOUNDS` of them, evenly spread, and the edge itself. Empty where the range is open.
         """
         number = chosen[0] if end == 0 else chosen[-1] + 1
         if not self.cyclic and number in (0, len(self.edges) - 1):

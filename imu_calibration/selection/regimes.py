@@ -120,12 +120,15 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np
 
     """
     rng = np.random.default_rng(0)
-    _, starts, place, count = np.unique(
+    # First block of each window, number of the window of each block, blocks of each window.
+    _, starts, number, count = np.unique(
         window, return_index=True, return_inverse=True, return_counts=True
     )
+    # Rms rate of rotation of each window.
     speed = np.sqrt(np.add.reduceat(intensity**2, starts) / count)
 
     # Window whose residual each window has, shape (PERMUTED, n_windows).
+    # Exchanged within classes of similar speed, unless all windows of a kind turn alike.
     partner = np.tile(np.arange(len(starts)), (PERMUTED, 1))
     for name in np.unique(kind):
         of_kind = np.flatnonzero(kind[starts] == name)
@@ -137,8 +140,8 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np
             partner[:, of_class] = rng.permuted(np.tile(of_class, (PERMUTED, 1)), axis=1)
 
     # Block k of a window has the residual of block k of its partner, modulo the partner's length.
-    source = partner[:, place]
-    return starts[source] + (np.arange(len(window)) - starts[place]) % count[source]
+    source = partner[:, number]
+    return starts[source] + (np.arange(len(window)) - starts[number]) % count[source]
 
 
 class ColumnWhitening(Protocol):

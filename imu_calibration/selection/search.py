@@ -288,8 +288,8 @@ class Search:
         if question.effect.smooth:
             return True
         used = self.indices(chosen)
-        *halves, whole = self.evidence.fits_of_halves(used)
-        return agree(halves, whole, [used.index(k) for k in question.parameters])
+        fits = self.evidence.fits_of_halves(used)
+        return agree(fits, [used.index(k) for k in question.parameters])
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
         """

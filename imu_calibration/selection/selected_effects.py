@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -13,6 +13,14 @@ from imu_calibration.selection.order_of_tests import SearchProblem
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 from imu_calibration.selection.unexplained import Unexplained
+
+
+class SensorLimit(Protocol):
+    """Range of a sensor that its outputs do not exceed."""
+
+    @property
+    def sensor(self) -> str:
+        """'accelerometer' or 'gyroscope'."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +59,8 @@ class SelectedEffects:
     Questions selected by likelihood but not named: their gain is too small, or the remaining excess
     too large.
     """
-    limits: Sequence[Any] = ()
-    """Saturations (`Saturation`)."""
+    limits: Sequence[SensorLimit] = ()
+    """Limits at which outputs pile up."""
 
     @property
     def changed_at(self) -> float | None:

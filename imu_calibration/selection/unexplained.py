@@ -154,6 +154,7 @@ def correlate(
             n_fitted = 1 + fitted_columns.shape[1]
             without_variable += _residual_squares(design[:, :n_fitted], values)
             with_variable += _residual_squares(design, values)
+        # F test of the fall of the sum over all axes.
         squares_without, dof_without = without_variable
         squares_with, dof_with = with_variable
         n_added = dof_without - dof_with

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.selection.evidence import agree
+from imu_calibration.selection.evidence import FitsOfHalves, agree
 
 
 @pytest.mark.parametrize(
@@ -21,4 +21,4 @@ def test_halves_disagree_where_both_show_an_effect_and_differently(first, second
     information = [1 / sd**2 for _, sd in (first, second)]
     value = np.average([first[0], second[0]], weights=information)
     whole = np.array([value, 7.0]), np.diag([1 / sum(information), 1.0])
-    assert agree(halves, whole, [0]) == alike
+    assert agree(FitsOfHalves(*halves, whole), [0]) == alike

@@ -18,7 +18,7 @@ from imu_calibration.estimation.noise_likelihood import NoiseLikelihood, NoiseSh
 from imu_calibration.estimation.rows import Rows, flat, normal_of_rows, weights_of
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.estimation.sensor_noise import BiasProcess
-from imu_calibration.selection.evidence import Evidence, ParameterFit
+from imu_calibration.selection.evidence import Evidence, FitsOfHalves
 
 GROUP_FOLDS = 12
 """Number of folds of the groups; with up to `ONE_BY_ONE` groups each group is a fold."""
@@ -102,9 +102,7 @@ class RowEvidence(Evidence):
             prior_mean=np.zeros(len(prior_sd)),
         )
 
-    def fits_of_halves(
-        self, used: Sequence[int]
-    ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
+    def fits_of_halves(self, used: Sequence[int]) -> FitsOfHalves:
         """Return the fits of parameters to both halves of the groups of rows, and to all."""
         first, second = np.array_split(self.groups, 2)
         no_groups = self.groups[:0]
@@ -113,7 +111,7 @@ class RowEvidence(Evidence):
             # The noise is estimated with the effects in the model, as part of the baseline.
             blocks = without_groups(self.blocks, left_out)
             fits.append(RowEvidence(blocks, self.prior_sd, smooth={}, baseline=used).fit(used))
-        return fits[0], fits[1], fits[2]
+        return FitsOfHalves(*fits)
 
     def weights(self, used: Sequence[int]) -> np.ndarray:
         """Return the weights of `Rows.residuals_at` at the fit to all rows, shape (q + 1,)."""

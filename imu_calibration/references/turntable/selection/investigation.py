@@ -41,7 +41,11 @@ from imu_calibration.references.turntable.selection.rivals import (
     settle_rivals,
     simpler,
 )
-from imu_calibration.references.turntable.selection.saturation import windows_at, without_clipping
+from imu_calibration.references.turntable.selection.saturation import (
+    Saturation,
+    windows_at,
+    without_clipping,
+)
 from imu_calibration.references.turntable.selection.testable_effects import testable_effects
 from imu_calibration.references.turntable.selection.window_evidence import MIN_FOLD_WINDOWS
 from imu_calibration.references.turntable.selection.window_gain import gain_in_turn
@@ -75,6 +79,8 @@ class Investigation(SelectedEffects):
     """Windows that were fitted to, without clipped samples."""
     problem: LinearisedProblem
     """Linearised at the findings."""
+    limits: Sequence[Saturation] = ()
+    """Limits at which outputs pile up."""
     rivals: Sequence[Rival] = field(default_factory=list)
     """Alternatives to findings that fit nearly as well."""
     onset: Onset | None = None

@@ -17,7 +17,7 @@ from imu_calibration.references.turntable.selection.parameter_space import (
     normal_matrix,
     within_of_axis,
 )
-from imu_calibration.selection.evidence import Evidence, ParameterFit, squares_of_folds
+from imu_calibration.selection.evidence import Evidence, FitsOfHalves, squares_of_folds
 
 MIN_FOLD_WINDOWS = 8
 """Least number of windows for held-out folds."""
@@ -145,12 +145,10 @@ class WindowEvidence(Evidence):
             normals[:, at[:, None], at] += parts.sum(axis=0)
         return normals
 
-    def fits_of_halves(
-        self, used: Sequence[int]
-    ) -> tuple[ParameterFit, ParameterFit, ParameterFit]:
+    def fits_of_halves(self, used: Sequence[int]) -> FitsOfHalves:
         """Return the fits of parameters to both halves of the windows, and to all of them."""
         first, second = self._halves
-        return self._fitted(first, used), self._fitted(second, used), self.fit(used)
+        return FitsOfHalves(self._fitted(first, used), self._fitted(second, used), self.fit(used))
 
     @cached_property
     def _halves(self) -> list[np.ndarray]:
