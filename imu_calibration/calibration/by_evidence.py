@@ -286,11 +286,12 @@ def stands_out(solution: Solution, question: Question, *, joint_test: bool = Tru
     if not joint_test:
         return True
 
-    # The lever arms of three sensors sum to zero by convention: C may be singular.
-    variances, directions = np.linalg.eigh(covariance)
+    # The lever arms of three sensors sum to zero by convention: C may be singular. The sum is over
+    # its eigenvectors with a variance.
+    variances, eigenvectors = np.linalg.eigh(covariance)
     in_rank = variances > CONVENTION_SHARE * variances[-1]
-    along_directions = directions.T @ change
-    chi_squared = (along_directions[in_rank] ** 2 / variances[in_rank]).sum()
+    components = eigenvectors.T @ change
+    chi_squared = (components[in_rank] ** 2 / variances[in_rank]).sum()
     return bool(chi2_sf(chi_squared, in_rank.sum()) < FAMILY_WISE)
 
 

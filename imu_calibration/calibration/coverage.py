@@ -283,6 +283,7 @@ def arrows_of(coverage: Coverage) -> Iterator[Arrow]:
         yield Arrow('next', -1.25 * RADIUS * step.axis, 1.25 * RADIUS * step.axis, ARROW)
     if coverage.arms is None:
         return
+    # Red, green and blue for the axes x, y, z.
     for colour, arm in zip(0.9 * np.eye(3), coverage.arms, strict=False):
         if arm.any():
             yield Arrow('arms', centre, ARMS_TIMES * arm, tuple(colour))

@@ -183,12 +183,16 @@ def in_paper_units(
     accelerometer = derived.sensor == 'accelerometer'
     size = STANDARD_GRAVITY if accelerometer else DEG
     name = 'g' if accelerometer else '(deg/s)'
+
+    # A recording in SI units: the scale factor is a ratio.
     if nominal is None:
         bias_factor, unit = (1e3 / STANDARD_GRAVITY, 'mg') if accelerometer else (1 / DEG, 'deg/s')
         return (
             PaperValues('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd),
             PaperValues('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor),
         )
+
+    # A recording in volts, SI = (volts - offset) / per_si: the nominal conversion is undone.
     nominal = nominal if isinstance(nominal, RawReadings) else RawReadings.of_scales(**nominal)
     stated = nominal.accelerometer if accelerometer else nominal.gyroscope
     offset = np.asarray(stated.offset)

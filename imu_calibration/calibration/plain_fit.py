@@ -130,7 +130,8 @@ def with_plain_fits(solution: Estimate, fits: Sequence[PlainFit]) -> Estimate:
         estimate = fit.estimate
         values = np.where(estimate.replaced, estimate.values, solution.values)
         change = values - solution.values
-        # At their prior: those that were there and are not fitted, and the dropped effects.
+        # At their prior afterwards: parameters that a prior replaced before and that the fit does
+        # not estimate, and the estimated parameters of effects that the fit drops.
         at_prior = np.isin(names, solution.replaced) & ~estimate.fitted
         at_prior |= estimate.replaced & ~estimate.fitted & ~solution.held
         solution = replace(

@@ -120,9 +120,12 @@ def _compared(
     before = before[has_errors]
     after = after[has_errors]
     counts = counts[has_errors]
+
+    # Ratio of the errors in each resample of the blocks.
     drawn = np.random.default_rng(1).integers(0, len(counts), (BLOCK_RESAMPLES, len(counts)))
     with np.errstate(divide='ignore', invalid='ignore'):
         ratio = np.sqrt(after[drawn].sum(axis=1) / before[drawn].sum(axis=1))
+    # A ratio of two zeros counts as no change, that to a zero before as very large.
     low, high = np.nan_to_num(np.quantile(ratio, (0.025, 0.975)), nan=1.0, posinf=1e9)
     n_errors = judged.components * counts.sum()
     seconds = None

@@ -197,18 +197,21 @@ def _onset_lines(onset: Onset | None) -> list[str]:
     """Return the time of a change of parameters, with their values before and after, as lines."""
     if onset is None:
         return []
-    by_size = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))
     # The largest changes of each sensor: their units differ.
+    by_size = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))
     largest = []
     for sensor in sorted({name.partition('.')[0] for name in by_size}):
         of_sensor = [name for name in by_size if name.partition('.')[0] == sensor]
         largest += of_sensor[:MOST_SHOWN]
+    # Their values, without the unit 1 of a ratio.
     changes = []
     for name in largest:
         before = in_words(onset.before[name], onset.what, onset.units[name]).removesuffix(' 1')
         after = in_words(onset.after[name], onset.what, onset.units[name]).removesuffix(' 1')
         changes.append(f'{name} {before} before, {after} after')
     values = '; '.join(changes)
+
+    # The axes of each sensor that change.
     axes_of_sensors = []
     for sensor, axes in onset.sensor_axes.items():
         if axes:

@@ -63,27 +63,32 @@ def sentence(
         Samples at a limit.
 
     """
+    # The size is the largest amplitude. An amplitude within 2 sd is not: it may be large because it
+    # is collinear with another parameter, such as the bias.
     amplitudes = effect.amplitudes(list(parameters))  # names
-    # The largest is the size. A parameter that is collinear with another, such as the bias, is not.
     significant = [
         name for name in amplitudes if abs(parameters[name].value) > 2 * parameters[name].sd
     ]
     largest = max(significant or amplitudes, key=lambda name: abs(parameters[name].value))
     value, sd, unit = parameters[largest]
     factor, unit = for_people(unit, effect.sensor)
-    size = _with_unit(' +- '.join(with_sd(value * factor, sd * factor)), unit)
-    if not significant and len(parameters) > 1:
-        size = f'known here in combinations only, none of its values by itself: {size}'
     if n_clipped is not None:
         limit = _with_unit(f'{value * factor:.4g}', unit)
         return (
             f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and neighbouring'
             ' samples were excluded.'
         )
-    which = '' if len(amplitudes) == 1 else f' (largest: {largest.split(".")[-1]})'
-    *_, last = parameters.values()
-    when = f' at {last.value:.1f} s' if effect.located else ''
-    text = f'{effect.explanation} Its size is {size}{which}{when}.'
+
+    # The size with its parameter, and the moment of a step.
+    size = _with_unit(' +- '.join(with_sd(value * factor, sd * factor)), unit)
+    if not significant and len(parameters) > 1:
+        size = f'known here in combinations only, none of its values by itself: {size}'
+    if len(amplitudes) > 1:
+        size += f' (largest: {largest.split(".")[-1]})'
+    if effect.located:
+        *_, moment = parameters.values()
+        size += f' at {moment.value:.1f} s'
+    text = f'{effect.explanation} Its size is {size}.'
     if gain is not None and gain.reduction > 0:
         text += (
             f' With it the {gain.of} ({gain.sensor}, held-out {gain.measure}) falls by'

@@ -237,18 +237,16 @@ class DistanceSums:
         """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
         windows = self._windows[sensor]
         n = np.array([window.n_samples for window in windows], float)
-        at_rest = np.array([window.at_rest for window in windows])
-        # For before and after: (sums of squares, numbers of values) of each window.
-        samples, means, within_windows, means_at_rest = [], [], [], []
-        for k in range(2):
-            within = np.array([window.within[k] for window in windows])
-            mean = np.array([window.mean[k] for window in windows])
-            samples.append((within + n * mean, 3 * n))
-            means.append((mean, np.full(len(n), 3.0)))
-            within_windows.append((within, 3 * (n - 1)))
-            means_at_rest.append((mean[at_rest], np.full(at_rest.sum(), 3.0)))
+        at_rest = np.array([window.at_rest for window in windows], bool)
+        # Before and after, of each window, shape (2, n_windows).
+        within = np.array([window.within for window in windows]).reshape(-1, 2).T
+        mean = np.array([window.mean for window in windows]).reshape(-1, 2).T
+        # In the order of `MEASURES`: sums of squares, and the numbers of values in them, all axes.
+        squares = (within + n * mean, mean, within, mean[:, at_rest])
+        numbers = (3 * n, np.full(len(n), 3.0), 3 * (n - 1), np.full(at_rest.sum(), 3.0))
         gains = {}
-        for measure, pair in zip(MEASURES, (samples, means, within_windows, means_at_rest)):
+        for measure, (before, after), number in zip(MEASURES, squares, numbers, strict=True):
+            pair = [(before, number), (after, number)]
             gains[measure] = gain_of(sensor, measure, pair, of=of)
         return gains
 
