@@ -351,13 +351,14 @@ def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
         if effect.sensor in calibration.absent:
             continue
         parameters = calibration.model.slices[effect.key]
-        # k counts the parameters of the effect, index those of the model.
+        # Parameter k of the effect is parameter `index` of the model.
         for k, index in enumerate(range(parameters.start, parameters.stop)):
-            factor, unit = for_people(effect.unit_of(k), calibration.param_names[index])
+            name = calibration.param_names[index]
+            factor, unit = for_people(effect.unit_of(k), name)
             value, sd = with_sd(
                 calibration.values[index] * factor, calibration.own_sd[index] * factor
             )
-            yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
+            yield name, value, sd, unit, str(calibration.status[index])
     common = calibration.common_scale
     if common:
         yield COMMON_SCALE, *with_sd(1.0, common['sd']), '1', str(common['status'])
@@ -391,6 +392,8 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     values = calibration.values[indices]
     covariance = calibration.covariance[np.ix_(indices, indices)]
     status = [calibration.status[index] for index in indices]
+
+    # Biases and matrices of these sensors at their priors, independent of the other parameters.
     for effect in reduced.effects:
         if effect.sensor in sensors and effect.role is not Role.LIMIT:
             parameters = reduced.slices[effect.key]

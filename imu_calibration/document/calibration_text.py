@@ -466,6 +466,8 @@ def _section(calibration: Calibration, section: str) -> dict[str, Any]:
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit),
             'status': status.tolist(),
         }
+
+        # The part of its columns that bias and matrix contain.
         constants = {}
         slopes = {}
         for group in effect.groups:
@@ -478,6 +480,8 @@ def _section(calibration: Calibration, section: str) -> dict[str, Any]:
             entry['centre'] = plain(constants)
         if slopes:
             entry['centre_slope'] = plain(slopes)
+
+        # Why components are held, where one is.
         reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]
         if any(reasons):
             entry['held_reason'] = np.array(reasons, dtype=object).reshape(effect.shape).tolist()

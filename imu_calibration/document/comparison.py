@@ -373,10 +373,8 @@ def _compared(
 
     # 4. Tests. Table and clock are judged separately: they are no property of the IMU.
     groups = _groups(common, difference, covariance, ~excluded) if n_known == 2 else []
-    names_of_reference = set()
-    for effect in first.model.effects:
-        if effect.section == 'reference':
-            names_of_reference |= {name.rpartition('.')[0] for name in effect.param_names()}
+    effects_of_reference = [e for e in first.model.effects if e.section == 'reference']
+    names_of_reference = {'.'.join(effect.key) for effect in effects_of_reference}
     of_reference = [group for group in groups if group.name in names_of_reference]
     of_imu = [group for group in groups if group.name not in names_of_reference]
     rejected_reference = _holm(of_reference)

@@ -89,11 +89,14 @@ def uncorrected_in_time(
     centre: dict[str, ColumnCentre] = {}
     sizes = []
     for effect in not_applied(model):
+        # The columns that are applied as constants.
         at_end = has_settled(latest, effect, end)
         at_times = columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
         for name, columns in applied.items():
             centre[name] = constant_part(effect, columns.mean(axis=0))
+
+        # The remainder on each axis at `times`, shape (n, 3).
         rows = model.layout(effect.sensor).rows
         uncorrected = 0.0
         for name, columns in at_times.items():
@@ -135,7 +138,9 @@ def has_settled(model: SensorModel, effect: Effect, end: float) -> bool:
     Return whether an effect in time has settled at the end of a recording, s.
 
     It has, with its columns c at the point of the model, if each of them changes in a second
-    recording by at most ``|c(2 end) - c(end)| = SETTLED |c(end) - c(0)|``.
+    recording by at most the share `SETTLED` of its change in this one::
+
+        |c(2 end) - c(end)| <= SETTLED |c(end) - c(0)|
 
     Then its value at the end is applied: it holds until the next start. Otherwise the mean is
     applied, with the least error in a recording that repeats the drift; a drift that continues

@@ -196,6 +196,7 @@ def _noise_numbers(
     if target.noise is None:
         return None, []
     noise = _noise_of(calibration, figures, rate)
+    # Without figures a file with other numbers is written without noise.
     if noise is None or (target.needs_walk and not noise.walk_known):
         lacks = 'noise, or the rate of the readings of the calibration,'
         if target.needs_walk:
@@ -322,6 +323,7 @@ def _worked_sample(
 
 def loss_lines(target: Target, loss: Loss, sensors: Sequence[str] = SENSORS) -> list[str]:
     """Return a line for each lost effect, and for the remaining error of each of `sensors`."""
+    # A program without a calibration has the complete error of the readings.
     if target.only_noise:
         remaining = ', '.join(
             f'{sensor} {error_text(rms, UNITS[sensor])}' for sensor, rms in loss.remaining.items()

@@ -19,7 +19,7 @@ from imu_calibration.document.decision import UNPROVEN
 from imu_calibration.document.exports import affine
 from imu_calibration.document.exports.affine import Capability
 from imu_calibration.document.exports.target import Numbers, Read, Readings, Target
-from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.base import INPUT_OF, SENSORS, Effect
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD, WEAK
@@ -84,6 +84,7 @@ def standard_motion(calibration: Calibration) -> TrialMotion:
     azimuth = 2 * np.pi * SPIRAL_TURNS * time / SPIRAL_SECONDS
     level = np.sqrt(1.0 - height**2)
     force = gravity * np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
+    # Rates and their derivatives, shape (n, 3).
     phase = 2 * np.pi * RATE_FREQUENCIES * time[:, None]
     rate = largest * np.sin(phase)
     alpha = largest * 2 * np.pi * RATE_FREQUENCIES * np.cos(phase)
@@ -220,14 +221,12 @@ def loss_of(
     model, values = invertible_values(calibration)
     ref = motion.reference
     estimated = [
-        effect
-        for effect in model.effects
-        if effect.key in calibration.model.slices and affine.capability_of(effect, target.estimates)
+        effect for effect in model.effects if affine.capability_of(effect, target.estimates)
     ]
     values_unestimated = values.copy()
     for effect in estimated:
         values_unestimated[model.slices[effect.key]] = effect.prior_values()
-    # In the frame of the program: true quantities, and readings by the formula of the program.
+    # In the frame of the program: true (force, rate), and readings by the formula of the program.
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
     # The whole document represents all effects of the full compensation.
     corrected = true
@@ -251,12 +250,14 @@ def loss_of(
             lost_effect = _lost_effect(calibration, effect, target.holds, motion)
             if lost_effect is not None:
                 lost.append(lost_effect)
+
+    # Errors by the formula of the program, and of raw readings.
     remaining = {}
     raw_error = {}
-    for index, sensor in enumerate(SENSORS):
-        remaining[sensor] = _rms(corrected[index] - true[index])
+    for sensor, result, true_result in zip(SENSORS, corrected, true, strict=True):
+        remaining[sensor] = _rms(result - true_result)
         raw = sensor_output(model, sensor, values, ref=ref)
-        raw_error[sensor] = _rms(raw - (ref.force_s, ref.rate_s)[index])
+        raw_error[sensor] = _rms(raw - getattr(ref, INPUT_OF[sensor]))
     return Loss(
         effects=tuple(lost),
         estimated=tuple(estimated),
