@@ -41,6 +41,7 @@ def averaging_factors(n_samples: int, per_octave: int = PER_OCTAVE) -> np.ndarra
 
 def _octaves_beyond(factor: np.ndarray) -> np.ndarray:
     """Return the numbers of halvings of the rate that reduce factors to at most `FULL`."""
+    # 1e-9: a rounding error at a power of two adds no halving.
     return np.maximum(np.ceil(np.log2(np.maximum(factor, 1) / FULL) - 1e-9), 0).astype(np.int64)
 
 

@@ -656,7 +656,7 @@ def _rest_line(recording: Mapping[str, Any]) -> str:
         line += f' in {recording["parts"]} parts, the longest {longest}'
     left_out = []
     for name, seconds in recording['left_out'].items():
-        if seconds >= 0.05:
+        if seconds >= 0.05:  # less is printed as 0.0
             left_out.append(f'{seconds:.1f} s of {name.replace("_", " ")}')
     if left_out:
         line += f'; left out: {", ".join(left_out)}'

@@ -190,6 +190,7 @@ def fit_processes(
             columns = whitener(design[:, free])
             norms = np.linalg.norm(columns, axis=0)
             new[free] = nnls(columns / norms, whitener(target - fixed_variance))[0] / norms
+        # The coefficients of the last weights are the same to seven digits.
         done = np.all(np.abs(new - values) <= 1e-7 * np.maximum(new, values))
         values = new
         if done:
@@ -245,7 +246,7 @@ def _first_guess(design: np.ndarray, target: np.ndarray, moments: Moments) -> np
 
     weight = 1.0 / (target * np.sqrt(moments.scales.tau[moments.used]))
     values = nnls(design * weight[:, None], target * weight)[0]
-    return np.maximum(values, 1e-6 * np.min(target[:, None] / design, axis=0))
+    return np.maximum(values, FLOOR * np.min(target[:, None] / design, axis=0))
 
 
 def fit_with_time(

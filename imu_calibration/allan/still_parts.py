@@ -90,9 +90,11 @@ def still_parts(
         Smallest step between readings of each column.
 
     """
+    # Chunks in which a sensor repeats its reading, and those at another rate.
     frozen = np.logical_or(*frozen_chunks(chunks, resolution).values())
     seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0  # of a chunk
     usual_rate = _at_the_usual_rate(chunks, period)
+
     # Rest is relative to the quietest tenth of the chunks, which frozen chunks would all be.
     live = chunks.select(~frozen)
     still = np.zeros(len(chunks), bool)
@@ -100,6 +102,8 @@ def still_parts(
     # Without the time in which the IMU settles after a motion, and as long before one.
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
     settled = shrunk_mask(still, margin)
+
+    # Runs of these chunks, long enough and without a long hole.
     parts = []
     seconds_short = 0.0
     for first, last in runs_of(settled, np.diff(chunks.time) > BRIDGE):
@@ -196,6 +200,7 @@ def _at_step(mean: np.ndarray, still: np.ndarray, width: int) -> np.ndarray:
         return at_step
     margin = max(width // 8, 1)
     for column in difference.T:
+        # 1.4826 times the median of absolute values is the sd of a normal distribution.
         step_size = np.where(comparable, column, 0.0)
         usual_size = 1.4826 * np.median(column[comparable])
         if not usual_size > 0:

@@ -231,12 +231,13 @@ def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
     2)``. Its correlations are those of the variances; squares are divided by `excess`. The cost is
     infinite for a fit that expects no variance at some averaging time.
     """
+    # Only averaging times with enough means for nearly Gaussian logarithms.
     compared = moments.scales.tau[moments.used] * MIN_COMPARED_MEANS <= moments.scales.longest
     expected = (moments.design(fit.processes) @ fit.coefficients)[compared]
     covariance = fit.covariance[np.ix_(compared, compared)]
     if not (np.all(expected > 0) and np.all(np.isfinite(covariance))):
         return np.inf
-    freedom = 2 * expected**2 / np.diag(covariance)
+    freedom = 2 * expected**2 / np.diag(covariance)  # n, from the variance 2 f^2 / n
     # Standard deviation of a logarithm over the relative one of its variance.
     log_factor = np.sqrt(polygamma(1, freedom / 2) * freedom / 2)
     whiten = Whitener(covariance / np.outer(expected, expected) * np.outer(log_factor, log_factor))

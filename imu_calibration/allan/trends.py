@@ -272,7 +272,7 @@ class TrendSearch:
         whitening = self.regress(axis, pairs).whitening
         design = np.column_stack([self._constants, self.columns(pairs)])
         remaining = np.eye(len(design)) - design @ np.linalg.pinv(whitening @ design) @ whitening
-        # Blocks per mean, two per octave.
+        # Blocks per mean, two per octave; 0.01 includes the last one in spite of rounding.
         counts = np.unique(
             np.rint(2.0 ** np.arange(0, np.log2(max(len(design) / 2, 1)) + 0.01, 0.5)).astype(int)
         )

@@ -275,6 +275,7 @@ def arrows_of(coverage: Coverage) -> Iterator[Arrow]:
     """
     step = coverage.next
     centre = np.zeros(3)
+    # Within the sphere the direction now, beyond it the next one.
     if coverage.up is not None:
         yield Arrow('up now', centre, 0.85 * RADIUS * coverage.up, NOW)
     if step.up is not None:

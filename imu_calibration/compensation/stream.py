@@ -101,7 +101,8 @@ class CompensationStream:
         A reading that is NaN, absent or broken remains NaN and does not affect its neighbours or
         the other sensor.
         """
-        # The first block determines how the samples are stamped.
+        # The first block determines how the samples are stamped; too few stamps count as those of a
+        # clock, a single one as at 100 Hz.
         if self.slope.line is None and len(imu):
             first = imu.stamp_ns[:10_000]
             line = describe_stamps(first)
@@ -363,7 +364,7 @@ def _as_samples(calibration: FittedErrors, force_s: Vectors, rate_s: Any, time: 
                 ' give `time` in seconds',
                 code='time_missing',
             )
-        time = np.arange(len(force_s)) * 0.01
+        time = np.arange(len(force_s)) * 0.01  # 100 Hz; no derivative is used
     imu = SampleBlock.from_arrays(time, force_s, rate_s).imu
     assert imu is not None, 'a block of arrays has readings'
     return imu

@@ -115,20 +115,21 @@ class DiagnosisResult:
     @property
     def notes(self) -> list[str]:
         """
-        Notes on residuals above the noise at rest, and on biases that step or wander on every axis.
+        Notes on residuals above the noise at rest, and on biases that move between windows.
 
-        They are on sensors without an unexplained residual. An onset explains them all.
+        They are those of `motion_misfits` and `unsteady`, of sensors whose residual is not
+        significant in the diagnosis. An onset explains all of them.
         """
         if self.diagnosis.onset is not None:
             return []
-        explained_sensors = set()
+        quiet_sensors = set()
         for sensor, residual in self.diagnosis.unexplained.items():
             if not residual.significant:
-                explained_sensors.add(sensor)
+                quiet_sensors.add(sensor)
         wandering = unsteady(self.calibration, self.tolerances)
         notes = []
         for reason in (*motion_misfits(self.calibration), *wandering):
-            if not explained_sensors.issuperset(reason.sensors):
+            if not quiet_sensors.issuperset(reason.sensors):
                 continue
             # Noise that is larger in motion has no effect that could explain it.
             needs_cause = reason in wandering or reason.key == 'diagnose'

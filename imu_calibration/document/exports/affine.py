@@ -291,6 +291,7 @@ def find_pose(content: bytes) -> tuple[Placement, str] | None:
         return None
     origin = values[:3]
     quaternion = values[3:]
+    # Not a unit quaternion within 1 %: no pose.
     if not np.all(np.isfinite(values)) or not 0.99 < np.linalg.norm(quaternion) < 1.01:
         return None
     if parent == UNNAMED:

@@ -121,6 +121,8 @@ def recorded_motion(
             f'{name} must have readings that can be compensated, it has none; give another'
             ' recording'
         )
+
+    # The period is that of the first samples; a single sample counts as one at 100 Hz.
     stamps = imu.stamp_ns[valid]
     period = typical_period(stamps[:10_000]) or 0.01
     derivative = StampedDerivative(derivative_for(calibration, period))
