@@ -514,7 +514,7 @@ SEARCH = _of(
     (
         'another look where nothing is left',
         '_looked_again',
-        'not _1.remaining_excess',
+        'not excess',
         'False',
         'test_rivals_pairs.py::test_pairs_are_tested_for_a_remaining_excess',
     ),

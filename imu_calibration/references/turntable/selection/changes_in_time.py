@@ -167,18 +167,21 @@ class WindowRows:
         Parameters
         ----------
         at : ndarray, shape (c,)
-            Places of the parameters.
+            Places of the parameters, increasing.
 
         """
         axes = []
         for rows in self.axes:
+            # Columns of the axis, without its residual, that belong to one of these parameters.
             columns = np.flatnonzero(np.isin(rows.places[:-1], at))
             if not len(columns):
                 continue
             order = np.searchsorted(at, rows.places[columns])
             mean = rows.means.equations[:, :, columns]
+            # Their products with all columns of the axis, and of these with one another.
             within = rows.within[:, :, columns]
-            axes.append(_ChangingOfAxis(rows, order, mean, within, within[:, columns]))
+            squares = within[:, columns]
+            axes.append(_ChangingOfAxis(rows, order, mean, within, squares))
         return ChangingColumns(len(self.expected), self.space.size + 1, len(at), tuple(axes))
 
     def fit(self, parameters: np.ndarray, changes: Changes | None = None) -> ChangeFit:
@@ -232,6 +235,8 @@ class WindowRows:
 
             squares = v'N v - 2 v'C c + c'S c,   expected = n, variance 2 n
 
+        N is the normal matrix of a part, C and S are its `Changes.cross` and `Changes.squares`. An
+        excess is significant from `SIGNIFICANT_REST` standard deviations on.
         """
         weights = weights_of(parameters.tolist(), fit.values, self.space.size)
         squares = np.einsum('i,kij,j->k', weights, self.part_normals, weights)
@@ -293,7 +298,7 @@ class ChangingColumns:
         squares = np.zeros((self.n_parts, n_changes, n_changes))
         products = functions[:, :, None] * functions[:, None]  # f g in each window, (n, m, m)
         for axis in self.axes:
-            # The changes along the first function are first, in the order of the parameters.
+            # Change of parameter j along function m: place m * count + j.
             rows = axis.rows
             places = (np.arange(n_functions)[:, None] * self.count + axis.order).ravel()
             at_cross = (rows.places[:, None], places)
@@ -306,6 +311,7 @@ class ChangingColumns:
             squares[rows.part][at_squares] += white.T @ white
 
             # Within windows, where the function is constant: sum_w f_w P_w and sum_w f_w g_w P_w.
+            # Shapes (p + 1, m, c) and (m, c, m, c), so that both reshape to the order of `places`.
             with_model = np.tensordot(axis.within, functions, (0, 0)).transpose(0, 2, 1)
             of_products = np.tensordot(products, axis.squares, (0, 0)).transpose(0, 2, 1, 3)
             cross[rows.part + 1][at_cross] += with_model.reshape(len(rows.places), -1)

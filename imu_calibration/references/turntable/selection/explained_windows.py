@@ -37,7 +37,7 @@ class ExplainedWindows(Explained):
         scatter = scatter_of_each(evidence.space, evidence.noise, values)
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
         """Evidence with this noise."""
-        # Squares of all axes.
+        # Numbers of squares of all axes, as in the two parts of `WindowEvidence.unpredicted`.
         n_means = 3.0 * len(recording.windows)
         n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
         numbers = dict.fromkeys(evidence.space.sensors, np.array([n_means, n_within]))

@@ -33,7 +33,7 @@ def extended_solution(
         Limits to write into the model.
 
     """
-    # Linearised where the rows of the recording are.
+    # Linearised where the rows of the recording are, so that their statistics are used again.
     model_of_rows = problem.recording.model
     model = replace(
         problem.baseline,
@@ -43,10 +43,12 @@ def extended_solution(
     )
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    trusted = {}
-    for sensor, noise in problem.noise.items():
-        trusted[sensor] = _in_trusted_band(noise, problem.space.slow_only[sensor])
+    trusted = {
+        sensor: _in_trusted_band(noise, problem.space.slow_only[sensor])
+        for sensor, noise in problem.noise.items()
+    }
     solution = solve(problem.recording.accumulated(model), model, noise=trusted)
+    # Folded arms are a property of the columns of a search, not of its result.
     solution = replace(solution, model=replace(model, folded_arms=None))
     for limit in saturations:
         solution = _with_limit(solution, limit)

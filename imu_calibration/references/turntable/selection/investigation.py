@@ -230,10 +230,15 @@ class _SearchResult:
 
 def _with_clock_step(searched: SearchedWindows, step: Effect, onset: Onset) -> _SearchResult:
     """Return the search with a step of the clock too, from the values of an onset of the clock."""
+    # An onset of the clock has one parameter, its offset: that before the onset, and the step.
+    ((offset_name, offset),) = onset.before.items()
+    size_name, time_name = step.param_names()
+    values = {
+        offset_name: offset,
+        size_name: onset.after[offset_name] - offset,
+        time_name: onset.time,
+    }
     effects = [*searched.effects, step]
-    ((name, before),) = onset.before.items()
-    size_and_time = (onset.after[name] - before, onset.time)
-    values = {name: before, **dict(zip(step.param_names(), size_and_time))}
     searched = replace(searched, effects=effects)
     problem = searched.linearised(point_with(searched.baseline, effects, values))
     start = [question for question in problem.questions if question.name == step.name]
@@ -255,11 +260,17 @@ def _search_result(
     for question in likeliest:
         if question.name not in FAMILY or problem.windows_agree(likeliest, question):
             chosen.append(question)
-    explanations = lag_explanations(problem, [*chosen, *problem.search.early(chosen)], searched)
+
+    # Lags together. An early clock with a late sensor looks like a negative lag, which a search
+    # does not choose.
+    early_lags = problem.search.early(chosen)
+    explanations = lag_explanations(problem, [*chosen, *early_lags], searched)
     if explanations is not None:
         searched = replace(searched, resolved=FAMILY)
         outcome, rivals = _with_lags(explanations, searched)
         return _SearchResult(outcome, rivals, searched)
+
+    # No lags, or none that explains the data: each timing effect against its rivals.
     settled, rivals = settle_rivals(problem, chosen, searched)
     if settled is not problem:
         chosen = settled.search.run()
@@ -329,19 +340,25 @@ def _with_lags(
     refused: list[Explanation] = []  # explanations of which some lags are not named
     tried = []
     for number in range(EXPLANATIONS):
+        # Search for the other effects at the lags of the simplest explanation.
         selected = simplest(candidates, explanations.cost_without_lag)
         at_lags = explanations.settled(selected, searched)
         chosen = at_lags.problem.search.run(at_lags.chosen)
+        # Its timing effects may be replaced by rivals, at another linearisation.
         settled, rivals = settle_rivals(at_lags.problem, chosen, searched)
         if settled is not at_lags.problem:
             chosen = _chosen_again(settled, chosen)
         outcome = _outcome(settled, chosen)
+
+        # The trial succeeds if all lags are named, also without the effects that are not.
         trial = _Trial(number, selected.lags.keys(), outcome, [*at_lags.rivals, *rivals])
         if trial.names_all_lags:
             trial = trial.finished(searched)
             if trial.names_all_lags:
                 return trial.outcome, trial.rivals
         tried.append(trial)
+
+        # Next an explanation with fewer effects; with one effect, if this one had only one.
         refused.append(selected)
         candidates = explanations.others(max(len(selected.lags) - 1, 1), refused)
         if not candidates:
@@ -378,23 +395,27 @@ def _looked_again(
     """
     Return the outcome of further searches if they remove nearly all of a remaining excess.
 
-    They start from pairs of effects, or allow implausible sizes. Any two of many effects reduce an
-    excess of a different cause somewhat: together they must remove nearly all. Otherwise `outcome`
-    is returned. `tried`: labels of the choices that were linearised; the new one is added.
+    They start from the resolved effects alone and with each of the best pairs of effects;
+    `searched.any_size` allows implausible sizes. Any two of many effects reduce an excess of a
+    different cause somewhat: together they must remove nearly all. Otherwise `outcome` is returned.
+
+    `tried`: labels of the choices that were linearised. Those of a new choice are added to it.
     """
-    if not outcome.remaining_excess:
+    excess = outcome.remaining_excess
+    if not excess:
         return outcome
+
+    # The choice of least cost of all searches.
     problem = outcome.problem.asking_any_size() if searched.any_size else outcome.problem
     search = problem.search
-    lags = _resolved(problem, outcome.chosen)
-    choices = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
+    resolved = _resolved(problem, outcome.chosen)
+    choices = [search.run([*resolved, *start]) for start in ((), *best_pairs(search))]
     best = min(choices, key=search.cost)
+
+    # Is it worth its linearisations?
     if _labels(best) in tried:
         return outcome
-    if (
-        outcome.problem.explained.remaining_excess(best)
-        >= MAX_EXCESS_BEFORE * outcome.remaining_excess
-    ):
+    if outcome.problem.explained.remaining_excess(best) >= MAX_EXCESS_BEFORE * excess:
         return outcome
     # Implausible sizes have a price; without them the better choice has the lower cost.
     if not searched.any_size and search.cost(best) >= search.cost(outcome.chosen):
@@ -402,11 +423,7 @@ def _looked_again(
 
     tried.add(_labels(best))
     other = _settled(searched, problem, best)
-    return (
-        other
-        if other.remaining_excess < MAX_REMAINING_EXCESS * outcome.remaining_excess
-        else outcome
-    )
+    return other if other.remaining_excess < MAX_REMAINING_EXCESS * excess else outcome
 
 
 def _settled(

@@ -66,18 +66,17 @@ class LagHypothesis:
         for question in self.chosen:
             if question.name in FAMILY | CLOCKS:
                 names.update(question.effect.param_names())
-        values = {}
-        for name, value in zip(self.problem.space.names, self.problem.values(self.chosen)):
-            if name in names:
-                values[name] = value
-        return values
+        values = zip(self.problem.space.names, self.problem.values(self.chosen))
+        return {name: value for name, value in values if name in names}
 
     def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the lags of one sensor, in the order of the kind."""
-        used = self.problem.search.indices(self.chosen)
-        values, covariance = self.problem.evidence.fit(used)
+        fitted = self.problem.search.indices(self.chosen)
+        values, covariance = self.problem.evidence.fit(fitted)
+        # A lag has one parameter.
         parameter = {question.name: question.parameters[0] for question in self.chosen}
-        places = [used.index(parameter[lag_name(sensor, ending)]) for ending in self.kind]
+        # Places of the lags among the fitted parameters.
+        places = [fitted.index(parameter[lag_name(sensor, ending)]) for ending in self.kind]
         return values[places], covariance[np.ix_(places, places)]
 
     def without(self, sensor: str) -> list[Question]:
@@ -138,11 +137,9 @@ class LagExplanations:
 
     def settled(self, selected: Explanation, searched: SearchedWindows) -> 'SettledLags':
         """Return an explanation with the problem linearised at its lags."""
-        # Linearise at the lags of the explanation.
         parameter = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
-        values = dict(selected.values)
-        for name, lag in selected.lags.items():
-            values[parameter[name]] = lag
+        lags_of_parameters = {parameter[name]: lag for name, lag in selected.lags.items()}
+        values = selected.values | lags_of_parameters
         settled = searched.linearised(
             point=point_with(self.problem.baseline, self.problem.effects, values)
         )
@@ -195,9 +192,10 @@ def lag_explanations(
     has_lag = any(question.name in FAMILY for question in chosen)
     if not has_lag or not FAMILY <= set(effects):
         return None
+    # Warm-ups of the bank ('@') are left to the search at the lags.
     other_effects = [each for each in chosen if each.name not in FAMILY and '@' not in each.label]
 
-    # Lags are nonlinear at a clock of zero where a clock changes.
+    # Where a clock changes, the lags are linearised at its estimated rate or step, not at zero.
     values = problem.values(chosen)
     clocks = {}
     for question in chosen:
@@ -207,6 +205,7 @@ def lag_explanations(
     hypotheses = _hypotheses(searched, effects, other_effects=other_effects, clocks=clocks or None)
 
     judges = [each.problem for each in hypotheses]
+    # Parameters are named 'sensor.effect.component'.
     names = [name for name in hypotheses[0].values if name.split('.')[1] not in FAMILY]
     explanations = _explanations(hypotheses, judges, names)
     if not explanations:
@@ -234,12 +233,16 @@ def simplest(
         a common clock is then accepted within the resolution of the misfit.
 
     """
-    best = min(each.cost for each in explanations)
-    near = [each for each in explanations if each.cost < best + TIE]
+    best_cost = min(each.cost for each in explanations)
+    near = [each for each in explanations if each.cost < best_cost + TIE]
     selected = min(near, key=lambda each: each.rank)
-    if cost_without_lag is None or len(selected.lags) < 2 or CLOCK in selected.lags:
+    if cost_without_lag is None:
         return selected
-    largest_cost = best + TIE + MAX_CLOCK_LOSS * (cost_without_lag - best)
+    if len(selected.lags) < 2 or CLOCK in selected.lags:  # no separate lags of both sensors
+        return selected
+
+    # Without rests: a common clock in place of separate lags, up to `MAX_CLOCK_LOSS`.
+    largest_cost = best_cost + TIE + MAX_CLOCK_LOSS * (cost_without_lag - best_cost)
     with_common_clock = []
     for each in explanations:
         has_as_many = CLOCK in each.lags and len(each.lags) == len(selected.lags)
@@ -282,9 +285,11 @@ def _hypotheses(
     first = _hypothesis(searched, DELAY, first.values, effects=effects, other_effects=other_effects)
     hypotheses = [first]
     for kind in LAG_KINDS[1:]:
+        # The whole lag of each sensor is that of the delay; two lags share it.
         values = dict(first.values)
         for sensor in SENSORS:
-            delay = first.lags(sensor)[0][0]
+            estimates, _ = first.lags(sensor)
+            delay = estimates[0]
             lags = [delay]
             if len(kind) == 2:
                 low_pass = FIRST_SHARE * abs(delay)
@@ -342,13 +347,12 @@ def _explanations(
     for sensor in SENSORS:
         no_lag = _without_lag(hypotheses[0], judges, sensor)
         cost_without += no_lag.cost
-        of_sensor = [no_lag]
-        for hypothesis in hypotheses:
-            of_sensor.append(_option(hypothesis, judges, sensor))
+        with_lag = [_option(hypothesis, judges, sensor) for hypothesis in hypotheses]
+        of_sensor = [no_lag, *with_lag]
         if len(hypotheses) == 1:
-            # Without curvature the kinds are one column.
+            # Delays only: no curvature is observable, and the fit of a low-pass is that of a delay.
             for ending in ('bandwidth', 'filter'):
-                of_sensor.append(replace(of_sensor[1], kind=(ending,), alike=True))
+                of_sensor.append(replace(with_lag[0], kind=(ending,), alike=True))
         options.append(of_sensor)
 
     explanations = []
@@ -461,17 +465,19 @@ def _explanations_of_pair(
     if not (one.kind and two.kind):
         return
 
-    # A common clock with the smaller lag, and the difference as lag of the later sensor. The fit is
-    # that of separate lags.
+    # A common clock with the smaller lag, and the difference as lag of the later sensor. The fit,
+    # and so the cost, is that of separate lags.
     difference = float(one.lags[0] - two.lags[0])
     later, earlier = (one, two) if difference > 0 else (two, one)
     if earlier.kind == DELAY and (later.kind == DELAY or later.alike):
         clock = {CLOCK: float(earlier.lags[0])}
         yield Explanation(clock | later.named([abs(difference)]), cost, values)
 
-    # A common clock in place of both delays: a parameter less, for the misfit of their difference.
+    # A common clock, their weighted mean, in place of both delays: one parameter less, so that the
+    # cost falls by its penalty and rises by the misfit d^2 / (2 (v1 + v2)) of their difference d
+    # with variances v1, v2. The other lags of both sensors follow by least squares.
     if one.kind[0] == two.kind[0] == 'delay':
-        variances = np.array([one.covariance[0, 0], two.covariance[0, 0]])
+        variances = np.array([one.covariance[0, 0], two.covariance[0, 0]])  # of both delays
         shared = float(np.average([one.lags[0], two.lags[0]], weights=1 / variances))
         remaining = one.named(one.with_delay(shared)) | two.named(two.with_delay(shared))
         remaining = {name: lag for name, lag in remaining.items() if not name.endswith('delay')}
@@ -496,7 +502,7 @@ def _rivals(
 
     """
     question_of = {question.name: question for question in settled.questions}
-    rivals: dict[str, Rival] = {}
+    rivals: dict[str, Rival] = {}  # added lag -> its rival, from the explanation of least cost
     for other in sorted(near, key=lambda explanation: explanation.cost):
         removed = sorted(set(selected.lags) - set(other.lags))
         added = sorted(set(other.lags) - set(selected.lags))
@@ -508,18 +514,19 @@ def _rivals(
                 continue
 
             # It replaces a lag of the same sensor, otherwise the clock or the first removed lag.
-            replaced = CLOCK if CLOCK in removed else removed[0]
-            for lag in removed:
-                if question_of[lag].sensor == question_of[name].sensor:
-                    replaced = lag
-                    break
+            sensor = question_of[name].sensor
+            otherwise = CLOCK if CLOCK in removed else removed[0]
+            replaced = next(
+                (lag for lag in removed if question_of[lag].sensor == sensor), otherwise
+            )
 
-            # The change of the parameters counts once for each replaced lag.
-            known = {rival.question.name for rival in rivals.values()}
+            # The moves of the other parameters are those of the whole explanation: they are in one
+            # rival of each replaced lag only.
+            with_moves = {rival.question.name for rival in rivals.values()}
             rivals[name] = Rival(
                 question=question_of[replaced],
                 other=question_of[name],
                 behind=other.cost - selected.cost,
-                moves={} if replaced in known else moves,
+                moves={} if replaced in with_moves else moves,
             )
     return list(rivals.values())

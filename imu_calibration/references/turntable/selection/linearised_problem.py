@@ -130,10 +130,13 @@ class LinearisedProblem:
             bank=make_bank(effects, self.constants, model, values=values),
         )
 
-        # Noise, fits and choices are from the windows that are not locked.
+        # Places of the parameters of the baseline in the model with all effects.
         places = range(len(values))
         parts = [places[model.slices[effect.key]] for effect in baseline.effects]
         in_baseline = tuple(chain.from_iterable(parts))
+
+        # Noise, fits and choices are from the windows that are not locked. A first linearisation is
+        # at the start of the baseline: the residuals of all windows move to its solution.
         of_selection = recording.select(~self.locked)
         if point is None:
             of_selection = _at_baseline(of_selection, baseline, in_baseline)
@@ -282,7 +285,7 @@ class LinearisedProblem:
             if part_here is not None:
                 start[part] = values[part_here]
                 if effect.time_constant:
-                    # A step along the tangent may pass zero.
+                    # A step along the tangent may pass zero, or far beyond the duration.
                     shortest = 0.25 * self.constants[0]
                     longest = 4.0 * self.constants[-1]
                     start[part.stop - 1] = np.clip(start[part.stop - 1], shortest, longest)
@@ -361,7 +364,7 @@ def _curvature(
     Return the relative error of the tangent of an effect at its estimate.
 
     For a lag it is its change from the linearisation times `DELAY_FREQUENCY`, for a time constant
-    the logarithm of the ratio.
+    the logarithm of the ratio. Other effects multiply the matrix of the sensor (`BILINEAR`).
     """
     effect = question.effect
     value = values[list(question.parameters)]

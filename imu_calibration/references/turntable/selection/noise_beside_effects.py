@@ -69,15 +69,17 @@ def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
             slow_squares, slow_rank = least_misfit(
                 space.within_sum(sensor, axis, moving, part='slow')
             )
+            # The misfit of one axis, three times, because the function takes three axes.
             misfit = band_misfit(
                 np.full(3, squares),
                 n_rows - rank,
                 np.full(3, slow_squares),
                 dof_slow=n_slow_rows - slow_rank,
             )
+            # The fast part is unexplained: above the slow part, and clearly above noise at rest.
             if misfit.apart[0] and misfit.fast[0] >= 2.0 * variance_at_rest[axis]:
                 slow_only[sensor][axis] = True
-                slow_variance[sensor][axis] = misfit.slow[axis]
+                slow_variance[sensor][axis] = misfit.slow[0]
     return replace(space, slow_only=slow_only, slow_variance=slow_variance)
 
 
@@ -200,7 +202,8 @@ def plausible_processes(
         return least_processes
     wander = float(np.sqrt(sum(process.within(duration) ** 2 for process in noise.bias_processes)))
     plausible = PLAUSIBLE * max(least_processes[0].sd, STABLE[sensor])
-    # `middle_wander` is of a long duration, as `bias_variance`.
+    # `middle_wander` and the root of `bias_variance` are sds over a long duration: their ratio, the
+    # share of the middle axis, applies to the sd within the duration of the recording too.
     limit_by_middle_axis = (
         MAX_MIDDLE_RATIO * noise.middle_wander * wander / float(np.sqrt(noise.bias_variance))
     )
@@ -250,7 +253,8 @@ def _with_moving_factors(
 
     The scatter is the variance of the residual at the parameters `values`, shape (q,). With
     `is_correlated` it grows by the ratio of the mean square of the residual along the columns of
-    each window to this variance, which is 1 for white noise.
+    each window to this variance, the mean over the axes, which is 1 for white noise. The factors
+    are on ``white_variance * inflation``.
     """
     recording = space.recording
     weights = weights_of(range(space.size), values, space.size)
@@ -290,16 +294,17 @@ def _scatter_in_windows(
     """
     Return (variance of the residual of an axis, its mean square along the columns of each window).
 
-    `rows`: mask of the windows, with `dof` degrees of freedom; `weights`: those of the residual in
-    the rows of the axis.
+    `rows`: mask of the windows, with `dof` degrees of freedom; `weights`, shape (q_a + 1,): a row
+    ``[design | residual]`` of the axis times these is the residual of the fit.
     """
     variance = 0.0
     squares = 0.0
     rank = 0
     for products in space.within_each(sensor, axis, rows):
-        # With the residual of the fit in place of that of the linearisation.
+        # With the rows B of a window, B'B w in the last column of B'B: products of all columns with
+        # the residual B w of the fit, in place of that of the linearisation.
         products[:, :, -1] = products @ weights
-        variance += (weights @ products[:, :, -1].T).sum() / dof
+        variance += (weights @ products[:, :, -1].T).sum() / dof  # w'B'B w
         squares_of_windows, rank_of_windows = misfit_along(products)
         squares += squares_of_windows
         rank += rank_of_windows
@@ -329,7 +334,8 @@ def _with_bias_process(
         Parameters of each effect of the sensor that is smooth in time.
 
     """
-    # Means of the windows with the parameters of the sensor, the smooth effects last.
+    # Means of the windows ``[structural | smooth | residual]`` with the parameters of the sensor,
+    # from the rows of each axis, which have only the parameters that act on it.
     recording = space.recording
     of_smooth = sorted(set().union(*smooth))
     structural = np.setdiff1d(np.concatenate(space.index[sensor]), of_smooth)
@@ -347,7 +353,8 @@ def _with_bias_process(
     processes = natural_processes(noise[sensor], recording.period)
     natural_wander = float(np.sqrt(sum(process.sd**2 for process in processes)))
     smooth_columns = equations[:, :, len(structural) : -1]
-    options = []  # columns of each smooth effect among `smooth_columns`
+    # Columns of each smooth effect among `smooth_columns`.
+    options = []
     for parameters_of_effect in smooth:
         options.append([place[k] - len(structural) for k in parameters_of_effect])
     wander = _WanderProblem(
@@ -363,8 +370,8 @@ def _with_bias_process(
     )
     choice = _best_course(wander)
 
-    # Offsets and bias process with that model. The wander of the middle axis is a limit
-    # (`plausible_processes`), needed only where the process exceeds a plausible one.
+    # Offsets and bias process with that model, of a grid of sizes, then refined. The wander of the
+    # middle axis is a limit (`plausible_processes`), needed only above a plausible process.
     search = choice.search
     shape, _ = search.best(choice.used)
     middle_wander = 0.0

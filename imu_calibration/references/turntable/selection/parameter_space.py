@@ -75,18 +75,18 @@ class ParameterSpace:
 
     def restricted(self, kept: np.ndarray) -> 'ParameterSpace':
         """Return the space of the parameters `kept`, shape (q',), in this order."""
-        order = np.argsort(kept)
+        # The new number of a parameter is its place in `kept`.
+        new_number = np.full(self.size, -1)
+        new_number[kept] = np.arange(len(kept))
         joined: dict[str, list[_Joined]] = {}
         for sensor in self.sensors:
             joined[sensor] = []
             for axis, acting in enumerate(self.index[sensor]):
-                is_kept = np.isin(acting, kept)
-                # The new number of a parameter is its place in `kept`.
-                place = np.searchsorted(kept, acting[is_kept], sorter=order)
-                columns = np.append(is_kept, True)
+                is_kept = new_number[acting] >= 0
+                columns = np.append(is_kept, True)  # and the residual, which is last
                 join = self.join[sensor][axis][:, columns]
                 within = self.join_within[sensor][axis][:, columns]
-                joined[sensor].append(_Joined(order[place], join, within))
+                joined[sensor].append(_Joined(new_number[acting[is_kept]], join, within))
         return replace(
             self,
             names=tuple(self.names[k] for k in kept),
@@ -456,9 +456,11 @@ def mean_rows(
     """
     recording = space.recording
     of_sensor = noise[sensor]
+    # Errors, times and recordings of the windows, three axes, without columns.
     means = recording.mean_rows(np.zeros((len(recording.kind), 3, 0)), of_sensor)
     variance = means.variance
     if scatter is not None:
+        # Only the part of the variance that the samples cause grows.
         of_samples = of_sensor.mean_variance(recording.kind, recording.count)
         variance = variance + (scatter - 1) * of_samples
     rows_of_axes = []

@@ -260,6 +260,10 @@ def best_pairs(search: Search) -> list[list[Question]]:
     return best
 
 
+BLOCK_JITTER = 1e4 * JITTER
+"""Added to the diagonal of scaled blocks, so that a singular one has a factor."""
+
+
 class _Blocks:
     """
     Normal equations ``M x = b`` of the parameters of all questions, one question after the other.
@@ -285,11 +289,12 @@ class _Blocks:
         matrix = information[np.ix_(free, free)] - cross.T @ scipy.linalg.cho_solve(factor, cross)
         right = right[free] - cross.T @ scipy.linalg.cho_solve(factor, right[base])
 
-        # Scale rows and columns by L^-1 of each block L L'.
+        # Scale rows and columns by L^-1 of each block L L'. The factor is that of the block scaled
+        # to a unit diagonal, because the units of its parameters differ.
         for params in self.params_of:
             scale = np.sqrt(np.diag(matrix)[params])
             block = matrix[params, params] / np.outer(scale, scale)
-            lower = np.linalg.cholesky(block + 1e4 * JITTER * np.eye(len(block))) * scale[:, None]
+            lower = np.linalg.cholesky(block + BLOCK_JITTER * np.eye(len(block))) * scale[:, None]
             matrix[params] = np.linalg.solve(lower, matrix[params])
             matrix[:, params] = np.linalg.solve(lower, matrix[:, params].T).T
             right[params] = np.linalg.solve(lower, right[params])
@@ -307,6 +312,7 @@ class _Blocks:
         All pairs have the same numbers of parameters. Pairs in which one effect imitates the other
         are omitted.
         """
+        # Rows and columns of each pair in M, shape (n_pairs, n_first + n_second).
         indices = np.arange(len(self.right))
         params_of_pairs = []
         for one, two in pairs:
@@ -314,12 +320,13 @@ class _Blocks:
         places = np.array(params_of_pairs)
         n_first = self.size(pairs[0][0])
         systems = self.matrix[places[:, :, None], places[:, None, :]]
-        systems = systems + 1e4 * JITTER * np.eye(places.shape[1])
+        systems = systems + BLOCK_JITTER * np.eye(places.shape[1])
 
         # The loss falls by x' b at the solution x of M x = b.
         values = np.linalg.solve(systems, self.right[places][:, :, None])[:, :, 0]
         fall = np.einsum('ki,ki->k', values, self.right[places])
-        # Share |M_21 x_1|^2 / |x_1|^2 of the signal of each effect that the other imitates.
+        # Share |M_21 x_1|^2 / |x_1|^2 of the signal of each effect that the other imitates; both
+        # blocks on the diagonal are unit matrices.
         cross = systems[:, :n_first, n_first:]
         first = values[:, :n_first]
         second = values[:, n_first:]

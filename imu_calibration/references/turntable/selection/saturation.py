@@ -95,6 +95,7 @@ def sample_sd_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
     It is at least that of rounding. Without static windows it is the sd of second differences,
     ``x_k - 2 x_(k+1) + x_(k+2)``, over sqrt(6).
     """
+    # Few samples have no reliable sd.
     long_enough = [window for window in windows if len(window.time) > 8]
     at_rest = [window for window in long_enough if window.kind == 'static']
     if at_rest:
@@ -160,7 +161,7 @@ def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     if n_largest < MIN_CLIPPED_SAMPLES or level == 0:
         return False
     # A coarse output repeats all its values, most of all the step at gravity; the values just below
-    # the largest show how often.
+    # the largest, within a tenth, show how often.
     below = size[(size < level * SAME_LEVEL) & (size > 0.9 * level)]
     _, repeats = np.unique(below, return_counts=True)
     return bool(n_largest > 3 * repeats[-5:].max(initial=1))
@@ -188,11 +189,13 @@ def find_saturation(
     """
     if not may_be_clipped(windows, sensor):
         return None
-    output = np.concatenate([measured(window, sensor) for window in windows])
-    expected_of_windows = []
-    for window, of_sensors in zip(windows, predicted):
-        shape = measured(window, sensor).shape
-        expected_of_windows.append(np.broadcast_to(of_sensors[sensor], shape))
+    # Of every sample; a window with one sample of motion has one prediction.
+    outputs = [measured(window, sensor) for window in windows]
+    output = np.concatenate(outputs)
+    expected_of_windows = [
+        np.broadcast_to(prediction[sensor], readings.shape)
+        for prediction, readings in zip(predicted, outputs)
+    ]
     expected = np.concatenate(expected_of_windows)
     level = np.abs(output).max()
     clipped = np.abs(output) >= level * SAME_LEVEL
@@ -258,6 +261,7 @@ def without_clipped(
             near = np.abs(of_sensors[sensor]) > level - CLIP_MARGIN_SDS * noise_sd[sensor]
             clipped = np.abs(measured(window, sensor)) >= level * SAME_LEVEL
             usable &= ~(near | clipped).any(axis=1)
+        # Of a window at rest the mean counts, which clipping of some samples biases.
         if usable.all():
             kept.append(window)
         elif window.kind != 'static' and usable.sum() >= MIN_LEFT_SAMPLES:

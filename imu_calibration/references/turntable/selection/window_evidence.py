@@ -99,15 +99,19 @@ class WindowEvidence(Evidence):
         """Sensor -> of each axis the products of means and within windows, (2, n_folds, n, n)."""
         blocks = []
         for sensor in space.sensors:
+            # Independent means of each axis, shape (k, q_a + 1).
             scatter_of_sensor = None if scatter is None else scatter.get(sensor)
             means = mean_rows(space, noise, sensor, scatter=scatter_of_sensor)
             self._white[sensor] = [flat(rows.white()) for rows in means]
+            blocks += means
+            # Normal matrices of each axis and fold: of the means, and within windows.
             self._of_axis[sensor] = []
             for axis, white in enumerate(self._white[sensor]):
                 of_means = [white[in_fold].T @ white[in_fold] for in_fold in self._in_fold]
                 within = self._within(space, sensor, axis)
                 self._of_axis[sensor].append(np.array([of_means, within]))
-            blocks += means
+
+        # Over all parameters: of each fold, of all windows, and of all but each fold.
         of_folds = np.sum([self._of_sensor(sensor) for sensor in space.sensors], axis=0)
         total = np.sum(of_folds, axis=0)
         super().__init__(
@@ -202,12 +206,14 @@ class WindowEvidence(Evidence):
                 _, at, column = np.intersect1d(parameters, places, return_indices=True)
 
                 # e' (I + A N^-1 A')^-1 e = e'e - g' (N + A'A)^-1 g with the slopes g = A'e.
+                # For each fold f: g = means_f w_f, shape (n_folds, n_fitted), and N + A'A.
                 slopes = np.zeros(information.shape[:2])
                 slopes[:, at] = np.einsum('fij,fj->fi', means[:, column], weights[:, places])
                 with_fold = information.copy()
                 with_fold[:, at[:, None], at] += means[:, column[:, None], column]
                 losses[sensor][0, axis] -= (slopes * solve_scaled(with_fold, slopes)).sum()
 
+                # Within windows, with the columns of effects that are smooth in time.
                 within = self._within_whole[sensor][axis]
                 losses[sensor][1, axis] = squares_of_folds(within, weights[:, places])[0]
         return losses

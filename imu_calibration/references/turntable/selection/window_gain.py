@@ -55,10 +55,11 @@ def gain_in_turn(
     """
     Return the Gain of the choice `after` over `before` on the selection windows, cross-validated.
 
-    Of all `sensors` and measures the one with the largest lower end of the interval, without the
-    rests; if that is not above zero, the one whose squares fall most surely: a small lag may reduce
-    window means by a tenth through noise, and samples by a certain half percent. For a quiet sensor
-    moving windows show the encoder, rests the sensor.
+    It is of one of the `sensors` and one of `MEASURES`. First choice: the largest lower end of the
+    interval, without the measure of rests, if it is above zero. Otherwise the one whose squares
+    fall most surely (`_certainty`), rests included: a small lag may reduce window means by a tenth
+    through noise, and samples by a certain half percent. For a quiet sensor moving windows show the
+    encoder, rests the sensor.
     """
     fold = problem.evidence.fold
     gains = []
