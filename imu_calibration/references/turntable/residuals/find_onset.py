@@ -96,7 +96,8 @@ def find_onset(
     if not candidates:
         return None
 
-    # The fewest parameters that explain as much as the best, then the least excess.
+    # The fewest parameters that explain as much as the best, then the least excess. An excess that
+    # noise could cause is not preferred to another one.
     limit = SIMPLER * min(max(candidate.excess, candidate.noise) for candidate in candidates)
     sufficient = [candidate for candidate in candidates if candidate.excess <= limit]
     best = min(
@@ -235,11 +236,12 @@ def _losses_of_moments(
     The fit has the columns `fitted`, of which the amplitudes of `changing` change after one of the
     windows `allowed`.
     """
+    # Places in `allowed` of evenly spread moments.
     coarse = np.unique(np.linspace(0, len(allowed) - 1, min(COARSE, len(allowed))).astype(int))
     losses = {}
     for last in allowed[coarse].tolist():
         losses[last] = _loss_of_step(rows, fitted, changing, _after(rows, last))
-    # All moments between the neighbours of the best one.
+    # All moments between the neighbours of the best one, which has this place in `coarse`.
     place = int(np.searchsorted(allowed[coarse], min(losses, key=losses.__getitem__)))
     first = coarse[max(place - 1, 0)]
     end = coarse[min(place + 1, len(coarse) - 1)]
@@ -271,6 +273,7 @@ def _follows_temperature(
     temperature = rows.space.recording.describe['temperature']
     if not np.all(np.isfinite(temperature)) or np.ptp(temperature) == 0:
         return False
+    # As many windows on either side of a temperature as before and after an onset.
     limits = np.sort(temperature)[MIN_ONSET_WINDOWS:-MIN_ONSET_WINDOWS]
     for limit in limits[:: max(len(limits) // MOST_LIMITS, 1)]:
         above = (temperature > limit).astype(float)[:, None]
@@ -324,6 +327,7 @@ def _onset_of(
     ends = problem.evidence.space.recording.time[list(candidate.ends)]
     moment, moment_sd = _refined(windows, table, model, states=states, between=(ends[0], ends[1]))
 
+    # Names, units and both values of the parameters that change.
     names = [problem.space.names[k] for k in group.parameters]
     units = {}
     for effect in model.effects:
@@ -331,6 +335,8 @@ def _onset_of(
             units[label] = effect.unit_of(k)
     before = dict(zip(names, states[0][group.parameters].tolist()))
     after = dict(zip(names, states[1][group.parameters].tolist()))
+
+    # Axes of each sensor by the squares of their changes above the expectation from noise, sd^2.
     sensor_axes: dict[str, tuple[str, ...]] = {}
     if group.role is not None:
         # Each axis of a sensor has one bias, or three elements in its row of the matrix.
@@ -338,7 +344,7 @@ def _onset_of(
         # Biases of the two sensors have different units: they are compared in standard deviations.
         unit = sd if group.role is Role.OFFSET else 1.0
         squares = np.maximum((change / unit) ** 2 - (sd / unit) ** 2, 0.0)
-        squares = squares.reshape(-1, 3, n_per_axis).sum(axis=2)
+        squares = squares.reshape(-1, 3, n_per_axis).sum(axis=2)  # (n_sensors, 3)
         sensors = dict.fromkeys(name.partition('.')[0] for name in names)
         for sensor, squares_of_axes in zip(sensors, squares, strict=True):
             sensor_axes[sensor] = largest_axes(squares_of_axes)

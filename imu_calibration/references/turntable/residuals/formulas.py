@@ -327,6 +327,49 @@ def _function(texts: Iterable[str]) -> Callable:
     return array_function([read(text) for text in texts])
 
 
+@dataclass(frozen=True, eq=False)
+class _OutsideCatalogue:
+    """Whitened residual and columns of one axis, without what the catalogue explains of them."""
+
+    residual: np.ndarray
+    """Shape (n,)."""
+    columns: np.ndarray
+    """Shape (n, n_texts); zero for a column that the catalogue contains."""
+    n_explained: int
+    """Number of directions in which the catalogue may exceed the noise, and of projected ones."""
+
+    @classmethod
+    def of(
+        cls, contributions: np.ndarray, residual: np.ndarray, columns: np.ndarray
+    ) -> '_OutsideCatalogue':
+        """
+        Return the residual and the columns with the catalogue's contributions as further noise.
+
+        Plausible contributions A p of covariance ``cov(p) = P P'`` add to noise of unit variance.
+        With ``A P = U S V'`` the rows are whitened by the factor::
+
+            (1 + U S^2 U')^(-1/2) = 1 - U diag(1 - 1 / sqrt(1 + S^2)) U'
+
+        Parameters
+        ----------
+        contributions : ndarray, shape (n, q)
+            ``A P``.
+        residual : ndarray, shape (n,)
+        columns : ndarray, shape (n, n_texts)
+
+        """
+        basis, sizes, _ = svd(contributions, full_matrices=False, lapack_driver='gesdd')
+        damped = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)
+        free_residual = residual - basis @ (damped * (basis.T @ residual))
+        free = columns - basis @ (damped[:, None] * (basis.T @ columns))
+
+        # A column that the catalogue contains is no formula beyond it.
+        square = np.einsum('bt,bt->t', columns, columns)
+        free_square = np.einsum('bt,bt->t', free, free)
+        is_new = free_square > NEW**2 * np.maximum(square, 1e-300)
+        return cls(free_residual, np.where(is_new, free, 0.0), int((sizes > 1.0).sum()))
+
+
 class FormulaSearch:
     """
     Search of formulas for the residual of one sensor, in the blocks outside locked windows.
@@ -364,44 +407,28 @@ class FormulaSearch:
         # Means over the blocks of the column of each text, shape (b, n_texts).
         self.means = self._evaluated(tuple(self._place), reference_temperature)
 
-        # Whitened rows of the catalogue's columns and residual of each axis, then of the texts.
+        # Whitened rows: the catalogue's columns and the residual of each axis, then the texts.
         whitener = blocks.white[SELECTION]
         white = whitener.whiten(np.concatenate([*blocks.design, self.means], axis=1))
         ends = np.cumsum([0, *(part.shape[1] for part in blocks.design)])
-        self._residual = []  # of each axis, outside of the catalogue, shape (n_selection,)
-        self._free = []  # of each axis: columns of the texts outside of it, (n_selection, n_texts)
-        self.n_explained = []  # of each axis: directions of the catalogue and of project_out
+        self._axes: list[_OutsideCatalogue] = []
         for axis in range(3):
-            catalogue_and_residual = white[:, ends[axis] : ends[axis + 1]] / whitener.scale[axis]
-            residual = catalogue_and_residual[:, -1]
-            columns = white[:, ends[3] :] / whitener.scale[axis]
-
-            # Plausible contributions A p of the catalogue, cov(p) = P P', are noise in addition to
-            # that of unit variance: with A P = U S V' the rows are multiplied by
-            # (1 + U S^2 U')^(-1/2) = 1 - U diag(1 - 1 / sqrt(1 + S^2)) U'.
-            basis, sizes, _ = svd(
-                catalogue_and_residual[:, :-1] @ plausible[blocks.index[axis]],
-                full_matrices=False,
-                lapack_driver='gesdd',
+            rows = white[:, ends[axis] : ends[axis + 1]] / whitener.scale[axis]
+            outside = _OutsideCatalogue.of(
+                contributions=rows[:, :-1] @ plausible[blocks.index[axis]],
+                residual=rows[:, -1],
+                columns=white[:, ends[3] :] / whitener.scale[axis],
             )
-            damped = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)
-            self._residual.append(residual - basis @ (damped * (basis.T @ residual)))
-            free = columns - basis @ (damped[:, None] * (basis.T @ columns))
-
-            # A column that the catalogue contains is no formula beyond it.
-            square = np.einsum('bt,bt->t', columns, columns)
-            free_square = np.einsum('bt,bt->t', free, free)
-            is_new = free_square > NEW**2 * np.maximum(square, 1e-300)
-            self._free.append(np.where(is_new, free, 0.0))
-            self.n_explained.append(int((sizes > 1.0).sum()))
+            self._axes.append(outside)
 
     def _evaluated(self, texts: Sequence[str], reference_temperature: float) -> np.ndarray:
         """Return the means over the blocks of texts, shape (b, n_texts); 0 where not finite."""
-        # Name of a quantity -> its value at each row.
+        # Name of a quantity -> its value at each row: a field of the motion, or a part of it with
+        # the indices behind the rows, as (attitude, 0, 2).
         ref = self.blocks.ref
         quantities = {'temperature_ref_c': reference_temperature}
         for name, (attribute, *index) in PLACES.items():
-            if not attribute:
+            if not attribute:  # a constant
                 continue
             values = getattr(ref, attribute)
             # Neither a missing temperature nor a joint that the table does not have.
@@ -409,6 +436,7 @@ class FormulaSearch:
                 at_all_rows = (slice(None), *index)
                 quantities[name] = values[at_all_rows]
 
+        # Some texts at a time. A constant text has one value for all rows.
         means = np.empty((len(self.blocks.time), len(texts)))
         with np.errstate(all='ignore'):
             for first in range(0, len(texts), COLUMN_CHUNK):
@@ -427,6 +455,7 @@ class FormulaSearch:
         The likeliest formula has the largest ``fall of chi-square - 2 n_amplitudes``. Formulas with
         nearly the same value, within `TIE` in units of the remaining misfit, are as likely.
         """
+        # Is the likeliest significant among so many?
         falls, n_amplitudes = self._falls()
         price = 2.0 * n_amplitudes
         order = np.argsort(price - falls)
@@ -437,10 +466,11 @@ class FormulaSearch:
             return None
 
         # Chi-square per degree of freedom with the likeliest formula, at least 1.
-        dof = max(3 * len(self._residual[0]) - sum(self.n_explained), 1)
-        squares = sum(float(residual @ residual) for residual in self._residual)
+        dof = max(sum(len(rows.residual) - rows.n_explained for rows in self._axes), 1)
+        squares = sum(float(rows.residual @ rows.residual) for rows in self._axes)
         misfit = max((squares - falls[likeliest]) / dof, 1.0)
 
+        # Formulas that are as likely, among the first 200.
         advantage = falls - price
         as_likely = []
         for k in order[:200]:
@@ -457,14 +487,17 @@ class FormulaSearch:
 
     def project_out(self, choice: FormulaChoice) -> None:
         """Project a choice out, so that the next is tested conditional on it."""
-        for axis in range(3):
+        # x - U U' x is orthogonal to the columns of the choice; U is their basis, without
+        # directions of collinear columns.
+        for axis, rows in enumerate(self._axes):
             places = [self._places(column)[axis] for column in choice.formula.columns]
-            columns = self._free[axis][:, places]
-            basis, sizes, _ = svd(columns, full_matrices=False)
+            basis, sizes, _ = svd(rows.columns[:, places], full_matrices=False)
             basis = basis[:, sizes > 1e-9 * max(sizes.max(), 1e-300)]
-            self._residual[axis] = self._residual[axis] - basis @ (basis.T @ self._residual[axis])
-            self._free[axis] = self._free[axis] - basis @ (basis.T @ self._free[axis])
-            self.n_explained[axis] += basis.shape[1]
+            self._axes[axis] = _OutsideCatalogue(
+                rows.residual - basis @ (basis.T @ rows.residual),
+                rows.columns - basis @ (basis.T @ rows.columns),
+                rows.n_explained + basis.shape[1],
+            )
 
     def _places(self, column: Column) -> list[int]:
         """Return the places of the texts of a column for the three axes."""
@@ -488,11 +521,14 @@ class FormulaSearch:
             for k in chosen:
                 places.append([self._places(column) for column in self.formulas[k].columns])
             place_on_axes = np.array(places)  # (n_chosen, width, 3)
-            for axis in range(3):
+            for axis, rows in enumerate(self._axes):
+                # X'r of every text, with its column at unit length.
                 places_of_axis = place_on_axes[:, :, axis]
-                free = self._free[axis]
+                free = rows.columns
                 size = np.sqrt(np.maximum(np.einsum('bt,bt->t', free, free), 1e-300))
-                slopes = (free.T @ self._residual[axis]) / size
+                slopes = (free.T @ rows.residual) / size
+
+                # X'X of each formula: cosines of the angles between its columns.
                 gram = np.eye(width) * np.ones((len(chosen), 1, 1))
                 for i in range(width):
                     for j in range(i):
@@ -502,10 +538,12 @@ class FormulaSearch:
                         cosine = np.clip(inner / (size[first] * size[second]), -1.0, 1.0)
                         gram[:, i, j] = cosine
                         gram[:, j, i] = cosine
-                gram += 1e-6 * np.eye(width)  # collinear columns
+                gram += 1e-6 * np.eye(width)  # so that collinear columns have a solution
                 right = slopes[places_of_axis]
                 amplitudes = np.linalg.solve(gram, right[..., None])[..., 0]
                 falls[chosen] += np.einsum('gk,gk->g', right, amplitudes)
+
+                # Columns that the catalogue contains are zero, and have no amplitude.
                 n_amplitudes[chosen] += (size[places_of_axis] > 1e-100).sum(axis=1)
         return falls, n_amplitudes
 

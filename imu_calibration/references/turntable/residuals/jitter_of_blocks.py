@@ -43,12 +43,17 @@ def stamp_jitter(
 
     """
     # Estimate of each sensor with its standard deviation, s^2.
-    estimates = []
-    for rough_of_sensor, slope_of_sensor in zip(rough, slope, strict=True):
-        estimates.append(_stamp_variance(rough_of_sensor, slope_of_sensor, freedom))
+    estimates = [
+        _stamp_variance(rough_of_sensor, slope_of_sensor, freedom)
+        for rough_of_sensor, slope_of_sensor in zip(rough, slope, strict=True)
+    ]
     value, sd = np.array(estimates).T
 
-    variance = max(min(np.average(value, weights=1 / sd**2), *(value + BOUND_SDS * sd)), 0.0)
+    # The weighted mean, within the limit of each sensor.
+    mean = np.average(value, weights=1 / sd**2)
+    variance = max(min(mean, *(value + BOUND_SDS * sd)), 0.0)
+
+    # Clear: every sensor shows the errors, and all agree on their variance.
     difference = np.abs(value - variance)
     alike = (difference < BOUND_SDS * sd) | (difference < ALIKE_VARIANCES * variance)
     clear = bool(np.all(value > CLEAR_SDS * sd) and alike.all())
@@ -103,6 +108,7 @@ def _stamp_variance(
         noise = _noise(rough, slope, variance)
         ratio = ((rough - noise) / np.maximum(slope, np.finfo(float).tiny)).ravel()
         weight = (np.sqrt(freedom / 2)[:, None] * slope / (noise + variance * slope)).ravel()
+        # Weighted median: half of the weight is below it.
         order = np.argsort(ratio)
         sum_of_weights = np.cumsum(weight[order])
         middle = np.searchsorted(sum_of_weights, sum_of_weights[-1] / 2)

@@ -228,10 +228,11 @@ def _plausible_sizes(sensor: str, problem: LinearisedProblem) -> np.ndarray:
     for question in problem.questions:
         acts_on = question.effect.acts_on
         if question.sensor not in SENSORS and other in acts_on and len(acts_on) > 1:
+            # Covariance of its parameters, the last ones, by the other sensor, with the baseline.
             parameters = list(question.parameters)
             n = len(parameters)
-            known = problem.evidence.known_from(other, [*problem.search.baseline, *parameters])
-            factor = np.linalg.cholesky(known[-n:, -n:])
+            covariance = problem.evidence.known_from(other, [*problem.search.baseline, *parameters])
+            factor = np.linalg.cholesky(covariance[-n:, -n:])
             plausible[np.ix_(parameters, parameters)] = OTHER_SENSOR * factor
     return plausible
 
@@ -252,8 +253,8 @@ def _stable(fits: BlockFits, choices: Sequence[FormulaChoice]) -> bool:
     """
     Return whether the halves of the recording agree on the amplitudes of the last choice.
 
-    Their difference is on average below three standard deviations, or small compared with the
-    amplitudes themselves.
+    Their difference is on average below three standard deviations. Or its squares sum to less than
+    a tenth of those of the amplitudes fitted to both halves, all in standard deviations.
     """
     columns = _joined(choices)
     early = fits.fit(columns, half=0)
@@ -372,6 +373,7 @@ def _shapes(
             weights = np.array([np.cos(phase), np.sin(phase)])
             text: Column = formula.phased.format(phase=phase).replace('- -', '+ ')
         else:
+            # Columns with 3 % of the largest output or less are omitted from the text.
             output = np.abs(weights) * scale
             rounded = np.array([float(f'{weight:.4g}') for weight in weights])
             weights = np.where(output > 0.03 * np.max(output), rounded, 0.0)

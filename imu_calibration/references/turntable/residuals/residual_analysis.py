@@ -274,8 +274,9 @@ class ResidualAnalysis(Investigation):
     def _described(self, sensor: str, residual: Unexplained) -> Unexplained:
         """Return the residual of a sensor with its regimes and a proposal."""
         proposal = self.proposals[sensor]
+        # The likeliest regime of each axis, which is the first: the last in reversed order stays.
         regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
-        regime_of_axis = {regime.axis: regime for regime in reversed(regimes)}  # the likeliest
+        regime_of_axis = {regime.axis: regime for regime in reversed(regimes)}
 
         # An insignificant residual without a formula: regimes of noise that grows with the motion
         # do not count.
@@ -287,6 +288,7 @@ class ResidualAnalysis(Investigation):
             if not regime_of_axis:
                 return beyond_noise(self.problem, sensor, residual)
 
+        # Axes of the residual; of an insignificant one those of the formula or of the regimes.
         axes = residual.axes
         if not axes:
             axes = self.fits(sensor).axes() if proposal is not None else tuple(regime_of_axis)
@@ -299,7 +301,8 @@ class ResidualAnalysis(Investigation):
         if residual.significant:
             return described
 
-        # Significant by the formula or the regimes: the rms is that of their contributions.
+        # Significant by the formula or the regimes: the rms is that of their contributions. A
+        # regime with an offset or scatter c in a share s of the blocks has the rms c sqrt(s).
         sizes: Sequence[float] = ()
         if proposal is not None:
             sizes = proposal.sizes

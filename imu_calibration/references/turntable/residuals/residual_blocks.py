@@ -227,10 +227,9 @@ def residual_blocks(
         The linearisation of the columns, and the noise of each sensor.
 
     """
+    # 1. Columns at a few rows of each block, residuals of every sample.
     cut = _CutWindows.of(windows)
     window_of_block = cut.used[cut.place_of_window]
-
-    # Columns at a few rows of each block, residuals of every sample.
     references = References(
         problem.recording.model, table, cut.motion, temperature_c=cut.temperature_c
     )
@@ -239,7 +238,7 @@ def residual_blocks(
         cut.windows, table, problem.recording.model, values=problem.recording.values
     )
 
-    # Variance within the blocks by second differences, with and without errors of the stamps.
+    # 2. Scatter within the blocks by second differences, and the part of it from the stamps.
     inner = _inner_samples(cut.windows)
     n_differences = np.add.reduceat(inner, cut.first_sample)
     freedom = n_differences / DIFFERENCES_PER_FREEDOM
@@ -256,6 +255,7 @@ def residual_blocks(
         by_jitter[sensor] = jitter_ratio(rough[sensor], slope[sensor], jitter.sd)
     jitter = replace(jitter, ratio=_by_kind(by_jitter, problem.recording.kind[window_of_block]))
 
+    # 3. Means over the blocks, with their variance by the white noise of each kind of window.
     time = np.concatenate([window.time for window in cut.windows])
     n_samples_of_block = np.diff(cut.first_sample, append=len(time)).astype(float)
     blocks = {}
@@ -345,6 +345,8 @@ def _variance_by_differences(
         Noise of rounding, SI.
 
     """
+    # The two further rows keep the number of samples; `inner` excludes the ends of windows. Then
+    # the sum over each block.
     differences = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
     squares = np.add.reduceat(inner[:, None] * differences**2, first_sample, axis=0)
     squares = squares / VARIANCE_OF_DIFFERENCES
@@ -471,6 +473,7 @@ def _mean_columns(
     row_edges = np.append(cut.first_row, len(cut.motion))
     groups: dict[str, list[np.ndarray]] = {sensor: [] for sensor in recording.sensors}
     for first in range(0, len(cut.first_row), AT_A_TIME):
+        # First row of each of these blocks, and the end of the last one.
         edges = row_edges[first : first + AT_A_TIME + 1]
         rows = slice(edges[0], edges[-1])
         temperature = None if cut.temperature_c is None else cut.temperature_c[rows]
@@ -703,7 +706,8 @@ class BlockFits:
         if half is not None:
             time = self.blocks.time[~self.blocks.locked]
             rows = rows[(time > np.median(time)) == half]
-        # Parameters have the priors of the catalogue, amplitudes nearly none.
+        # Parameters have the priors of the catalogue, amplitudes nearly none: their columns are the
+        # last ones before the residual.
         parameters = self.blocks.index[axis][places]
         size = np.sqrt(np.maximum((rows[:, len(places) : -1] ** 2).sum(axis=0), 1e-60))
         sd = np.append(self._prior_sd[parameters], AMPLITUDE_PRIOR_SD / size)

@@ -49,19 +49,22 @@ class ScatterSearch(RegimeSearch):
             Largest probability of a regime by chance.
 
         """
-        # In units of the median. The exchanges are slow, and not needed without a louder range.
+        # 1. In units of the median. The exchanges are slow, and not needed without a louder range.
         median = float(np.median(rough))
         if median <= 0:
             return []
         rough = rough / median
         if not any(fall.any() for fall in self._falls(rough[:, None], weight)):
             return []
+
+        # 2. Permutation test: column 0 has the blocks in their order, the others exchanged.
         exchanged = np.column_stack([rough, rough[self.exchange].T])
         p_value, likely = self.tested(self._falls(exchanged, weight))
         if p_value > level:
             return []
 
-        # A regime must fit clearly better than a variance that follows a smooth curve.
+        # 3. A regime must fit clearly better than a variance that follows a smooth curve of any
+        #    variable with a scale.
         fits = []  # (cost, dispersion)
         for ranges in self.ranges:
             if len(ranges.variable.edges):
@@ -69,6 +72,8 @@ class ScatterSearch(RegimeSearch):
         one_variance = (variance_cost(weight @ rough, weight.sum()), 1.0)
         smooth_cost, dispersion = min(fits, default=one_variance)
         largest_cost = smooth_cost - SURE * dispersion
+
+        # 4. The likeliest ranges, each shortened to the bins with nearly all of its excess.
         squares = weight * rough
         regimes = []
         for ranges, number in likely:
@@ -78,31 +83,33 @@ class ScatterSearch(RegimeSearch):
             inside = ranges.marks[:, bins].sum(axis=1)  # share of each block
             outside = 1.0 - inside
 
-            # Sums of squares inside and outside, degrees of freedom, and their ratio.
+            # Inside and outside: sum of squares, degrees of freedom, and the excess over the
+            # median, 1 for each degree of freedom.
             energy = np.array([(inside * squares).sum(), (outside * squares).sum()])
             count = np.array([(inside * weight).sum(), (outside * weight).sum()])
             variance = energy / np.maximum(count, 1.0)
             excess = np.maximum(energy - count, 0.0)
             share = excess[0] / max(excess.sum(), TINY)
             cost = np.sum(variance_cost(energy, count))
-            if share >= MOST_OF_IT and cost < largest_cost:
-                bounds = variable.bounds(bins)
-                regimes.append(
-                    RestRegime(
-                        sensor=self.sensor,
-                        axis=axis,
-                        variable=variable.name,
-                        text=variable.words(bins, bounds) + ', by larger scatter',
-                        share=float(share),
-                        p_value=p_value,
-                        size=float(np.sqrt(median * max(variance[0] - variance[1], 0.0))),
-                        inside=inside > 0.5,
-                        time=self.time,
-                        offset=False,
-                        bounds=bounds,
-                        is_rate=variable.is_rate,
-                    )
+            if share < MOST_OF_IT or cost >= largest_cost:
+                continue
+            bounds = variable.bounds(bins)
+            regimes.append(
+                RestRegime(
+                    sensor=self.sensor,
+                    axis=axis,
+                    variable=variable.name,
+                    text=variable.words(bins, bounds) + ', by larger scatter',
+                    share=float(share),
+                    p_value=p_value,
+                    size=float(np.sqrt(median * max(variance[0] - variance[1], 0.0))),
+                    inside=inside > 0.5,
+                    time=self.time,
+                    offset=False,
+                    bounds=bounds,
+                    is_rate=variable.is_rate,
                 )
+            )
         return largest_share_first(regimes)
 
     def _falls(self, rough: np.ndarray, weight: np.ndarray) -> list[np.ndarray]:
@@ -135,6 +142,7 @@ class ScatterSearch(RegimeSearch):
         for ranges in self.ranges:
             count_inside = (ranges.member @ (ranges.marks.T @ weight))[:, None]
             energy_inside = ranges.member @ (ranges.marks.T @ squares)
+            # The condition of `louder`, multiplied by n_in (n - n_in).
             count_outside = count - count_inside
             least_outside = np.maximum(energy - energy_inside, count_outside)
             louder = energy_inside * count_outside > LOUDER * least_outside * count_inside
@@ -185,7 +193,8 @@ def _smooth_scatter(
     root = np.sqrt(weight)
     values = np.zeros(design.shape[1])
     for _ in range(FISHER_STEPS):
-        # d(log likelihood) / d(log variance) = n (ratio - 1) / 2, information n / 2.
+        # d(log likelihood) / d(log variance) = n (ratio - 1) / 2, information n / 2. In units of
+        # the median the curve is at least 1.
         log_variance = np.maximum(design @ values, 0.0)
         ratio = np.minimum(variance * np.exp(-log_variance), MAX_VARIANCE_RATIO)
         step = np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]

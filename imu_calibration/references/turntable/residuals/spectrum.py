@@ -87,18 +87,12 @@ def orders_of(
     """
     # Projections of p pieces on k orders, in m columns.
     order = np.arange(LOWEST_ORDER, HIGHEST_ORDER + 1)
-    windows_of_pieces = []
-    sums_of_pieces = []
-    weights_of_pieces = []
-    for piece in _pieces(windows, residuals_of_windows, joint):
-        sums_of_piece, weight_of_piece = _projected(piece, order)
-        windows_of_pieces.append(piece.window)
-        sums_of_pieces.append(sums_of_piece)
-        weights_of_pieces.append(weight_of_piece)
-    if not windows_of_pieces:
+    pieces = list(_pieces(windows, residuals_of_windows, joint))
+    if not pieces:
         return None
-    sums = np.stack(sums_of_pieces)  # (p, k, m)
-    weight = np.stack(weights_of_pieces)  # (p, k)
+    projected = [_projected(piece, order) for piece in pieces]
+    sums = np.stack([projections for projections, _ in projected])  # (p, k, m)
+    weight = np.stack([weights for _, weights in projected])  # (p, k)
 
     # Orders that enough pieces show.
     count = (weight > 0).sum(axis=0)
@@ -110,13 +104,38 @@ def orders_of(
     weight = weight[:, enough]
     count = count[enough]
 
-    # T^2 = n mean' S^-1 mean, with mean and covariance S of real and imaginary part over n pieces.
+    # The coherent wave, and its power over that of the other orders.
+    wave = sums.sum(axis=0) / weight.sum(axis=0)[:, None]
+    power = np.abs(wave) ** 2
+    median_power = np.maximum(np.median(power, axis=0), np.finfo(float).tiny)
+    share = _share_in_phase(np.array([piece.window for piece in pieces]), sums, weight, wave)
+    p_value = _random_phase_p_value(sums, weight, count)
+    return Orders(order, 2 * np.abs(wave), p_value, power / median_power, share)
+
+
+def _random_phase_p_value(sums: np.ndarray, weight: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """
+    Return the probability of a coherent wave by pieces with random phases, shape (k, m).
+
+    Hotelling's T^2 of the real and imaginary parts over the n pieces that show an order::
+
+        T^2 = n mean' S^-1 mean,    T^2 (n - 2) / (2 (n - 1)) ~ F(2, n - 2)
+
+    Parameters
+    ----------
+    sums, weight
+        As for `_share_in_phase`.
+    count : ndarray, shape (k,)
+        Number n of the pieces that show each order.
+
+    """
     scaled = sums / np.sqrt(np.where(weight > 0, weight, np.inf))[..., None]
     parts = np.stack([scaled.real, scaled.imag], axis=-1)  # (p, k, m, 2)
     mean = parts.sum(axis=0) / count[:, None, None]
     squares = np.einsum('pkxi,pkxj->kxij', parts, parts)
     squares_of_mean = count[:, None, None, None] * np.einsum('kxi,kxj->kxij', mean, mean)
     covariance = (squares - squares_of_mean) / (count - 1)[:, None, None, None]
+
     # Repeated data have no scatter, with which a mean could be compared: there T^2 is zero.
     trace = np.trace(covariance, axis1=-2, axis2=-1)
     has_scatter = trace > ROUNDING_SHARE * (mean**2).sum(axis=-1)
@@ -125,17 +144,8 @@ def orders_of(
     mean[~has_scatter] = 0.0
     whitened = np.linalg.solve(covariance, mean[..., None])[..., 0]
     t_squared = count[:, None] * np.einsum('kxi,kxi->kx', mean, whitened)
-
-    # T^2 (n - 2) / (2 (n - 1)) follows F(2, n - 2).
     dof = (count - 2)[:, None]
-    p_value = f_sf(t_squared * dof / (2 * (count - 1)[:, None]), 2, dof)
-
-    # The coherent wave, and its power over that of the other orders.
-    wave = sums.sum(axis=0) / weight.sum(axis=0)[:, None]
-    power = np.abs(wave) ** 2
-    median_power = np.maximum(np.median(power, axis=0), np.finfo(float).tiny)
-    share = _share_in_phase(np.array(windows_of_pieces), sums, weight, wave)
-    return Orders(order, 2 * np.abs(wave), p_value, power / median_power, share)
+    return f_sf(t_squared * dof / (2 * (count - 1)[:, None]), 2, dof)
 
 
 def _share_in_phase(
@@ -159,9 +169,11 @@ def _share_in_phase(
         Mean over all pieces.
 
     """
+    # Sums over the pieces of each window, which follow one another from its first piece on.
     starts = np.flatnonzero(np.diff(window, prepend=-1))
     sums_of_windows = np.add.reduceat(sums, starts)
     known = np.add.reduceat(weight, starts) > 0
+    # Re(s conj(w)) = |s| |w| cos(phase difference).
     projection = (sums_of_windows * wave.conj()).real
     in_phase = projection > IN_PHASE * np.abs(sums_of_windows) * np.abs(wave)
     return (in_phase & known[..., None]).sum(axis=0) / known.sum(axis=0)[:, None]
@@ -478,7 +490,8 @@ def _stretches_of_turns(
         if rate.min() <= MIN_ORDER_RATE and rate.max() >= -MIN_ORDER_RATE:
             continue
 
-        # Interpolated to equal steps of the angle, which has to increase.
+        # Interpolated to equal steps of the angle, which has to increase: samples of a joint that
+        # turns backwards are in reversed order.
         turns = window.motion.position[:, joint] / (2 * np.pi)
         upwards = slice(None, None, int(np.sign(turns[-1] - turns[0])))
         even_turns = np.arange(turns[upwards][0], turns[upwards][-1], 1 / ANGLES_PER_TURN)
@@ -486,6 +499,8 @@ def _stretches_of_turns(
             continue
         of_axes = [np.interp(even_turns, turns[upwards], axis[upwards]) for axis in residual.T]
 
+        # Orders with enough samples per cycle: of the recording at the highest speed, and of the
+        # equal steps.
         step = float(np.median(np.diff(window.time)))
         most_turns_per_sample = float(np.abs(rate).max()) * step / (2 * np.pi)
         highest = min(MAX_ORDER_SHARE / most_turns_per_sample, MAX_ORDER_SHARE * ANGLES_PER_TURN)
@@ -512,7 +527,7 @@ def of_stretches(
     stretches = list(stretches)
     if not stretches:
         return
-    # Length of the transform: all stretches are padded to the longest that is possible.
+    # All stretches are padded to the longest that is possible, so that they share the frequencies.
     size = round(1 / (FREQUENCY_STEP * stretches[0].step))
     grid = FREQUENCY_STEP * np.arange(size // 2 + 1)
     # Sums over the stretches, for each frequency and axis.
@@ -536,6 +551,7 @@ def of_stretches(
         sum_of_excess[at] += np.maximum(power - around, 0.0) * 4 / (2 / 3 * length)
     if not n_stretches.any():
         return
+    # P-value of each frequency, 1 where too few stretches have a peak.
     chance = np.where(
         n_peaks > MIN_TONE_SHARE * n_stretches[:, None],
         binom_sf(n_peaks - 1, n_stretches[:, None], LINE_CHANCE) * np.count_nonzero(n_stretches),
@@ -543,7 +559,8 @@ def of_stretches(
     )
     for axis in range(3):
         mean_ratio = sum_of_ratios[:, axis] / np.maximum(n_stretches, 1)
-        # The highest significant peak: the surroundings are known by octaves only.
+        # The highest significant peak. Its height is over the median of all frequencies, because
+        # the power around each is known by octaves only.
         mean_height = sum_of_heights[:, axis] / np.maximum(n_stretches, 1)
         significant_height = np.where(chance[:, axis] < TONE_P_VALUE, mean_height, -1.0)
         best = int(np.argmax(significant_height))
@@ -637,12 +654,10 @@ def find_sway(blocks: BlockMeans, fits: BlockFits) -> Tone | None:
     # Fall of the sum of squares by the four amplitudes of each frequency.
     n_amplitudes = columns[0].shape[1]
     white_columns, residual = fits.outside_catalogue(np.concatenate(columns, axis=1))
-    columns_of_waves = []
+    columns_of_waves = np.split(white_columns, len(frequencies), axis=1)
     falls = []
-    for place in range(len(frequencies)):
-        of_wave = white_columns[:, place * n_amplitudes : (place + 1) * n_amplitudes]
-        basis = np.linalg.qr(of_wave)[0]
-        columns_of_waves.append(of_wave)
+    for columns_of_wave in columns_of_waves:
+        basis = np.linalg.qr(columns_of_wave)[0]
         falls.append(float(np.sum((basis.T @ residual) ** 2)))
     best = int(np.argmax(falls))
 

@@ -111,16 +111,19 @@ def _unexplained(
         Weights of columns and residual (`weights_of`).
 
     """
+    # Residual of the means of the windows, and its sd by noise alone.
     space = problem.space
     recording = problem.recording
     explained = problem.explained
-    residual_of_axes = []  # of the means of the windows
-    for axis in range(3):
-        residual_of_axes.append(space.mean[sensor][axis] @ values[space.places(sensor, axis)])
+    residual_of_axes = [
+        space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)
+    ]
     residual = np.stack(residual_of_axes, axis=1)
     floor = explained.floor.noise[sensor]
     white = recording.mean_variance(floor)
     noise_sd = np.sqrt(white + floor.bias_variance)
+
+    # Is the excess of the means, or of the samples within windows, significant?
     n_means, n_within = explained.numbers[sensor]
     sigma_means, sigma_within = explained.sigma(sensor, excess)
     # At least the excess of one axis, which negative values of other axes would lower.
@@ -152,7 +155,9 @@ def _unexplained(
     # The means differ by less than the wander of the bias, but neighbours by more than white noise.
     if rms == 0:
         rms = float(np.sqrt(np.mean(white) * excess_of_means / n_means))
-    # The fit has absorbed the part of the cause that the columns of the model resemble.
+
+    # Its correlation with time, temperature and motion. The fit has absorbed the part of the cause
+    # that the columns of the model resemble.
     fitted = []
     for axis in range(3):
         used = np.flatnonzero(values[space.places(sensor, axis)[:-1]])
@@ -176,7 +181,7 @@ def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray
         if name.startswith('angle'):
             number = name[len('angle') :]
             angle = describe[name]
-            # In a window of a larger span the mean angle has no meaning.
+            # In a window of a larger span, rad, the mean angle has no meaning.
             known = describe['span' + number] < 0.7
             waves = []
             for multiple in (1, 2, 3):

@@ -42,7 +42,8 @@ def variables_of(blocks: BlockMeans, joint_names: Sequence[str]) -> list[Variabl
     if blocks.warms and ref.temperature_c is not None:
         temperature = ref.temperature_c
         variables += of_value('temperature', temperature, 'C', least=0.5)
-        # Slope of a polynomial, which smooths the steps of the thermometer.
+        # Slope of a polynomial, which smooths the steps of the thermometer: at least ten rows for
+        # each of its coefficients.
         degree = min(12, len(temperature) // 10)
         course = np.polynomial.Chebyshev.fit(ref.time, temperature, degree)
         slope = np.gradient(course(ref.time))
@@ -67,6 +68,7 @@ def _approach(name: str, rate: np.ndarray, starts: np.ndarray) -> list[Variable]
 
     `rate` is that of the joint, rad/s, at each row, shape (n,).
     """
+    # Direction at the last row that moves, up to each row; 0 before the first motion.
     moving = np.abs(rate) > 0.5 * DEG
     direction = np.where(moving, np.sign(rate), 0.0)
     last_moving = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
