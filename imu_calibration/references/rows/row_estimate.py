@@ -239,6 +239,8 @@ class _RowSquares:
         change = np.zeros(rows.n_nuisances + len(free))
         moving = np.append(np.ones(rows.n_nuisances, bool), free)
         change[moving] = scipy.linalg.solve_triangular(factor[:, :-1], right)
+
+        # A change of a variance by 1 % changes weights and steps little; so does a small variance.
         negligible = 1e-4 * np.min(self.fallback)
         settled = np.allclose(scatter.variance, before, rtol=0.01, atol=negligible)
         return _RowStep(change, float(np.linalg.norm(right)), scatter, settled)

@@ -70,16 +70,20 @@ class RowEvidence(Evidence):
         *,
         baseline: Sequence[int],
     ):
-        # Smooth effects are included: the noise is not estimated from what they explain.
+        # Noise of each block. Smooth effects are included: it is not estimated from what they
+        # explain.
         self._weighted = []
         """The blocks with the variance and the bias process that are estimated for each."""
         for block in blocks:
             of_smooth = chain.from_iterable(smooth.get(block.sensor, ()))
             self._weighted.append(_with_noise(block, [*baseline, *of_smooth]))
+        # Folds of whole groups: consecutive groups are in different folds.
         self.groups = np.unique(np.concatenate([block.group for block in blocks]))
         """Numbers of the groups of rows, shape (n_groups,)."""
         n_folds = len(self.groups) if len(self.groups) <= ONE_BY_ONE else GROUP_FOLDS
         folds = [np.searchsorted(self.groups, block.group) % n_folds for block in blocks]
+
+        # White rows, and the results that are computed once.
         self._white = [flat(block.white()) for block in self._weighted]
         """Independent rows of unit variance ``[columns | residual]`` of each block."""
         self._is_in_block = [np.any(white != 0, axis=0) for white in self._white]
@@ -88,6 +92,8 @@ class RowEvidence(Evidence):
         """(Number of a block, choice) -> its sum of squares: one choice meets many larger ones."""
         self._bases: dict[tuple[int, ...], np.ndarray] = {}
         """Choice -> orthonormal basis of its white columns."""
+
+        # Normal matrices of all rows, and of the rows without each fold, which are whitened again.
         total = np.sum([white.T @ white for white in self._white], axis=0)
         without = []
         for number in range(n_folds):

@@ -39,9 +39,11 @@ def model_error(
         Parameters that were estimated.
 
     """
+    # Too few blocks have no scatter: no growth of the standard deviations.
     if len(system.accumulator.blocks) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
-    waves = waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free=free)
+    information, gradient = _block_scores(system, values, noises)
+    waves = waves_of_blocks(information, gradient, system.prior.root, free=free)
     error, misfits = errors_of_waves(waves, system.model)
     if 'accelerometer' in misfits:
         # An error that depends on the attitude scatters the means as offsets or a fast bias process

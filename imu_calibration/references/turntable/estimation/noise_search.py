@@ -190,14 +190,15 @@ class _ShapeSearch:
             time = np.exp(np.clip(logs[2], *LOG_TIME_RANGE))
             return NoiseShape(float(offset / unit), float(bias / unit), float(time))
 
+        # An offset of zero has no logarithm. Sds to 3 %: the likelihood determines them less well.
         offset, bias, time = start
-        found = minimize(
+        minimum = minimize(
             lambda logs: self.cost(shape(logs), session),
             np.log([max(offset, 0.1) * unit, bias * unit, time]),
             method='Nelder-Mead',
             options={'maxfev': 80, 'xatol': 0.03, 'fatol': 0.03},
         )
-        return shape(found.x)
+        return shape(minimum.x)
 
 
 def _posterior_mean(shapes: np.ndarray, costs: np.ndarray) -> NoiseShape:
@@ -273,11 +274,13 @@ class BiasProcessSearch:
             """Return the loss of a shape with its price."""
             return self.likelihood.loss(shape, used) + self.price(shape.offset, shape.bias)
 
-        # First offsets with the least bias process; then, for each correlation time, the best bias
-        # process without offsets, with shares of the first offsets.
+        # Offsets with the least bias process.
         first_time = CORRELATION_TIMES[0]
         offset = _descend(lambda x: loss(NoiseShape(x, self.least, first_time)), SD_RATIOS)
         shapes = [NoiseShape(offset, self.least, first_time)]
+
+        # With enough windows, for each correlation time: the best bias process without offsets,
+        # from the least one on, with shares of these offsets.
         larger = [ratio for ratio in SD_RATIOS if ratio > 1.2 * self.least]
         if self.likelihood.many:
             offsets = [_nearest_ratio(share * offset) for share in OFFSET_SHARES]

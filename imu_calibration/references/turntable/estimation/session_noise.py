@@ -91,13 +91,15 @@ class BandMisfit:
         """
         Return the excess variance of moving windows with this residual over the noise at rest.
         """
-        # With separate weights the samples have the variance of the fast part, and only its slow
-        # part counts for the pieces; otherwise the larger excess of both applies to all rows.
+        # Rows: with separate weights the excess of the fast part, otherwise the larger one of all
+        # samples and of the slow part; at least the noise at rest.
         samples = np.where(self.apart, self.fast, self.overall)
         pieces = np.where(self.apart, 0.0, self.slow)
         of_samples = samples / noise.white_variance
         of_pieces = pieces / noise.low_variance
         centred = np.maximum.reduce([of_samples, of_pieces, np.ones(3)])
+
+        # Slow part: its own excess with separate weights, otherwise that of all rows.
         slow = np.minimum(np.maximum(self.slow / noise.low_variance, 1.0), centred)
         return MovingFactors(centred, slow=np.where(self.apart, slow, centred))
 
@@ -252,16 +254,20 @@ def white_noise(
     if not static:
         return None
 
-    # A code may be constant at rest: the noise is at least that of rounding, from moving windows.
+    # A code may be constant at rest: the noise is at least the least positive variance of moving
+    # windows, that of rounding.
     moving = [row.sensors[sensor].noise_variance for row in rows if row.kind != 'static']
-    rounding = np.array(moving).reshape(-1, 3)
-    rounding = np.where(rounding > 0, rounding, np.inf)
-    floor = np.min(rounding, axis=0, initial=np.inf)
+    in_motion = np.array(moving).reshape(-1, 3)
+    in_motion = np.where(in_motion > 0, in_motion, np.inf)
+    floor = np.min(in_motion, axis=0, initial=np.inf)
     floor = np.where(np.isfinite(floor), floor, 0.0)
+
+    # Variances, inflations and numbers of samples of the static windows.
     variances = np.maximum([row.sensors[sensor].noise_variance for row in static], floor)
     inflations = np.array([row.sensors[sensor].inflation for row in static])
     counts = np.array([row.count for row in static], float)
 
+    # Means over the windows near the usual variance, weighted by their samples.
     white_variance = np.empty(3)
     inflation = np.empty(3)
     for axis in range(3):
@@ -282,24 +288,24 @@ def white_noise(
 
 def _rests(rows: Sequence[WindowStatistics], sensor: str) -> list[WindowStatistics]:
     """Return the static windows of which the variance of a sensor is known."""
-    found = []
-    for row in rows:
-        if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance)):
-            found.append(row)
-    return found
+    static = [row for row in rows if row.kind == 'static']
+    return [row for row in static if np.isfinite(row.sensors[sensor].noise_variance).all()]
 
 
 def _usual(variances: np.ndarray, inflations: np.ndarray) -> tuple[float, bool]:
     """
-    Return (the median variance, False).
+    Return (usual variance of rests on one axis, whether most of them vibrate).
 
-    For vibration above the band of the means in most windows, (the second least, True).
+    It is the median of the `variances`. If most rests vibrate, above the band of the means, it is
+    the second least: the quiet level, but not a single rest with less noise than all others.
     """
     median = float(np.median(variances))
     quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
     if not 0.0 < VIBRATES * quiet < median:
         return median, False
-    # Vibration above the band of the means raises the variance of samples, not that of the means.
+
+    # Vibration above the band of the means raises the variance of samples, not that of the means:
+    # the means of pieces then scatter less than white noise of this variance would.
     louder = variances > VIBRATES * quiet
     if float(np.median(inflations[louder])) < MIN_INFLATION:
         return quiet, True
@@ -317,16 +323,18 @@ def shaken_means(
         return {}
     variances = np.array([row.sensors[sensor].noise_variance for row in static])
     inflations = np.array([row.sensors[sensor].inflation for row in static])
-    of_means = np.zeros(variances.shape)
+
+    # Variance at low frequency of the vibrating rests; zero for the others.
+    low_variances = np.zeros(variances.shape)
     for axis in range(3):
         quiet, shaken = _usual(variances[:, axis], inflations[:, axis])
         loud = (variances[:, axis] > VIBRATES * quiet) & shaken
-        of_means[loud, axis] = variances[loud, axis] * inflations[loud, axis]
-    found = {}
-    for row, variance in zip(static, of_means):
+        low_variances[loud, axis] = variances[loud, axis] * inflations[loud, axis]
+    shaken_variance = {}
+    for row, variance in zip(static, low_variances):
         if variance.any():
-            found[row.session, row.time] = variance / row.count
-    return found
+            shaken_variance[row.session, row.time] = variance / row.count
+    return shaken_variance
 
 
 def first_noise(
@@ -378,8 +386,9 @@ def updated_noise(
     Return the noise of a sensor estimated from the residuals at `values`, starting from `noise`.
     """
     if white_noise(system.accumulator.rows, sensor) is None:
-        known, left_out = noise.known, noise.left_out
-        noise = replace(_at_rest(system, sensor, values), known=known, left_out=left_out)
+        # Without rests the noise of the samples is that of the residuals.
+        of_residuals = _at_rest(system, sensor, values)
+        noise = replace(of_residuals, known=noise.known, left_out=noise.left_out)
 
     # Centred rows: the excess over the noise at rest.
     moving = {}
@@ -415,6 +424,7 @@ def _misfit_with_correlation(
         joined = np.column_stack([design, residual])
         return joined.T @ joined
 
+    # Products of the fast part: those of all rows less those of the slow ones among them.
     all_rows = system.within[sensor][kind]
     slow_rows = system.accumulator.slow[sensor, kind]
     along_parameters = np.zeros(3)

@@ -312,11 +312,6 @@ class _Point:
     residual: np.ndarray
     """Residual of the weighted rows, then of the prior, shape (m,)."""
 
-    @property
-    def cost(self) -> float:
-        """Sum of squares."""
-        return float(self.residual @ self.residual)
-
 
 @dataclass(frozen=True, eq=False)
 class _Step:
@@ -376,11 +371,11 @@ class _WindowSquares:
 
     def cost(self, point: _Point) -> float:
         """Return the sum of squares of a point."""
-        return point.cost
+        return float(point.residual @ point.residual)
 
     def is_last(self, point: _Point, step: _Step) -> bool:
         """Return whether a step is small; a large misfit limits the accuracy."""
-        return step.length < self.small_step * max(1.0, 1e-7 * np.sqrt(point.cost))
+        return step.length < self.small_step * max(1.0, 1e-7 * np.sqrt(self.cost(point)))
 
 
 @dataclass(frozen=True, eq=False)
