@@ -33,7 +33,8 @@ def gain_by_hand(
     if compensated is None:
         return search.problem.gain(search.held_out, before, after, sensor=sensor)
 
-    # The rows in which the difference of the two choices is clearest.
+    # The rows in which the difference of the two choices is clearest. Turns, which have a duration,
+    # have one error: an angle.
     block = search.problem.clearest(compensated.before, compensated.after, sensor)
     poses = search.baseline.poses
     end = end_by_hand(poses)
@@ -41,7 +42,8 @@ def gain_by_hand(
     errors_before = np.zeros((len(block.group), n_columns))
     errors_after = np.zeros((len(block.group), n_columns))
 
-    # Each part of the recording is predicted by a fit to the other parts.
+    # Each part of the recording is predicted by a fit to the other parts, with the effects of each
+    # choice that are found in them.
     settled_from = 0.0
     for part in search.held_out:
         rows = np.flatnonzero(np.isin(block.group, part.groups))

@@ -258,7 +258,8 @@ class _Equations:
         )
         main = np.zeros((len(true), 3, model.size))
         main[:, :, 0:3] = np.eye(3)
-        # Row i of the lower triangular matrix has the elements up to i.
+        # After three biases, row i of the matrix has the places 3 + 3 i to 5 + 3 i; of the lower
+        # triangular one the elements up to i.
         for i in range(3):
             main[:, i, 3 + 3 * i : 4 + 4 * i] = true[:, : i + 1]
         main[:, :, model.extra_index('accelerometer')] = slopes
@@ -323,6 +324,7 @@ class _Equations:
             Place in `COMPONENTS`.
 
         """
+        # Five nuisances of each pose, shape (k, 3, k, 5): a row has only those of its own pose.
         pose = np.arange(len(residual))
         size = residual.size
         nuisance = np.zeros((*residual.shape, len(residual), 5))
@@ -375,7 +377,7 @@ class _Equations:
         across_i = self.across[i]
         across_j = self.across[j]
 
-        # By the gyroscope's parameters, through psi.
+        # By the gyroscope's parameters, through psi: d(R u_i) = -psi x (R u_i).
         by_psi = across_j.T @ skew(carried)
         main = np.zeros((2, model.size))
         main[:, model.gyro_bias] = by_psi @ turn.by_bias

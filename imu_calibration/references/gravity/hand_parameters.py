@@ -247,22 +247,9 @@ class HandModel:
         true_force = np.linalg.solve(force_matrix, (force - force_bias).T).T
         true_rate = np.linalg.solve(gyro_matrix, (rate - gyro_bias).T).T
         for _ in range(REPEATS if self.extras else 0):
-            further_force, _ = self.further_output(
-                'accelerometer',
-                values,
-                true_force,
-                rate=true_rate,
-                time=time,
-                temperature_c=temperature_c,
-            )
-            further_rate, _ = self.further_output(
-                'gyroscope',
-                values,
-                true_force,
-                rate=true_rate,
-                time=time,
-                temperature_c=temperature_c,
-            )
+            inputs = {'rate': true_rate, 'time': time, 'temperature_c': temperature_c}
+            further_force, _ = self.further_output('accelerometer', values, true_force, **inputs)
+            further_rate, _ = self.further_output('gyroscope', values, true_force, **inputs)
             true_force = np.linalg.solve(force_matrix, (force - force_bias - further_force).T).T
             true_rate = np.linalg.solve(gyro_matrix, (rate - gyro_bias - further_rate).T).T
         return true_force, true_rate

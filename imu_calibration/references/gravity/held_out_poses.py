@@ -395,7 +395,7 @@ class _Turns(PlainEquations):
         The bias is the mean rate at rest, the matrix a Gauss-Newton step with the turns.
         """
         hand = self.hand
-        model = self.hand.hand_model
+        model = hand.hand_model
         fitted = self.plan.fitted
         is_bias = np.zeros(len(values), bool)
         is_bias[model.gyro_bias] = True

@@ -267,41 +267,40 @@ def hand_coverage(
 
     It has the gain of each direction, the next pose with the turn to it, and the remaining seconds.
     """
-    # Without an accelerometer gravity is not measured, and no attitude has a gain.
     without_gravity = 'accelerometer' in scan.absent
     seen = ups_of(None if without_gravity else scan.poses)
-    up = seen[-1] if len(seen) else None
     no_gain = Coverage(
         worth=np.zeros(len(DIRECTIONS)),
         seen=seen,
-        up=up,
+        up=seen[-1] if len(seen) else None,
         next=Step(''),
         seconds=0.0,
         frame_id=frame_id,
     )
+
+    # No attitude has a gain: all is determined, or each need is an input or a cause to be found,
+    # the keys of `REMEDY_KEYS`, or gravity is not measured. `MOVED_REMEDY` is none of these keys: a
+    # sensor that moved at rest is put down again, in the attitude that the picture shows.
     if result is not None:
         if is_done(result):
             return replace(no_gain, done=True)
-        # Nor does an attitude determine more where each need is an input or a cause to be found,
-        # the keys of `REMEDY_KEYS`. `MOVED_REMEDY` is none of them: a sensor that moved at rest is
-        # put down again, in the attitude that the picture shows.
         needs = needs_of(result.calibration)
         if needs and set(needs) <= set(REMEDY_KEYS):
             return replace(no_gain, next=Step(needs[0]))
     if without_gravity:
         return no_gain
+
+    # The plan of the remaining steps.
     knowledge = knowledge_of(scan, result, options)
     steps = foretold(knowledge)
     if not steps:
         return no_gain
     first = steps[0]
-    return Coverage(
+    return replace(
+        no_gain,
         worth=knowledge.best().gains,
-        seen=seen,
-        up=up,
         next=Step(first.words, first.up, first.axis, first.angle),
         seconds=sum(step.seconds for step in steps),
-        frame_id=frame_id,
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Effect, Role
-from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.rows import Rows
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
@@ -171,16 +171,20 @@ def investigate_by_hand(
     poses = data.poses
     if len(poses) < MIN_FOLD_POSES:
         raise too_few_poses(len(poses))
-    accelerometer = options.accelerometer or BASE
-    gyroscope = options.gyroscope or BASE
+
+    # Baseline: the given solution, unless it has an added g-sensitivity, or other effects.
+    requested = options.model
     baseline = solved
-    # The given solution may have an added g-sensitivity, or other effects.
     if baseline is None or (baseline.model.accelerometer, baseline.model.gyroscope) != (
-        accelerometer,
-        gyroscope,
+        requested.accelerometer,
+        requested.gyroscope,
     ):
-        requested = replace(options, accelerometer=accelerometer, gyroscope=gyroscope)
-        baseline = solve_by_hand(data, requested)
+        explicit = replace(
+            options, accelerometer=requested.accelerometer, gyroscope=requested.gyroscope
+        )
+        baseline = solve_by_hand(data, explicit)
+
+    # Effects that can be tested, and their columns.
     follows_gravity = shown(g_sensitivity_evidence(poses))
     effects, not_testable = sort_effects(
         baseline.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity)

@@ -84,9 +84,10 @@ def covariance_of_placements(rows: Rows, estimate: RowEstimate) -> np.ndarray:
     first = placements(estimate.state.up)
     if len(first) == n_rests:
         return covariance
-    placement = np.searchsorted(first, np.arange(n_rests), side='right') - 1
+    placement = np.searchsorted(first, np.arange(n_rests), side='right') - 1  # of each rest
 
-    # Weights of the rests in the mean of each placement and axis, shape (n_means, m).
+    # Weights of the rests in the mean of each placement and axis, shape (n_means, m). A rest has
+    # three rows, one for each axis; axis a of placement p has the mean number 3 p + a.
     pose = COMPONENTS.index('pose')
     of_poses = np.flatnonzero(rows.component == pose)
     mean = 3 * placement[rows.group[of_poses]] + np.arange(len(of_poses)) % 3
@@ -119,6 +120,8 @@ def _variance_of_means(rows: Rows, estimate: RowEstimate, weights: np.ndarray) -
     columns = flat(free.equations)
     white = flat(free.with_scatter(estimate.scatter.variance).white())
 
+    # Other rows, the means, and the differences within each mean: for whitened rests the mean has
+    # the direction of the roots of the weights.
     transformed = [white[rows.component != COMPONENTS.index('pose')], weights @ columns]
     for weights_of_mean in weights:
         in_mean = np.flatnonzero(weights_of_mean)

@@ -10,7 +10,7 @@ from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.rows import Rows
 from imu_calibration.estimation.sensor_noise import NATURAL
 from imu_calibration.kinematics.rotations import skew
-from imu_calibration.kinematics.strapdown import integrate_turn
+from imu_calibration.kinematics.strapdown import Turn, integrate_turn
 from imu_calibration.references.gravity.equations import Poses, TurnData, between_middles, tangent
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
@@ -76,9 +76,10 @@ def build_rows(
     prior_sds = [FREE_SD_FACTOR * hand.hand_model.priors, np.array([EARTH_UPWARDS_SD])]
     start = hand.hand_model.size + 1
     for group in groups:
-        parts[group.label] = slice(start, start + group.size)
-        prior_sds.append(group.effect.prior_sds()[: group.size])
-        start += group.size
+        n_columns = group.effect.n_amplitudes
+        parts[group.label] = slice(start, start + n_columns)
+        prior_sds.append(group.effect.prior_sds()[:n_columns])
+        start += n_columns
     space = SearchParameters(parts, np.concatenate(prior_sds))
 
     # Derivatives of the outputs in the poses. The last parameter of a warm-up, its time constant,
@@ -90,7 +91,7 @@ def build_rows(
             columns = _columns(
                 hand, group.effect, true_force, tau=group.time_constant, **hand.poses.conditions
             )
-            at_rest[group.effect.sensor][group.label] = columns[:, :, : group.size]
+            at_rest[group.effect.sensor][group.label] = columns[:, :, : group.effect.n_amplitudes]
 
     # Rows of the poses and of the turns.
     blocks = [
@@ -125,11 +126,6 @@ class _ColumnGroup:
     """Its name, for a warm-up with the number of the time constant."""
     time_constant: float | None = None
     """Time constant, s."""
-
-    @property
-    def size(self) -> int:
-        """Number of columns."""
-        return len(self.effect.amplitudes(self.effect.components))
 
 
 def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
@@ -246,38 +242,18 @@ def _turn_block(
     variance of a row is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the integrated rates,
     rad^2, and the standard errors s of the two means.
     """
-    bias_f, matrix_f = hand.accelerometer
-    matrix = hand.gyroscope.matrix
     across = tangent(hand.state.up)
-    rows = []  # of each turn, shape (2, q + 1), the last column is the residual
+    rows = []  # of each turn, shape (2, q + 1): columns of all parameters, then the residual
     variances = []  # shape (2,)
     durations = []
     for turn in turns:
-        # True inputs during the turn, and the columns of further effects less those at rest.
         i, j = turn.first, turn.last
-        bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
-        force = np.linalg.solve(matrix_f, (turn.force - bias_f).T).T
-        rate = np.linalg.solve(matrix, (turn.rate - bias).T).T
-        further = [np.zeros((len(force), 3, 0))]
-        for effect in effects:
-            columns = _columns(
-                hand, effect, force, rate=rate, time=turn.time, temperature_c=turn.temperature_c
-            )
-            columns_at_rest = at_rest[effect.name]
-            further.append(columns - 0.5 * (columns_at_rest[i] + columns_at_rest[j]))
-
-        # The direction carried through the turn, and its derivative by a rotation psi.
-        integrated = integrate_turn(
-            turn.time,
-            turn.rate,
-            bias=bias,
-            matrix=matrix,
-            further=(np.zeros_like(force), np.concatenate(further, axis=2)),
-        )
+        integrated = _integrated(hand, turn, at_rest, effects)
         duration = integrated.duration
+
+        # Residual, and its derivatives through the error psi of the rotation.
         carried = between_middles(hand.poses, turn, integrated.mat_ji) @ hand.state.up[i]
         by_psi = across[j].T @ skew(carried) / duration
-
         row = np.zeros((2, space.size + 1))
         row[:, hand.hand_model.gyro_matrix] = by_psi @ integrated.by_matrix.reshape(3, 9)
         start = 0
@@ -288,6 +264,8 @@ def _turn_block(
         row[:, -1] = -across[j].T @ carried / duration
         rows.append(row)
         durations.append(duration)
+
+        # Noise of the integrated rates, and of the mean of both rates at rest.
         bias_variance = 0.25 * np.mean(hand.poses.rate_sem[[i, j]] ** 2, axis=1).sum()
         variances.append(np.full(2, turn.noise_variance / duration**2 + bias_variance))
     return Rows(
@@ -298,4 +276,40 @@ def _turn_block(
         group=np.array([turn.first for turn in turns]),
         time=np.array([turn.time.mean() for turn in turns]),
         duration=np.array(durations),
+    )
+
+
+def _integrated(
+    hand: HandCalibration,
+    turn: TurnData,
+    at_rest: Mapping[str, np.ndarray],
+    effects: Sequence[Effect],
+) -> Turn:
+    """
+    Return a turn integrated with the mean rate of the rests before and after it as the bias.
+
+    `Turn.by_further` has the derivatives by the parameters of the `effects`, one after the other:
+    of their output in the turn less the mean of their output in both rests (`at_rest`).
+    """
+    # True inputs during the turn.
+    i, j = turn.first, turn.last
+    force_bias, force_matrix = hand.accelerometer
+    matrix = hand.gyroscope.matrix
+    bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
+    force = np.linalg.solve(force_matrix, (turn.force - force_bias).T).T
+    rate = np.linalg.solve(matrix, (turn.rate - bias).T).T
+
+    further = [np.zeros((len(force), 3, 0))]
+    for effect in effects:
+        columns = _columns(
+            hand, effect, force, rate=rate, time=turn.time, temperature_c=turn.temperature_c
+        )
+        columns_at_rest = at_rest[effect.name]
+        further.append(columns - 0.5 * (columns_at_rest[i] + columns_at_rest[j]))
+    return integrate_turn(
+        turn.time,
+        turn.rate,
+        bias=bias,
+        matrix=matrix,
+        further=(np.zeros_like(force), np.concatenate(further, axis=2)),
     )

@@ -117,9 +117,13 @@ def _hidden_rates(
     ``h^2 / 12 exp(-4 pi^2 v / h^2)``: noise of half a step averages it. The bias, and with it the
     error, is the same in all poses.
     """
+    # Step of the readings of each axis; 0 where they have none. A dead band that hides the bias
+    # gives zero in all poses.
     step = smallest_step(rate_s)
     step = np.where(np.isfinite(step), step, 0.0)
     bands = np.where(np.any(means != 0.0, axis=0), 0.0, dead_bands(rate_s, step))
+
+    # The root of h^2 / 12 exp(-4 pi^2 v / h^2), with v / h^2 of the poses.
     scatter = np.mean([part.var(axis=0) for part in parts], axis=0)
     # Between two steps the readings scatter by up to half a step without any noise: the noise is
     # that of the calmest axis.
@@ -324,6 +328,7 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
     """
     is_new = np.ones(len(rate), bool)  # a reading published twice is one reading
     is_new[1:] = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rate.T])
+    # One range for both sides of all axes, or a range for each side of each axis.
     at_end = _at_end(np.abs, rate.T, is_new)
     for axis in rate.T:
         at_end |= _at_end(np.positive, axis[None], is_new)
@@ -348,14 +353,16 @@ def _at_end(signed: Callable, axes: np.ndarray, is_new: np.ndarray) -> np.ndarra
         False for repeated readings.
 
     """
-    # The largest readings of all axes, and the step of the converter: their smallest difference.
+    # 1. The largest readings of all axes, and the step of the converter: their smallest difference.
     largest = np.concatenate([_largest(signed, axis, is_new) for axis in axes])
     largest = np.sort(largest)[-MAX_RANGE_READINGS:]
     extreme = largest[-1]
     step = np.diff(largest)
     step = step[step > 1e-9 * np.abs(extreme)].min(initial=np.inf)
 
-    # Readings at the extreme. Two's complement: one end is larger by a step.
+    # 2. Samples at the extreme: to half a step below it, where no other reading is. Of several axes
+    #    the next reading too, because in two's complement one end is larger by a step. At most 1e-4
+    #    of the extreme, also where the readings have no step or a coarse one.
     margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step
     margin = min(margin, 1e-4 * np.abs(extreme))
     at_extreme = np.logical_or.reduce([signed(axis) >= extreme - margin for axis in axes])
@@ -363,10 +370,12 @@ def _at_end(signed: Callable, axes: np.ndarray, is_new: np.ndarray) -> np.ndarra
     if len(below) < TOP:
         return np.zeros(len(is_new), bool)
 
-    # Readings expected there by chance, and the ones that are there.
+    # 3. Readings expected there by chance: the density of the readings below, over the margin.
     n_by_chance = 0.0
     if np.isfinite(step):
         n_by_chance = TOP * (margin + 0.5 * step) / (extreme - below[0])
+
+    # 4. Readings that are there, in runs of consecutive samples.
     run_lengths = np.diff(runs_of(at_extreme[is_new]))
     if n_by_chance < CERTAIN:
         n_readings = run_lengths.sum()
@@ -472,7 +481,8 @@ def _clock_times(stamps: np.ndarray, period: float) -> np.ndarray:
     lines = [_clock_line(number, stamps, n_lines) for number in numbers]
     line = min(lines, key=lambda line: np.sum((stamps - line) ** 2))
 
-    # Mean departure of pieces of about LAG samples, of which the first `longer` have one more.
+    # Mean departure of pieces of about LAG samples. The first `longer` pieces have size + 1
+    # samples, all others `size`: piece k begins at k size + min(k, longer).
     piece = np.arange(len(stamps) // LAG)
     size, longer = divmod(len(stamps), len(piece))
     sums = np.add.reduceat(stamps - line, piece * size + np.minimum(piece, longer))

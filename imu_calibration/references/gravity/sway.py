@@ -39,10 +39,13 @@ def sway_at_rest(
     predicted_power = 0.0
     n_rests = 0
     for force, rate, seconds in zip(forces, rates, length, strict=True):
+        # Without readings for each piece, or with a mean force of zero, a rest does not count.
         size = len(force) // REST_PIECES
         mean_length = float(np.linalg.norm(force.mean(axis=0)))
         if not size or not mean_length > 0.0:
             continue
+
+        # Direction by the accelerometer, and by the integral of the rates, less their means.
         direction = unit_rows(force)
         turned = np.cumsum(np.cross(direction, rate - bias), axis=0) * seconds / len(force)
         used = slice(0, size * REST_PIECES)

@@ -69,7 +69,7 @@ def off_axis_lacking(up: np.ndarray) -> tuple[str, ...]:
     first = placements(up)
     lacking = []
     for name in CROSS_TERMS:
-        i, j = (AXES.index(axis) for axis in name[-2:])
+        i, j = (AXES.index(axis) for axis in name[-2:])  # the name ends in two axes, as 'yx'
         if np.count_nonzero(np.abs(up[first, i] * up[first, j]) >= OFF_AXIS) < LEAST_PLACEMENTS:
             lacking.append(name)
     return tuple(lacking)
