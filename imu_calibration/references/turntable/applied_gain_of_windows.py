@@ -206,14 +206,16 @@ def _errors(windows: Sequence[Window], table: Table, side: _Side) -> dict[str, n
 
     The true readings are the output of an ideal sensor on the table as this side estimates it.
     """
-    # Ideal sensors at the estimated reference (angles, places, delays of the table).
+    # Ideal sensors at the estimated reference (angles, places, delays of the table). A rest has one
+    # row of motion; `rows` has the row of each sample.
     motion, temperature, rows = all_samples(windows)
     ideal = with_reference(side.model, nominal_values(side.model), side.values)
     ideal_model = side.model.at(ideal)
     references = References(ideal_model, table, motion, temperature_c=temperature)
     reference_of = {sensor: references.at(sensor) for sensor in SENSORS}
 
-    # Readings as compensation corrects them, with the motion at the gyroscope.
+    # Readings as compensation corrects them, with the motion at the gyroscope. Their covariance is
+    # not used: the calibration is given without one.
     ref = reference_of['gyroscope'].select(rows)
     raw = []
     for sensor in SENSORS:

@@ -139,6 +139,8 @@ def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
     """
     if all(issubclass(kind, SAVED_PLAIN) for kind in set(map(type, values))):
         return ['plain', values]
+
+    # Values of different structure: a column for each structure.
     kinds = [_kind(value) for value in values]
     if len(set(kinds)) > 1:
         values_of_kind: dict[Any, list] = {}
@@ -150,6 +152,8 @@ def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
             [order.index(kind) for kind in kinds],
             [_packed(alike, arrays) for alike in values_of_kind.values()],
         ]
+
+    # Values of the structure of the first one.
     first = values[0]
     if isinstance(first, np.ndarray):
         arrays.append(np.array(values))
@@ -160,15 +164,15 @@ def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
             [len(value) for value in values],
             _packed(list(chain.from_iterable(values)), arrays),
         ]
-    keys = tuple(first) if isinstance(first, dict) else ()
-    rows: list[Iterable] = []  # the fields of each value
-    for value in values:
-        if isinstance(value, tuple):
-            rows.append(value)
-        elif isinstance(value, dict):
-            rows.append(value.values())
-        else:
-            rows.append(vars(value).values())
+
+    # Tuples, dicts with the same keys, and dataclasses: a column for each field.
+    keys: tuple = ()
+    rows: Iterable[Iterable] = values
+    if isinstance(first, dict):
+        keys = tuple(first)
+        rows = [value.values() for value in values]
+    elif not isinstance(first, tuple):
+        rows = [vars(value).values() for value in values]
     return [
         type(first).__name__,
         len(values),
@@ -218,7 +222,8 @@ def _unpacked(column: list, numbers: _SavedNumbers) -> list:
 
     Their arrays are the next ones of the file `numbers`.
     """
-    # The meaning of the second item depends on the name, see `_packed`.
+    # The meaning of the second item depends on the name, see `_packed`: values, shape, lengths,
+    # numbers of kinds, or the number of values.
     name, size, *parts = column
     if name == 'plain':
         return size
@@ -234,6 +239,8 @@ def _unpacked(column: list, numbers: _SavedNumbers) -> list:
     if name == 'mixed':
         values_of_kind = [iter(values) for values in columns]
         return [next(values_of_kind[number]) for number in size]
+
+    # Objects from the columns of their fields; without fields there are `size` empty ones.
     kind: Any = SAVED_TYPES[name]
     rows = list(zip(*columns, strict=True)) or [()] * size
     # The test narrows the type to an instance or a class; only classes are saved.

@@ -30,7 +30,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.noise_model import noise_of_windows
+from imu_calibration.references.turntable.noise_model import NoiseModel, noise_of_windows
 from imu_calibration.references.turntable.session_data import SessionData
 
 LEVELLING_SD = 2 * ARCMIN
@@ -174,48 +174,56 @@ def parameter_shifts(
     sources = list(_sources(gathered))
     # Of each window: sensor -> columns and changes of the output.
     outputs = [_outputs(table, solution, source, changes=changes) for source in sources]
-    kinds = [source.kind for source in sources]
-    counts = np.array([source.samples for source in sources])
-    times = np.array([source.time for source in sources])
-    sessions = np.array([source.session for source in sources])
 
-    # Normal equations of the solver: A' V^-1 A, and A' V^-1 d of each window and change.
+    # Normal equations of the solver: A' V^-1 A, and A' V^-1 d of each window and change. The rows
+    # of a window are its mean, and its samples about the mean.
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(sources), len(solution.values)))
     for sensor, noise in noise_of_windows(solution).items():
+        # Design of each window, shape (n_samples, 3, n_params).
         slope = coefficient_jacobian(solution.model, sensor, solution.values)
-        # Of each window, shape (n_samples, 3, n_params).
         designs = [
             np.einsum('nq,qap->nap', of_window[sensor].columns, slope) for of_window in outputs
         ]
-
-        # The means of all windows, correlated through the bias.
         means = np.array([design.mean(axis=0) for design in designs])
-        variance = noise.mean_variance(kinds, counts) + noise.offset_sd**2
-        rows = Rows(
-            equations=means,
-            variance=variance,
-            processes=noise.bias_processes,
-            time=times,
-            session=sessions,
-        )
-        whitening = rows.whitening()
-        weighted = whitening.adjoint(whitening(means))
-        normal = normal + np.tensordot(weighted, means, ([0, 1], [0, 1]))
-
-        # The samples about the mean of their window.
+        weighted_means = _weighted_means(means, sources, noise)
+        normal = normal + np.tensordot(weighted_means, means, ([0, 1], [0, 1]))
         for k, (source, design, of_window) in enumerate(zip(sources, designs, outputs)):
-            output_changes = of_window[sensor].changes
+            # Each sample stands for `stride` samples. Sums over samples and axes.
             centred = design - means[k]
-            within = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
-            normal += np.tensordot(within, centred, ([0, 1], [0, 1]))
-            right[:, k] += output_changes.mean(axis=1) @ weighted[k]
-            right[:, k] += np.tensordot(output_changes, within, ([1, 2], [0, 1]))
+            weighted = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
+            normal += np.tensordot(weighted, centred, ([0, 1], [0, 1]))
+            output_changes = of_window[sensor].changes  # (n_changes, n_samples, 3)
+            right[:, k] += output_changes.mean(axis=1) @ weighted_means[k]
+            right[:, k] += np.tensordot(output_changes, weighted, ([1, 2], [0, 1]))
+
+    # Fixed and held parameters do not shift.
     index = np.flatnonzero(~fixed_parameters(solution.model) & ~solution.held)
     shifts = np.zeros_like(right)
     shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
     return shifts
+
+
+def _weighted_means(
+    means: np.ndarray, sources: Sequence['_Source'], noise: NoiseModel
+) -> np.ndarray:
+    """
+    Return ``V^-1 A`` of the means of n windows, shape (n, 3, n_params).
+
+    `means` is their design A, of the same shape; bias processes correlate the windows of `sources`.
+    """
+    counts = np.array([source.samples for source in sources])
+    variance = noise.mean_variance([source.kind for source in sources], counts)
+    rows = Rows(
+        equations=means,
+        variance=variance + noise.offset_sd**2,
+        processes=noise.bias_processes,
+        time=np.array([source.time for source in sources]),
+        session=np.array([source.session for source in sources]),
+    )
+    whitening = rows.whitening()
+    return whitening.adjoint(whitening(means))
 
 
 class _Source(NamedTuple):
@@ -299,6 +307,7 @@ def _outputs(
         for reference in references:
             ref = reference.at(sensor)
             outputs.append(sensor_output(model, sensor, solution.values, ref=ref))
+        # Also without any change, shape (0, n, 3).
         moved = np.array(outputs[1:]).reshape(-1, *outputs[0].shape) - outputs[0]
         outputs_of[sensor] = _Outputs(columns(references[0], sensor), moved)
     return outputs_of

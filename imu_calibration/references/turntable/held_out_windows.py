@@ -275,9 +275,11 @@ def errors_of(
     Block k is corrected with ``folds[k % len(folds)]``. The nuisances, a delay and an arm common to
     all pieces, are those with the smallest errors.
     """
+    # Of each block and regime: the errors, then their change with each nuisance, shape
+    # (1 + n_nuisances, n_rows, 3), and its (block, index of the regime).
     regimes = _regimes_of(held_out)
     corrections = [_Correction(model, sensor, values) for values in folds]
-    places: list[tuple[int, int]] = []  # (block, index of the regime) of each item of `stacks`
+    places: list[tuple[int, int]] = []
     stacks: list[np.ndarray] = []
     for k, block in enumerate(held_out.blocks):
         for (name, regime), rows in block.pieces.items():
@@ -285,6 +287,7 @@ def errors_of(
                 places.append((k, regimes.index(Regime(regime))))
                 stacks.append(corrections[k % len(folds)].errors(rows))
 
+    # One delay and one arm for all of them.
     nuisances, without_delay = _nuisances(np.concatenate(stacks, axis=1))
     squares = np.zeros((len(held_out.blocks), len(regimes)))
     for place, (error, *changes) in zip(places, stacks, strict=True):
@@ -308,6 +311,7 @@ def _nuisances(stacked: np.ndarray) -> tuple[np.ndarray, float]:
     error = stacked[0].ravel()
     changes = stacked[1:].reshape(len(stacked) - 1, -1)
     nuisances = np.linalg.lstsq(changes.T, -error, rcond=1e-9)[0]
+    # Again with the arm alone, if there is one.
     arm_changes = changes[1:]
     arm = np.zeros(0)
     if len(arm_changes):

@@ -179,6 +179,7 @@ class LiveCalibration(LiveSession):
         Whether the last solution is outside the validity of its linearisation, and the store is too
         small to linearise again.
         """
+        # Windows are collected from now on, unless a thermal effect waits for a temperature.
         model = self._requested_model
         if earlier_run is not None:
             if model.needs_temperature:
@@ -274,12 +275,9 @@ class LiveCalibration(LiveSession):
             When the joint states do not contain the table's joints.
 
         """
-        if (
-            self._first_temperature_c is None
-            and block.temperature is not None
-            and len(block.temperature)
-        ):
-            self._first_temperature_c = float(block.temperature.temperature_c[0])
+        temperature = block.temperature
+        if self._first_temperature_c is None and temperature is not None and len(temperature):
+            self._first_temperature_c = float(temperature.temperature_c[0])
         if self._collector is None:
             return self._push_before_temperature(block)
         return self._collector.push(block)

@@ -157,16 +157,16 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
     mount_angles = np.round(mount_rpy_deg(turn.matrix, table), 2)
     fits = ', '.join(f'{angle + 0.0:.2f}' for angle in mount_angles)  # + 0.0: no negative zero
     size = f'{turn.angle / DEG:.2f} deg'
-    if not severe:
+    if severe:
+        text = (
+            'the IMU must be mounted as in the table description, its readings are turned by'
+            f' {size} against it: mount.rpy_deg [{fits}] would fit; correct it{zero}, or'
+            ' the matrices contain this turn'
+        )
+    else:
         text = (
             'the axes of the matrices are those of the mount as stated, they contain a common turn'
             f' of {size} against it: mount.rpy_deg [{fits}] would remove it; if the axes of the'
             f' sensors are wanted, state it{zero}'
         )
-        return (CheckFinding(MOUNT_CHECK, NOTE, text, key='table'),)
-    text = (
-        'the IMU must be mounted as in the table description, its readings are turned by'
-        f' {size} against it: mount.rpy_deg [{fits}] would fit; correct it{zero}, or'
-        ' the matrices contain this turn'
-    )
-    return (CheckFinding(MOUNT_CHECK, WARNING, text, key='table'),)
+    return (CheckFinding(MOUNT_CHECK, WARNING if severe else NOTE, text, key='table'),)

@@ -59,14 +59,13 @@ class StaticWindow:
         """Return the statistics with the columns of a model."""
         references = References(model, table, self.motion, temperature_c=self.temperature_c)
         sensors = {}
+        pieces = {}
         for name, known in self.statistics.sensors.items():
             output = known.mean[-N_AXES:]
             mean = np.concatenate([columns(references, name).mean(axis=0), output])
             # At rest there are no centred rows, but their width is that of the columns.
             sensors[name] = replace(known, mean=mean, within=np.zeros((0, len(mean))))
-        pieces = {}
-        for name, statistics in sensors.items():
-            pieces[name] = pieces_at_rest(statistics.mean, self.statistics.duration)
+            pieces[name] = pieces_at_rest(mean, self.statistics.duration)
         return replace(self.statistics, sensors=sensors, pieces=pieces)
 
 

@@ -51,19 +51,20 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     frame_id : str
 
     """
+    # 1. Parameters that motions can determine: not the ones with another remedy.
     solution = result.solution
     requested = result.calibration.requested
-    # Parameters that motions can determine: not the ones with another remedy.
     wanted = np.zeros(len(solution.values), bool)
     for index, name in enumerate(result.calibration.param_names):
         need, _ = result.needed.get(name, ('', 0.0))
         wanted[index] = name in requested and need not in REMEDY_KEYS
+
+    # 2. Information of the recording and of the prior, with a gauge that double precision allows.
+    #    Unmodelled effects make the standard deviations larger than it predicts; the same factor is
+    #    assumed after further motions.
     prior = make_prior(solution.model)
     gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge
     base = solution.information + np.diag(1 / prior.sd**2) + gauge.T @ gauge
-
-    # Unmodelled effects make the standard deviations larger than the information matrix predicts.
-    # The same factor is assumed after further motions.
     factor = np.maximum(result.calibration.sd / sd_of_information(base), 1.0)
 
     def excess(information: np.ndarray) -> np.ndarray:
@@ -72,20 +73,23 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
             (factor * sd_of_information(information))[wanted], result.tolerances[wanted]
         )
 
+    # 3. Gain of a rest with each direction up.
     added = MotionInformation(
         solution.model, solution.values, solution.noise, result.gravity
     ).added_by
     after = np.array([excess(base + added(rest)) for rest in REST_WITH_UP])
     worth = share_gained(excess(base), after)
+
+    # 4. The next motion, of those that the table can do.
     possible = possible_motions(cast(WindowObservations, result.data).table)
-    motions = []
-    for motion in MOTIONS if possible is None else possible:
-        if motion.seconds < MAX_MOTION_SECONDS:
-            motions.append(motion)
+    if possible is None:
+        possible = MOTIONS
+    motions = [motion for motion in possible if motion.seconds < MAX_MOTION_SECONDS]
     first, seconds = _plan_ahead(base, excess, added, motions)
     step = _next_on_table(result) if first is None else _step(first.text)
+
+    # 5. Directions of gravity in the rests; none are shown without an accelerometer.
     errors = result.window_errors()
-    # Without an accelerometer no directions of gravity are shown.
     force = errors.true.get('accelerometer', np.zeros((len(errors.kind), 3)))
     force = force[(np.asarray(errors.kind) == 'static') & force.any(axis=1)]
     return Coverage(

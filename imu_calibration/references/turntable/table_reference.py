@@ -121,9 +121,7 @@ class TableReference:
         try:
             with_errors = calibrate_with_table_errors(recordings, options)
             calibrated = with_errors.result
-            for finding in calibrated.gathered.findings:
-                if finding.check in STATED_CHECKS:
-                    shown.append(finding)
+            shown = [each for each in calibrated.gathered.findings if each.check in STATED_CHECKS]
             shown += with_errors.findings
         except ImuCalibrationError as error:
             calibrated = error

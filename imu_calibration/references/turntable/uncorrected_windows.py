@@ -49,35 +49,35 @@ def uncorrected_on_table(
     """
     latest = latest or model
     end = end_of(accumulator)
-    # A time constant changes the columns, which were gathered at another one.
+    # The model at the time constants of the gathered columns, which are others than its own.
     gathered_at = {e.name: gathered.point_of(e) for e in model.effects if e.time_constant}
-    at_columns = replace(model, point=model.point | gathered_at)
+    model_of_columns = replace(model, point=model.point | gathered_at)
+
     centre: dict[str, ColumnCentre] = {}
     sizes = []
     for effect in not_applied(model):
-        at_end = has_settled(latest, effect, end)
+        settled = has_settled(latest, effect, end)
         true_input = gathered.columns_of(effect.sensor, Role.LINEAR)
         samples = _Samples.of(accumulator, effect.sensor, true_input)
         squares = np.zeros(3)
         for group in effect.groups:
+            # Constant part of a settled effect: the value at the end. Of any other one the part
+            # that bias and matrix describe, moved to the time constant of the model.
             columns = gathered.layout(effect.sensor).rows[group.name]
-
-            # The constant part: the value at the end, or the part that bias and matrix describe.
-            if at_end:
-                at_last = columns_at(model, effect, [end])[group.name][0]
-                of_group = constant_part(effect, at_last)
+            if settled:
+                columns_at_end = columns_at(model, effect, [end])[group.name][0]
+                centre_of_group = constant_part(effect, columns_at_end)
             else:
                 change = values[model.slices[effect.key]] - gathered.point_of(effect)
-                of_group = _moved(effect, _projection(effect, columns, samples), change)
-            centre[group.name] = of_group
+                centre_of_group = _moved(effect, _projection(effect, columns, samples), change)
+            centre[group.name] = centre_of_group
 
-            # The output of the effect without that of the constant part. The coefficients of the
-            # effect are those at the time constant of the gathered columns.
+            # The output of the effect in the gathered columns, without that of the constant part.
             rows = model.layout(effect.sensor).rows[group.name]
+            value = coefficients(model_of_columns, effect.sensor, values)[rows]
             applied = coefficients(model, effect.sensor, values)[rows]
-            value = coefficients(at_columns, effect.sensor, values)[rows]
-            squares += samples.squares_without(columns, value, of_group, applied)
-        sizes.append(uncorrected_size(effect, np.sqrt(squares / samples.counts.sum()), at_end))
+            squares += samples.squares_without(columns, value, centre_of_group, applied)
+        sizes.append(uncorrected_size(effect, np.sqrt(squares / samples.counts.sum()), settled))
     return Uncorrected(centre, tuple(sizes))
 
 

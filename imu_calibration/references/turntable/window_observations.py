@@ -215,6 +215,8 @@ class WindowObservations:
 
         Before: nominal parameters. After: estimated without the fold of the window.
         """
+        # Parameters without each fold of windows. Where no windows are held out, all of them are
+        # one block with the parameters of the solution.
         solution = result.solution
         model = solution.model
         held_out = self.gathered.held_out
@@ -225,15 +227,16 @@ class WindowObservations:
         if len(held_out.blocks) > 1:
             folds = held_out.values_without(solution)
 
-        # The rows of all blocks, and the fold of each row.
+        # The windows of all blocks, and the fold of each window.
         rows = []
         fold = []
         for number, block in enumerate(held_out.blocks):
             for row in block.accumulator.rows:
                 rows.append(row)
                 fold.append(number % len(folds))
-        count = np.array([row.count for row in rows], float)
 
+        # Errors of each sensor.
+        count = np.array([row.count for row in rows], float)
         errors = WindowErrors(
             time=np.array([row.time for row in rows]),
             kind=np.array([row.kind for row in rows]),
@@ -247,14 +250,16 @@ class WindowObservations:
             means = np.array([row.sensors[sensor].mean for row in rows])
             columns_of_means = means[:, :-3]
             output = means[:, -3:]
+            errors.measured[sensor] = output
+            errors.true[sensor] = means[:, model.columns_of(sensor, Role.LINEAR)]
             nominal = coefficients(model, sensor, nominal_values(model))
-            # Of each row, shape (n, n_columns, 3).
+            errors.before[sensor] = output - columns_of_means @ nominal
+
+            # Corrected: matrix^-1 (output - columns @ coefficients), with the coefficients of the
+            # fold of each window, shape (n, n_columns, 3).
             after = np.array([coefficients(model, sensor, values) for values in folds])[fold]
             residual = output - np.einsum('ni,nij->nj', columns_of_means, after)
             matrix = result.calibration.of(sensor, Role.LINEAR)
-            errors.measured[sensor] = output
-            errors.true[sensor] = means[:, model.columns_of(sensor, Role.LINEAR)]
-            errors.before[sensor] = output - columns_of_means @ nominal
             errors.after[sensor] = residual @ np.linalg.inv(matrix).T
             errors.floor[sensor] = np.sqrt(
                 noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance

@@ -313,7 +313,7 @@ def _piece_length(window: Window) -> int:
     span = window.time[-1] - window.time[0]
     if span <= 0:
         return 1
-    return max(int(round(SLOW_TIME * (len(window.time) - 1) / span)), 1)
+    return max(round(SLOW_TIME * (len(window.time) - 1) / span), 1)
 
 
 def slow_part(rows: np.ndarray, length: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Measurement on a table against the simulation of two models, for plots."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -74,11 +74,12 @@ def residual_traces(
     """
     # A single model is predicted once: the items 0 and -1 are then the same.
     models = [before] if after is before else [before, after]
-    sensors = tuple(before.noise)
+    recording = _Recording(windows, table, models)
+
+    # Residuals of the used windows: their sums of squares, and their means over blocks.
     sums = DistanceSums()
-    spans: list[tuple[float, float]] = []  # first and last time of every window
     blocks_of_groups: list[ResidualBlocks] = []
-    for group in chunks(_used(windows, spans)):
+    for group in chunks(recording.used_windows()):
         residuals_of_models = [
             residuals(group, table, model.model, values=model.values) for model in models
         ]
@@ -90,9 +91,10 @@ def residual_traces(
             after_rows = {sensor: values[rows] for sensor, values in residual_after.items()}
             sums.add(window, [before_rows, after_rows], before.noise)
         blocks_of_groups.append(_blocks_of(group, table, before, residual_before, residual_after))
-
     blocks = _joined(blocks_of_groups)
-    recording = _Recording(windows, spans, table, models)
+
+    # Readings where the residual of each axis is largest, and dead reckoning with both sensors.
+    sensors = tuple(before.noise)
     segments = {}
     for sensor in sensors:
         segments[sensor] = []
@@ -167,21 +169,6 @@ def _joined(parts: Sequence[ResidualBlocks]) -> ResidualBlocks:
     )
 
 
-def _used(
-    windows: Sequence[Window] | StoredWindows, spans: list[tuple[float, float]]
-) -> Iterator[Window]:
-    """
-    Yield the windows that are not unused.
-
-    The (first, last) time of every window, s, is appended to `spans`.
-    """
-    for number in range(len(windows)):
-        window = windows[number]
-        spans.append((window.time[0], window.time[-1]))
-        if window.kind != 'unused':
-            yield window
-
-
 def _segment_of_largest(time: np.ndarray, residual: np.ndarray) -> tuple[float, float]:
     """
     Return start and end of the segment with the largest sum of squared residuals, s.
@@ -189,24 +176,34 @@ def _segment_of_largest(time: np.ndarray, residual: np.ndarray) -> tuple[float, 
     Among the segments of `SEGMENT` seconds that begin at a block; `time`, `residual`: of the
     blocks, shape (n,).
     """
+    # Sum of the blocks first to stop - 1: sums[stop] - sums[first].
     sums = np.concatenate([[0.0], np.cumsum(residual**2)])
     stop = np.searchsorted(time, time + SEGMENT)
     first = int(np.argmax(sums[stop] - sums[:-1]))
     return time[first] - PLOT_BLOCK_SECONDS, time[first] + SEGMENT
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Recording:
     """The windows of a recording and the models that predict them."""
 
     windows: Sequence[Window] | StoredWindows
     """In the order of time, with unused ones."""
-    spans: Sequence[tuple[float, float]]
-    """First and last time of each window, s."""
     table: Table
     """The reference."""
     models: Sequence[Solution | Calibration]
     """The model before, and the model after if it is another one."""
+    spans: list[tuple[float, float]] = field(default_factory=list)
+    """First and last time of each window, s; complete after `used_windows`."""
+
+    def used_windows(self) -> Iterator[Window]:
+        """Yield the windows that are not unused, and note the times of all of them."""
+        self.spans = []
+        for number in range(len(self.windows)):
+            window = self.windows[number]
+            self.spans.append((window.time[0], window.time[-1]))
+            if window.kind != 'unused':
+                yield window
 
     def overlay(self, sensor: str, axis: int, start: float, stop: float) -> OverlaySegment:
         """Return measured and predicted readings from `start` to `stop`, s, for one axis."""
@@ -262,9 +259,10 @@ def _dead_reckoning(recording: _Recording) -> dict[str, float] | None:
 
     A stretch is a sequence of windows without a gap.
     """
+    # Stretches, as the numbers of their windows: each ends when it is long enough, or at a gap.
     spans = recording.spans
     stretches = []
-    stretch: list[int] = []  # numbers of its windows
+    stretch: list[int] = []
     for number, (first, last) in enumerate(spans):
         if stretch:
             end_before = spans[stretch[-1]][1]
