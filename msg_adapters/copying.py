@@ -204,8 +204,8 @@ class _Patch:
 
         A zero stamp counts as the time of arrival. `received_ns`: shape (n,).
         """
-        # 1. Samples of the wanted messages, in the order of `packed`. `message_of_sample` has the
-        #    index into `packed` of each, as the indices of the groups; it is ascending.
+        # 1. Samples of the wanted messages, in the order of `packed`. `message_of_sample` and the
+        #    index of each group are places in `packed`, and ascending.
         nothing = np.zeros(0, dtype=int), packed.select(np.zeros(0, dtype=int))
         groups = self._wanted_groups(packed)
         if not groups:
@@ -230,6 +230,7 @@ class _Patch:
         corrected = self.correct(samples)
         tables = []
         for layout, index, group in groups:
+            # The samples of the messages of this group.
             sample = np.searchsorted(message_of_sample, index)
             readings = {'force': corrected.force[sample], 'rate': corrected.rate[sample]}
             fields = self._fields(layout, group, readings, corrected.marks[sample])

@@ -113,10 +113,11 @@ def patch_imu_group(
         ).view(np.uint8)
     if frame_id is None or frame_id == layout.names[0]:
         return table
+    # The stamp, the new frame_id with its padding, and the doubles.
     head = np.frombuffer(frame_head(frame_id, layout.order), np.uint8)
-    rows = np.broadcast_to(head, (len(table), len(head)))
+    heads = np.broadcast_to(head, (len(table), len(head)))
     return np.concatenate(
-        [table[:, :FRAME_OFFSET], rows, table[:, layout.offsets['orientation'][0] :]], axis=1
+        [table[:, :FRAME_OFFSET], heads, table[:, layout.offsets['orientation'][0] :]], axis=1
     )
 
 

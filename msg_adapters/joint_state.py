@@ -46,6 +46,7 @@ def find_joint_layout(data: bytes) -> MessageLayout:
     header = open_header(data)
     cursor = _Cursor(bytes(data), header)
     try:
+        # The number of names may be any one: at most as many as are accepted are read.
         n_names = cursor.count()
         names = tuple(cursor.string() for _ in range(min(n_names, MAX_MESSAGE_JOINTS)))
         if n_names > MAX_MESSAGE_JOINTS or cursor.position > MAX_NAME_BYTES:
@@ -141,7 +142,7 @@ class CdrWriter:
 
     def integer(self, value: int, signed: bool = False) -> None:
         """Append an integer of four bytes."""
-        self._align(4)
+        self.align(4)
         self.data += value.to_bytes(4, 'little', signed=signed)
 
     def string(self, text: str) -> None:
@@ -154,10 +155,10 @@ class CdrWriter:
         """Append a sequence of doubles, shape (n,)."""
         self.integer(len(values))
         if len(values):
-            self._align(8)
+            self.align(8)
             self.data += np.asarray(values, '<f8').tobytes()
 
-    def _align(self, size: int) -> None:
+    def align(self, size: int) -> None:
         """Append zeros up to a multiple of `size`, counted without the four bytes in front."""
         self.data += bytes(-(len(self.data) - 4) % size)
 

@@ -1,6 +1,5 @@
 """Messages from samples, and bags of a session."""
 
-import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -15,8 +14,13 @@ from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import DEFAULT_TOPICS, standard_definition
 from msg_adapters.imu import FIELDS, IMU_TYPE, N_DOUBLES, TEMPERATURE_TYPE
-from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, encode_trajectory
-from msg_adapters.layout import NS_PER_S, Packed, frame_head
+from msg_adapters.joint_state import (
+    JOINT_STATE_TYPE,
+    JOINT_TRAJECTORY_TYPE,
+    CdrWriter,
+    encode_trajectory,
+)
+from msg_adapters.layout import ENCAPSULATION_SIZE, FRAME_OFFSET, NS_PER_S, Packed, frame_head
 
 NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0)
 UNKNOWN_COVARIANCE = (0.0,) * 9
@@ -65,19 +69,25 @@ def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarra
 
     With an empty sequence of velocities when these are left out.
     """
-    count = struct.pack('<I', len(joints.names))
+    n_joints = len(joints.names)
+    # The same in all messages: frame_id, names and number of positions, up to the first double.
+    message = CdrWriter()
+    message.data += bytes(FRAME_OFFSET - ENCAPSULATION_SIZE)  # a stamp, which `_table` has
+    message.string('')
+    message.integer(n_joints)
+    for name in joints.names:
+        message.string(name)
+    message.integer(n_joints)
+    if n_joints:
+        message.align(8)
+    # The count of the velocities needs four more bytes, because doubles are aligned to eight.
     no_items = bytes(4)  # count of an empty sequence
-    # The frame_id, which is empty, and the names; the length of a string is aligned to 4 bytes.
-    # Joined once: a sum that grows by each of many names needs quadratic time.
-    names = [_padded(_string(name), 4) for name in joints.names]
-    head = b''.join([_padded(_string(''), 4), count, *names])
-    # Doubles are aligned to 8 bytes: after the first ones the 4 bytes of a count need 4 more.
     velocity = [no_items]
-    if with_velocity and joints.names:
-        velocity = [count + bytes(4), joints.velocity]
+    if with_velocity and n_joints:
+        velocity = [n_joints.to_bytes(8, 'little'), joints.velocity]
     return _table(
         joints.stamp_ns,
-        _padded(head + count, 8 if joints.names else 4),
+        bytes(message.data[FRAME_OFFSET:]),
         [joints.position, *velocity, no_items],
     )
 
@@ -87,17 +97,6 @@ def encode_temperature(temperature: TemperatureSamples) -> np.ndarray:
     doubles = np.zeros((len(temperature), 2), dtype='<f8')
     doubles[:, 0] = temperature.temperature_c
     return _table(temperature.stamp_ns, frame_head(''), [doubles])
-
-
-def _string(text: str) -> bytes:
-    """Return a string in CDR: its length with the closing zero, then its bytes."""
-    data = text.encode() + b'\0'
-    return struct.pack('<I', len(data)) + data
-
-
-def _padded(data: bytes, size: int) -> bytes:
-    """Pad bytes that follow the 8 bytes of a stamp, so that their end is aligned."""
-    return data + bytes(-len(data) % size)
 
 
 def _table(stamp_ns: np.ndarray, head: bytes, pieces: Sequence[bytes | np.ndarray]) -> np.ndarray:

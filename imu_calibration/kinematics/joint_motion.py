@@ -188,6 +188,8 @@ def _interpolated(
         True where the instant is before its stamp.
 
     """
+    # Index of the stamp after each instant, clipped at both ends of the recording. Instants that
+    # are not between it and the stamp before, or in a gap, are outside.
     after = np.clip(np.searchsorted(time, target, side='right'), 1, len(time) - 1)
     is_between = (target >= time[after - 1]) & (target <= time[after])
     inside = (step[after - 1] <= LINKED) & is_between

@@ -323,6 +323,7 @@ class PenalisedSpline:
         """
         number = np.arange(self.n_coefficients - 3)
         distance = np.minimum(number, number[::-1]) - 2  # from the closer end, in knots
+        # The weight is 1 from about a period of the bandwidth on, 2 pi / bandwidth knots.
         return np.clip(distance * self.bandwidth(penalty) / 6, 0.1, 1.0) ** 3
 
     def gains(self, penalty: float) -> tuple[float, float]:

@@ -274,6 +274,7 @@ def _read(text: str | bytes) -> Any:
             raise ValueError(
                 f'it has {len(text)} characters, at most {MAX_DOCUMENT_CHARACTERS} are accepted'
             )
+        # Names are printed: without control characters.
         root = ElementTree.fromstring(text)
         for element in root.iter():
             element.attrib.update((key, printable(value)) for key, value in element.items())

@@ -126,6 +126,7 @@ def without_readings(evidence: RecordingEvidence) -> np.ndarray:
     the cleaned samples; one chunk on both sides is included, because its readings may be mixed.
     """
     chunks = evidence.chunks
+    # An axis that never changes is no reason: that is a finding of the complete recording.
     is_unusable = np.logical_or(*evidence.frozen.values())
     is_unusable |= evidence.stuck[:, evidence.n_changed > 0].any(axis=1)
     for part in evidence.frozen_parts:

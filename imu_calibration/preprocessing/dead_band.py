@@ -49,7 +49,8 @@ class DeadBandSearch:
         """
         thresholds = np.zeros(3)
         for axis, counts in enumerate(self._counts):
-            # The first bin below which there are more readings than transients is not in the band.
+            # n_below[k] is the number of readings below bin k. The band ends at the last bin below
+            # which there are no more readings than transients cause.
             n_below = np.append(0, np.cumsum(counts))
             first = int(np.searchsorted(n_below, MOST_STRAYS, side='right')) - 1
             threshold = SMALLEST * 2.0 ** (first / BINS_PER_OCTAVE)

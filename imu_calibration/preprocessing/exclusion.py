@@ -44,7 +44,7 @@ def parse_exclusions(text: str) -> tuple[Exclusion, ...]:
         start, _, stop = span.partition(':')
         try:
             exclusion = Exclusion(float(start), float(stop), name)
-        except ValueError:
+        except ValueError:  # no numbers: refused below
             exclusion = Exclusion(np.nan, np.nan)
         if not 0.0 <= exclusion.start < exclusion.stop:
             raise InputError(

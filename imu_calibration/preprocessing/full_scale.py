@@ -282,6 +282,7 @@ def relate_turns(chunks: Chunks) -> Turning | None:
         return None
     used = rms > 1e-3 * rms.max()
     while used.any():
+        # Rates along the used directions in units of their rms; a column of the fit belongs to one.
         seen = directions[:, used]
         scale = rms[used]
         fit = _fit(pairs, rate @ seen / scale)

@@ -98,6 +98,7 @@ def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
         Projector on the directions in which the reference moved.
 
     """
+    # Correlation of each candidate, (48, 3, 3), with the matrix: 1 if it is equal up to the scale.
     projected = matrix @ seen
     scale = np.sqrt((projected**2).sum() / np.trace(seen))
     candidates = signed_permutations()
@@ -623,6 +624,8 @@ def _correlations(first: np.ndarray, second: np.ndarray, max_lag: int) -> np.nda
     """
     from scipy.interpolate import CubicSpline  # here, because its import is slow
 
+    # By the FFT, with zeros behind the values, so that the shifted ends do not meet. A negative lag
+    # is a negative index of `sums`.
     size = 1 << int(np.ceil(np.log2(2 * len(first))))
     spectrum = np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))
     sums = np.fft.irfft(spectrum.sum(axis=1), size)

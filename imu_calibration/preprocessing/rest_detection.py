@@ -242,6 +242,7 @@ def least_variance(values: np.ndarray) -> float:
 
     It is that of an sd of half a converter step, plus that of an sd of 1e-5 of the readings.
     """
+    # The first samples show the step of the converter as well as all of them.
     first = np.ascontiguousarray(values[:4000].T)
     change = np.abs(np.diff(first, axis=1))
     step = np.where(change > 0, change, np.inf).min(axis=1, initial=np.inf)

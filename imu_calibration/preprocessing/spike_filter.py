@@ -152,8 +152,8 @@ class SpikeFilter:
         is_knock &= inner == row
 
         # 4. During vibration, as at the first touch of a hand, the previous noise does not apply:
-        #    it is the median of the second differences around, of which a spike affects three, two
-        #    spikes six. `window` has the rows around each candidate, shape (m, 17).
+        #    it is the median of 15 second differences around, of which a spike affects three, two
+        #    spikes six. `window` has the 17 rows around each of the m candidates, shape (m, 17).
         first = np.clip(row - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
         window = first[:, None] + np.arange(2 * SPIKE_REACH + 1)
         median_around = np.median(second[window[:, 1:-1], column[:, None]], axis=1)

@@ -614,9 +614,7 @@ class SampleTimes:
             n_missing = CLOCK_BLOCK - self._n_since_block
             part = samples.select(slice(0, n_missing))
             samples = samples.select(slice(n_missing, None))
-            self._n_since_block = (self._n_since_block + len(part)) % CLOCK_BLOCK
-            stamps_ns = np.concatenate([self._stamps_ns, part.stamp_ns])
-            self._stamps_ns = stamps_ns[-STAMP_HISTORY:]
+            self._add_to_history(part.stamp_ns)
             ready += self._add_part(part)
         return _joined(ready)
 
@@ -624,10 +622,7 @@ class SampleTimes:
         """Return the buffered samples, and reset."""
         if self._is_unclassified and self._buffered is not None:
             self._set_line(describe_stamps(self._buffered.stamp_ns))
-        if self._counted_clock is not None:
-            ready = self._timed_by_clock(final=True)
-        else:
-            ready = [self._ordered(self._buffered)]
+        ready = self._take_buffered(final=True)
         self._begin()
         return _joined(ready)
 
@@ -649,11 +644,15 @@ class SampleTimes:
             return False
         if not self._times_in_order.passes(samples.stamp_ns):
             return False
-        self._n_since_block = (self._n_since_block + len(samples)) % CLOCK_BLOCK
-        stamps_ns = np.concatenate([self._stamps_ns, samples.stamp_ns[-STAMP_HISTORY:]])
-        self._stamps_ns = stamps_ns[-STAMP_HISTORY:]
+        self._add_to_history(samples.stamp_ns)
         self._last_sample = samples.select(slice(len(samples) - 1, None))
         return True
+
+    def _add_to_history(self, stamp_ns: np.ndarray) -> None:
+        """Keep the newest stamps, and count them for the next complete block."""
+        self._n_since_block = (self._n_since_block + len(stamp_ns)) % CLOCK_BLOCK
+        stamps_ns = np.concatenate([self._stamps_ns, stamp_ns[-STAMP_HISTORY:]])
+        self._stamps_ns = stamps_ns[-STAMP_HISTORY:]
 
     def _without_repeated(self, samples: ImuSamples) -> ImuSamples:
         """Return samples without those that repeat the stamp and the readings of the one before."""
@@ -707,8 +706,12 @@ class SampleTimes:
             return []
         self._is_unclassified = False
         self._set_line(line)
+        return self._take_buffered()
+
+    def _take_buffered(self, final: bool = False) -> list:
+        """Return the buffered samples with their stamps, or the times that are determined now."""
         if self._counted_clock is not None:
-            return self._timed_by_clock()
+            return self._timed_by_clock(final)
         buffered = self._buffered
         self._buffered = None
         return [self._ordered(buffered)]

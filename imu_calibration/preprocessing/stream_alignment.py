@@ -409,6 +409,7 @@ class MotionChunks:
         level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
         step = np.zeros(level.shape)
         assert self._start_ns is not None
+        # Joints at rest are known for a while before their first reading and after the last one.
         for k, run in enumerate(runs):
             is_first = (
                 self._first_joint_ns is not None

@@ -119,21 +119,19 @@ def force_error(
         Samples per second, for the search of increments; 0: not known.
 
     """
+    # 1. A unit in which the readings have the length of gravity; '' for none, and for m/s^2.
+    raw_length = length if stated.is_si else length * float(np.mean(stated.scale))
+    unit = unit_of_rest(raw_length)
     requirement = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
     remedy = 'convert it in the driver'
-    raw_length = length
     if not stated.is_si:
-        # The length of the readings, for the search of their unit.
-        raw_length = length * float(np.mean(stated.scale))
+        if _is_force(raw_length):
+            unit = unit or 'm/s^2'
         requirement = (
             f'specific force must be in the stated unit {stated.unit}, the length of the readings'
             f' {where} is {raw_length:.4g}: '
         )
         remedy = 'give the recording that the unit belongs to'
-    # 1. A unit in which the readings have the length of gravity; '' for none, and for m/s^2.
-    unit = unit_of_rest(raw_length)
-    if not stated.is_si and _is_force(raw_length):
-        unit = unit or 'm/s^2'
     is_wrong = not _is_force(length)
     # Only readings in SI must not look like another unit: a stated one explains their length.
     if unit and (is_wrong or stated.is_si):

@@ -153,17 +153,17 @@ def make_window(
     if kind == WindowKind.STATIC:
         motion = _mean_motion(motion)
     return Window(
-        kind,
-        samples.stamp_ns,
-        samples.time,
-        samples.force_s,
-        samples.rate_s,
-        motion,
-        temperature,
-        reason,
-        samples.joint_step.max(axis=0),
-        samples.corrected,
-        samples.absent,
+        kind=kind,
+        stamp_ns=samples.stamp_ns,
+        time=samples.time,
+        force_s=samples.force_s,
+        rate_s=samples.rate_s,
+        motion=motion,
+        temperature_c=temperature,
+        reason=reason,
+        joint_step=samples.joint_step.max(axis=0),
+        corrected=samples.corrected,
+        absent=samples.absent,
     )
 
 

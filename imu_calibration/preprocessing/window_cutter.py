@@ -512,10 +512,8 @@ class WindowCutter:
 
         phase = samples.phase.copy()
         for k, (start, stop) in enumerate(zip(starts, stops, strict=True)):
-            if run_phase[k] == MOVING:
-                continue
-            # The samples before belong to the same run, which was long enough.
-            if phase_before[k] == run_phase[k]:
+            # Motion, or the continuation of a run that was long enough.
+            if run_phase[k] in (MOVING, phase_before[k]):
                 continue
             # A steady turn settles after another phase, before its shortest window begins.
             needed = self._short_rest
