@@ -1563,20 +1563,18 @@ def _only_set(path: Path, quantity: str, sets: AxisSets) -> list[Columns]:
     complete = {key: axes for key, axes in sets.items() if len(axes) == 3}
     if len(complete) > 1 and quantity == 'force':
         complete = _with_gravity(complete)
-    ordered = []
-    for axes in complete.values():
-        ordered.append([axes['x'], axes['y'], axes['z']])
-    names = [tuple(column.names[0] for column in columns) for columns in ordered]
-    if len(ordered) > 1:
+    names = [tuple(axes[axis].names[0] for axis in 'xyz') for axes in complete.values()]
+    if len(names) > 1:
         raise InputError(
-            f'{path} must have one column of {quantity} per axis, got {len(ordered)}'
+            f'{path} must have one column of {quantity} per axis, got {len(names)}'
             f' sets, as of several IMUs: {"; ".join(map(", ".join, names))}; {REMEDY}',
             key='columns',
             code='several_sets',
         )
-    if not ordered:
+    if not names:
         return []
-    units = {column.unit for column in ordered[0]}
+    (axes,) = complete.values()
+    units = {column.unit for column in axes.values()}
     return [Columns(quantity, names[0], units.pop() if len(units) == 1 else None)]
 
 

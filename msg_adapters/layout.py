@@ -157,7 +157,7 @@ class MessageLayout:
 
     def stamp_ns(self, packed: Packed) -> np.ndarray:
         """Return the header stamps of messages that have this layout, int64, shape (n,)."""
-        # Seconds and nanoseconds alternate, four bytes each; the first are signed.
+        # Seconds and nanoseconds alternate, four bytes each; seconds are signed.
         pairs = np.ascontiguousarray(packed.items_at(ENCAPSULATION_SIZE, 'V8'))
         sec = pairs.view(self.order + 'i4')[::2]
         nanosec = pairs.view(self.order + 'u4')[1::2]

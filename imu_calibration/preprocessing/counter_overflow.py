@@ -171,7 +171,7 @@ def _without_overflows_in_gaps(stamps: CounterStamps) -> CounterStamps:
     stamp_ns = stamps.stamp_ns
     steps = np.diff(stamp_ns)
     period = np.median(steps[steps > 0])
-    # The stamps after k steps back, and the one after that is still before k.
+    # Stamp k + 1 is a step back from stamp k, and stamp k + 2 is still before stamp k.
     back = np.flatnonzero(steps[:-1] < -LOST_PERIODS * period)
     continues = back[stamp_ns[back + 2] < stamp_ns[back]]
     return stamps.without(continues, np.full(len(continues), stamps.size_ns))

@@ -363,9 +363,9 @@ def _fit(pairs: _ChunkPairs, rate: np.ndarray) -> _TurnFit:
     inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(3 * width))
     solution = inverse @ (design.T @ target)
     residual = float(((target - design @ solution) ** 2).sum())
-    # Columns of the matrix without the offset, which is the last input.
     n_spare = max(len(target) - 3 * width, 1)
     sd = CHUNK_SD_FACTOR * np.sqrt(np.diag(inverse) * residual / n_spare)
+    # Columns of the matrix, without the offset, which belongs to the last input.
     column_sd = np.linalg.norm(sd.reshape(3, width)[:, :-1], axis=0)
     matrix = solution.reshape(3, width)[:, :-1]
     determined = column_sd < DETERMINED_SD_SHARE * np.linalg.norm(matrix, axis=0)

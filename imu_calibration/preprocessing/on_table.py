@@ -532,8 +532,8 @@ def _estimate_delay(windows: Sequence[Window], table: Table) -> _DelayEstimate:
     is_peak = (inner >= shares[:-2]) & (inner >= shares[2:])
     peaks = 1 + np.flatnonzero(is_peak & (inner >= shares.max() - SHARE_TIE))
     best = int(peaks[np.argmin(np.abs(peaks - zero))] if len(peaks) else np.argmax(shares))
-    # A peak inside the range of a lag, not the slope of one beyond; a best delay that does not
-    # explain everything; and delays of the other sign, beyond the range, that are as good.
+    # Ambiguous: a peak inside the range of a lag, not the slope of one beyond; a best delay that
+    # does not explain everything; and a delay of the other sign, beyond the range, that is as good.
     has_inner_peak = 0 < peak_near_zero - zero + reach < 2 * reach
     is_incomplete = shares[best] < 1.0 - SHARE_TIE
     shares_of_other_sign = shares[: max(zero - reach, 0)]
