@@ -286,7 +286,7 @@ def fit_joint_curve(
     trend = Trend.through(time, position, still)
 
     # 3. A spline through the positions of each moving joint minus the trend, then with velocities.
-    #    Fewer stamps have the trend only.
+    #    Fewer than `_MINIMUM_SAMPLES` stamps have the trend only.
     coefficients = np.zeros((knots.n_coefficients, position.shape[1]))
     bandwidth = np.zeros(position.shape[1])
     noise = floor.copy()

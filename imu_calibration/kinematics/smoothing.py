@@ -191,8 +191,8 @@ def _horner(
         Zeros; receives the derivatives over the factorial of their order.
 
     """
-    # Each power is one step of Horner's rule, for the value and for each derivative, whose
-    # coefficients are the values of the order below. Before DEGREE - power steps it is zero.
+    # Each power is one step of Horner's rule for the value. The derivative of order k follows from
+    # the same rule with the results of order k - 1 as coefficients; it is zero before k steps.
     for power in range(DEGREE, -1, -1):
         for order in range(min(DEGREE - power, len(taylor) - 1), 0, -1):
             taylor[order] *= place
