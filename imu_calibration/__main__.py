@@ -33,13 +33,14 @@ class Interruption:
 
     def __call__(self, _number: int, frame: FrameType | None) -> None:
         """Raise now or later."""
-        importing = numerical = False
+        is_importing = is_numerical = False  # by the running function and all its callers
         while frame is not None:
-            importing |= frame.f_code.co_filename.startswith('<frozen importlib')
-            numerical |= frame.f_globals.get('__name__', '').partition('.')[0] in NUMERICAL
+            is_importing |= frame.f_code.co_filename.startswith('<frozen importlib')
+            is_numerical |= frame.f_globals.get('__name__', '').partition('.')[0] in NUMERICAL
             frame = frame.f_back
-        self._left -= numerical
-        if importing or (numerical and self._left >= 0):
+        if is_numerical:
+            self._left -= 1
+        if is_importing or (is_numerical and self._left >= 0):
             signal.setitimer(signal.ITIMER_REAL, RETRY_SECONDS)
         else:
             # A second one ends the process at once, without a traceback.

@@ -221,6 +221,7 @@ def readings_of(choices: Mapping[str, Any]) -> RawReadings | None:
     stated = _stated(choices)
     if nominal is None and not any(stated.values()):
         return None
+    # What is described, and then what is stated, but not both for one sensor.
     mapping: Mapping[str, Any] = {}
     if isinstance(nominal, RawReadings):
         mapping = nominal.to_mapping()
@@ -381,7 +382,8 @@ def _documented(option: Any) -> Any:
     """
     Return an option as it is written into a document.
 
-    Of a file, and of data in memory, it is the name and the hash.
+    Of a file it is the name and the hash, of a mapping or a table in memory the hash, of a sequence
+    its entries; of other data in memory only that they are.
     """
     if isinstance(option, (str, PathLike)):
         if Path(option).is_file():
@@ -437,6 +439,7 @@ def require_same_inputs(
     """
     path = Path(folder) / name
     if not path.exists():
+        # A report without a result is that of another verb: the new one must not replace it.
         files.require_new(Path(folder) / files.REPORT, force=not report)
         return
     new = provenance()

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -191,12 +190,14 @@ def compensate_recording(
     figures = noise_of(noise)
     if figures is not None:
         calibration = with_measured_noise(calibration, figures)
+    readings = readings_for(calibration, choices)
     correction = _Correction(
         calibration=calibration,
         used=used,
         transfer=requested_transfer(target_frame, target_xyz, target_rpy),
         shift_ns=late_ns(calibration, correct_stamps),
-        readings=readings_for(calibration, choices),
+        readings=readings,
+        topics=topics_of(choices, readings),
         mask=ExclusionMask(parse_exclusions(exclude) if exclude else ()),
     )
 
@@ -208,70 +209,21 @@ def compensate_recording(
             f'the output {output} must not exist yet; choose another name or remove it',
             code='exists_already',
         )
-    topics = topics_of(choices, correction.readings)
     if output is not None and is_text_log(output):
-        return _into_text_log(recording, output, correction, topics)
+        return _into_text_log(recording, output, correction)
     _refuse_corrected_log(recording)
 
-    # A bag with the sensors on two topics.
-    other = None
-    output_frame = target_frame
-    checks = RawChecks(correction.readings, calibration)
-    if gyroscope_topic is not None:
-        split = read_split(recording, topics)
-        joined = split.joined.imu
-        if output is None:
-            block = SampleBlock(joined, None, temperatures(recording, topics))
-            return _in_memory(block, correction)
-        # The messages of the slower sensor are corrected, in the frame of the accelerometer.
-        checks.require_scale(joined.select(slice(UNIT_READINGS)))
-        refuse_corrected(gyroscope_topic)
-        other = split.other
-        output_frame = target_frame or joined.frame_id
-        if split.topic == gyroscope_topic:
-            topics = topics._replace(imu=gyroscope_topic, frame=None)
-
     # A bag, block by block: into memory, or into another bag.
-    bag = open_bag(recording, topics, want_joints=False)
-    advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
-    with bag:
-        refuse_corrected(bag.imu_topic)
-        if other is None:
-            checks.require_scale(_first_readings(recording, topics))
-        run = _CorrectionRun(correction, checks, temperatures(recording, topics), advance)
-        if output is None:
-            return _samples_of_bag(bag, run)
-
-        from msg_adapters.copying import copy_with_corrected
-
-        # Messages are omitted in excluded times, and where the other sensor has no reading.
-        keep: Callable[[np.ndarray], np.ndarray] | None = None
-        if other is not None:
-            keep = partial(_kept_with, correction.mask, other)
-        elif exclude:
-            keep = correction.mask.kept
-        lost = copy_with_corrected(
-            recording,
-            output,
-            bag.imu_topic,
-            corrected_topic=corrected_topic,
-            correct=run.correct,
-            propagate=run.propagate,
-            frame_id=output_frame or None,
-            mat_ts=None if correction.transfer is None else correction.transfer.mat_ts,
-            late_ns=correction.shift_ns,
-            source_frame_id=topics.frame,
-            log=topics.log,
-            check=run.require_valid,
-            keep=keep,
-            other=other,
-        )
-        return run.outcome(None, lost)
-
-
-def _kept_with(mask: ExclusionMask, other: OtherSensor, stamp_ns: np.ndarray) -> np.ndarray:
-    """Return which messages have no excluded time, and a reading of the other sensor."""
-    return mask.kept(stamp_ns) & other.known(stamp_ns)
+    if output is None:
+        return _bag_in_memory(recording, correction)
+    return _into_bag(
+        recording,
+        output,
+        correction,
+        corrected_topic=corrected_topic,
+        target_frame=target_frame,
+        excludes=bool(exclude),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,6 +240,8 @@ class _Correction:
     """Subtracted from the stamps, ns."""
     readings: RawReadings
     """Units and axes of the readings."""
+    topics: Topics
+    """Topics of the recording."""
     mask: ExclusionMask
     """Times without corrected readings."""
 
@@ -354,6 +308,8 @@ class _CorrectionRun:
         stream = self.stream
         used = self.correction.used
         calibration = self.correction.calibration
+
+        # Lines on the calibration, then on the readings.
         lines = [*used.lines, *caveats(calibration)]
         refused = dict(used.refused)
         for sensor in calibration.absent:
@@ -383,19 +339,96 @@ class _CorrectionRun:
         )
 
 
-def _samples_of_bag(bag: Recording, run: _CorrectionRun) -> Compensated:
-    """Correct the samples of a bag in memory."""
-    parts = []
-    for block in bag.blocks():
-        if block.imu is not None:
-            imu = block.imu.select(run.correction.mask.kept(block.imu.stamp_ns))
-            parts.append(run.correction.samples(imu, run.correct(imu)))
-    run.require_valid()
-    return run.outcome(ImuSamples.concatenate(parts) if parts else None, bag.lost)
+def _bag_in_memory(recording: str | PathLike, correction: _Correction) -> Compensated:
+    """Correct the samples of a bag in memory; sensors on two topics as one stream."""
+    topics = correction.topics
+    if topics.gyroscope is not None:
+        joined = read_split(recording, topics).joined.imu
+        block = SampleBlock(joined, None, temperatures(recording, topics))
+        return _in_memory(block, correction)
+    checks = RawChecks(correction.readings, correction.calibration)
+    with open_bag(recording, topics, want_joints=False) as bag:
+        run = _run_over(bag, recording, correction, checks)
+        parts = []
+        for block in bag.blocks():
+            if block.imu is not None:
+                imu = block.imu.select(correction.mask.kept(block.imu.stamp_ns))
+                parts.append(correction.samples(imu, run.correct(imu)))
+        run.require_valid()
+        return run.outcome(ImuSamples.concatenate(parts) if parts else None, bag.lost)
+
+
+def _into_bag(
+    recording: str | PathLike,
+    output: str | PathLike,
+    correction: _Correction,
+    *,
+    corrected_topic: str,
+    target_frame: str,
+    excludes: bool,
+) -> Compensated:
+    """
+    Correct a bag into another one that has all its topics too.
+
+    Of sensors on two topics the messages of the slower one are corrected, in the frame of the
+    accelerometer. `excludes`: whether there are excluded times.
+    """
+    from msg_adapters.copying import copy_with_corrected
+
+    checks = RawChecks(correction.readings, correction.calibration)
+    topics = correction.topics
+    output_frame = target_frame
+    other: OtherSensor | None = None
+    if topics.gyroscope is not None:
+        split = read_split(recording, topics)
+        joined = split.joined.imu
+        checks.require_scale(joined.select(slice(UNIT_READINGS)))
+        refuse_corrected(topics.gyroscope)
+        other = split.other
+        output_frame = target_frame or joined.frame_id
+        if split.topic == topics.gyroscope:
+            topics = topics._replace(imu=topics.gyroscope, frame=None)
+
+    def keep(stamp_ns: np.ndarray) -> np.ndarray:
+        """Return which messages have no excluded time, and a reading of the other sensor."""
+        kept = correction.mask.kept(stamp_ns)
+        return kept if other is None else kept & other.known(stamp_ns)
+
+    with open_bag(recording, topics, want_joints=False) as bag:
+        run = _run_over(bag, recording, replace(correction, topics=topics), checks)
+        lost = copy_with_corrected(
+            recording,
+            output,
+            bag.imu_topic,
+            corrected_topic=corrected_topic,
+            correct=run.correct,
+            propagate=run.propagate,
+            frame_id=output_frame or None,
+            mat_ts=None if correction.transfer is None else correction.transfer.mat_ts,
+            late_ns=correction.shift_ns,
+            source_frame_id=topics.frame,
+            log=topics.log,
+            check=run.require_valid,
+            keep=keep if excludes or other is not None else None,
+            other=other,
+        )
+        return run.outcome(None, lost)
+
+
+def _run_over(
+    bag: Recording, recording: str | PathLike, correction: _Correction, checks: 'RawChecks'
+) -> _CorrectionRun:
+    """Return the correction of an open bag, which must hold raw readings in their units."""
+    topics = correction.topics
+    advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
+    refuse_corrected(bag.imu_topic)
+    if topics.gyroscope is None:  # otherwise the joined sensors are checked
+        checks.require_scale(_first_readings(recording, topics))
+    return _CorrectionRun(correction, checks, temperatures(recording, topics), advance)
 
 
 def _into_text_log(
-    recording: str | PathLike, output: str | PathLike, correction: _Correction, topics: Topics
+    recording: str | PathLike, output: str | PathLike, correction: _Correction
 ) -> Compensated:
     """Correct a text log into another one with the same columns."""
     from msg_adapters.csv_copy import write_corrected_log
@@ -413,7 +446,7 @@ def _into_text_log(
             code='output_kind',
         )
     _refuse_corrected_log(recording)
-    log = read_directly(existing(recording), topics.log)
+    log = read_directly(existing(recording), correction.topics.log)
     result = _in_memory(SampleBlock(log.imu, None, log.temperature), correction)
     assert result.imu is not None  # a correction in memory returns its samples
     with files.output_folder(str(Path(output).parent)):
@@ -522,8 +555,10 @@ class RawChecks:
         matrix = self._calibration.of('gyroscope', Role.LINEAR)
         if evidence.turning is None or matrix is None or 'gyroscope' in self._calibration.absent:
             return
-        # Corrected rate over the true one: the factor is that of true over raw rates.
-        ratio = 1.0 / (evidence.turning.factor * float(np.mean(np.diag(matrix))))
+        # With the raw rate w the corrected one is w / gain, and the true one by the turns of
+        # gravity is factor w: their ratio.
+        gain = float(np.mean(np.diag(matrix)))
+        ratio = 1.0 / (evidence.turning.factor * gain)
         text = corrected_rates_text(ratio)
         if scale_range(ratio) is IMPOSSIBLE:
             raise InputError(text, key='gyroscope_unit', code='corrected_scale')
@@ -547,6 +582,7 @@ def _in_memory(recording: ImuSamples | SampleBlock, correction: _Correction) -> 
     checks = RawChecks(correction.readings, correction.calibration)
     checks.require_scale(imu)
     run = _CorrectionRun(correction, checks, block.temperature)
+    # All readings are checked before one is corrected.
     run.check(imu)
     checks.require()
     corrected = correction.samples(imu, run.stream.correct(correction.readings.apply(imu)))

@@ -80,8 +80,9 @@ def export_calibration(
     figures = None if noise is None else files.read_noise(noise)
     motion = None
     if bag is not None:
-        raw = log_options(calibration.readings, {}).raw
-        topics = topics._replace(log=replace(topics.log, raw=raw))
+        # Of a text log: quantities whose units the calibration describes are not converted twice.
+        raw_quantities = log_options(calibration.readings, {}).raw
+        topics = topics._replace(log=replace(topics.log, raw=raw_quantities))
         motion = _motion(calibration, bag, stand, topics=topics, exclude=exclude)
     exported = export(calibration, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
     if output is not None:

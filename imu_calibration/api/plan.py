@@ -126,6 +126,7 @@ class Planned:
         require_no_plan(folder, report=report, force=force)
         place = files.make_folder(folder)
         moves_joints = bool(self.plan.moved_joints)
+        # Made before anything is replaced: an error leaves the earlier plan as it is.
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
 
@@ -234,7 +235,8 @@ def plan(
     if around or reach is not None:
         limits, start = _neighbourhood(limits, table.joint_names, around or {}, reach)
 
-    # Prior data, and the effects to separate: requested, or collinear ones of a diagnosis.
+    # Prior data, and the effects to separate: requested ones, or collinear ones of a diagnosis with
+    # their sizes.
     prior = _prior_calibration(calibration, table, options)
     effects = tuple(separate)
     sizes = {}
@@ -299,7 +301,7 @@ def notes_on(table: Table) -> list[str]:
         share = gravity_sd / table.gravity_value
         lines.append(
             f'warning: the scales of the accelerometer are known to {100 * share:.2g} %, as'
-            f' gravity is; {REMEDIES[GRAVITY,]}'
+            f' gravity is; {REMEDIES[(GRAVITY,)]}'
         )
     return lines
 
@@ -383,12 +385,13 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
 
     """
     for finding in document.get('findings') or ():
-        if finding.get('indistinguishable_from'):
+        mates = finding.get('indistinguishable_from')
+        if mates:
             sizes = {}
             for sizes_of_mate in finding.get('sizes_of_mates', {}).values():
-                for name, size in sizes_of_mate.items():
-                    sizes[name] = float(size['value'])
-            return (finding['effect'], *finding['indistinguishable_from']), sizes
+                for parameter, size in sizes_of_mate.items():
+                    sizes[parameter] = float(size['value'])
+            return (finding['effect'], *mates), sizes
     raise InputError(
         'the diagnosis must have a finding with collinear effects, it has none; no effects need to'
         ' be separated',

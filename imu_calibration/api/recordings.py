@@ -132,11 +132,13 @@ class RecordingFile:
         )
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Yield the blocks and report the progress."""
+        """
+        Yield the blocks and report the progress; of sensors on two topics all samples as one block.
+        """
         gyroscope = self.topics.gyroscope
         if gyroscope is not None:
-            first_topic = replace(self, topics=self.topics._replace(gyroscope=None), quiet=True)
-            yield _with_gyroscope(list(first_topic), self.path, gyroscope)
+            without_rates = replace(self, topics=self.topics._replace(gyroscope=None), quiet=True)
+            yield _with_gyroscope(list(without_rates), self.path, gyroscope)
             return
         recording = self.open()
         n_messages = 0 if self.quiet else recording.message_counts.get(recording.imu_topic, 0)

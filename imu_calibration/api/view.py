@@ -330,6 +330,7 @@ def overlay_topics(
     """
     end = float(traces.time[-1])
     for sensor in SENSORS:
+        # 1. Signals on a segment, and residuals of all blocks, over time.
         for axis, segment in zip(AXES, traces.segments.get(sensor, ())):
             names = [name.replace(' ', '_') for name in segment.signals]
             rows = np.column_stack(list(segment.signals.values()))
@@ -341,7 +342,7 @@ def overlay_topics(
         for k, time in enumerate(traces.time.tolist()):
             messages.append((time, _residual(traces, sensor, joint_names, k)))
         yield f'/residual/{sensor}', messages
-        # Spectrum and histograms belong to the complete time: at its start and at its end.
+        # 2. Spectrum and histograms belong to the complete time: at its start and at its end.
         if sensor in traces.distances:
             frequency, (before, after), noise = traces.distances[sensor].density()
             content = {
@@ -411,17 +412,13 @@ class View:
         """Content that cannot be shown, with the reason."""
         if self.coverage is None:
             return (
-                (
-                    'a calibration file contains no residuals: only the parameters are shown; give'
-                    ' the recording for residuals'
-                ),
+                'a calibration file contains no residuals: only the parameters are shown; give'
+                ' the recording for residuals',
             )
         if SPECTRUM_TOPIC not in self.contents:
             return (
-                (
-                    'no window with motion was long enough for a spectrum, and by hand there is'
-                    ' none: it is left out'
-                ),
+                'no window with motion was long enough for a spectrum, and by hand there is'
+                ' none: it is left out',
             )
         return ()
 

@@ -43,11 +43,8 @@ def run(options: Options) -> VerbResult:
     The exit code is 0 when it helps each sensor and no error has changed, otherwise 3.
     """
     from imu_calibration.api.calibrate import check_recording
-    from imu_calibration.cli.show import show_table, warn
-    from imu_calibration.cli.terminal import Terminal
-    from imu_calibration.document import files
+    from imu_calibration.cli.show import show_answer, warn
     from imu_calibration.preprocessing.checks import visible_findings
-    from imu_calibration.report.answer_page import answer_page
 
     page = options.page('check.html')
     result = check_recording(
@@ -58,27 +55,23 @@ def run(options: Options) -> VerbResult:
         **options.choices(),
     )
     warn([finding.to_mapping() for finding in visible_findings(result.findings)])
-    out = Terminal.of()
-    table = _table(result)
-    show_table(out, table.columns, list(table.rows), numbers=table.numbers)
-    out.print(str(result))
-    if page is not None:
-        headline, *lines = str(result).split('\n')
-        text = answer_page(
-            'Check of a calibration',
-            headline,
-            lines,
-            table=table,
-            good=not result.exit_code,
-            lead=(
-                'Errors on the new recording before and after correction, and in the file of the'
-                ' calibration on held-out data. A sensor has changed where the 95 % interval of now'
-                f' / stored lies above {result.change_limit:g} in a kind of motion.'
-            ),
-            facts={'recording': str(options.bag), 'calibration': str(options.calibration)},
-        )
-        files.write_texts(page.parent, {page.name: text})
-        out.print(f'written: {page}')
+    text = str(result)
+    headline, *lines = text.split('\n')
+    show_answer(
+        text,
+        page=page,
+        table=_table(result),
+        title='Check of a calibration',
+        headline=headline,
+        lines=lines,
+        good=not result.exit_code,
+        lead=(
+            'Errors on the new recording before and after correction, and in the file of the'
+            ' calibration on held-out data. A sensor has changed where the 95 % interval of now'
+            f' / stored lies above {result.change_limit:g} in a kind of motion.'
+        ),
+        facts={'recording': str(options.bag), 'calibration': str(options.calibration)},
+    )
     document = {
         'proof': {sensor: entry.to_mapping() for sensor, entry in result.proof.items()},
         'helps': result.helps,

@@ -21,35 +21,28 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Compare and print; exit code 3 where the calibrations of the IMU disagree."""
-    from imu_calibration.cli.show import show_table
-    from imu_calibration.cli.terminal import Terminal
+    from imu_calibration.cli.show import show_answer
     from imu_calibration.document import comparison, files
-    from imu_calibration.report.answer_page import answer_page
 
     page = options.page('compare.html')
     result = comparison.compare(
         files.read_calibration(options.first), files.read_calibration(options.second)
     )
 
-    out = Terminal.of()
-    table = _table(result)
-    show_table(out, table.columns, table.rows, numbers=table.numbers)
-    out.print('\n'.join(result.lines))
-    if page is not None:
-        text = answer_page(
-            'Two calibrations',
-            result.lines[-1],
-            result.lines[:-1],
-            table=table,
-            good=bool(result.agree),
-            lead=(
-                'Differences in combined standard deviations; a group of parameters differs at 1 %'
-                ' over all groups.'
-            ),
-            facts={'A': options.first, 'B': options.second},
-        )
-        files.write_texts(page.parent, {page.name: text})
-        out.print(f'written: {page}')
+    show_answer(
+        '\n'.join(result.lines),
+        page=page,
+        table=_table(result),
+        title='Two calibrations',
+        headline=result.lines[-1],  # the verdict
+        lines=result.lines[:-1],
+        good=bool(result.agree),
+        lead=(
+            'Differences in combined standard deviations; a group of parameters differs at 1 %'
+            ' over all groups.'
+        ),
+        facts={'A': options.first, 'B': options.second},
+    )
     document = {
         'rows': [asdict(row) for row in result.rows],
         'lines': list(result.lines),

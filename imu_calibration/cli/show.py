@@ -13,6 +13,7 @@ from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, Chec
 
 if TYPE_CHECKING:
     from imu_calibration.api.calibrate import Calibrated
+    from imu_calibration.report.answer_page import AnswerTable
 
 
 def show_table(
@@ -41,6 +42,23 @@ def show_table(
         cells.append([(cell, style) for cell in row])
     right = [k for k, heading in enumerate(headings) if heading in numbers]
     out.write(out.table(cells, right=right, gap=gap))
+
+
+def show_answer(text: str, *, page: Path | None, table: 'AnswerTable', **content: Any) -> None:
+    """
+    Print a table and the text of an answer, and write `page` with both unless it is None.
+
+    `content`: further arguments of `answer_page`.
+    """
+    from imu_calibration.document import files
+    from imu_calibration.report.answer_page import answer_page
+
+    out = Terminal.of()
+    show_table(out, table.columns, table.rows, numbers=table.numbers)
+    out.print(text)
+    if page is not None:
+        files.write_texts(page.parent, {page.name: answer_page(table=table, **content)})
+        out.print(f'written: {page}')
 
 
 def warn(findings: Iterable[dict[str, Any]]) -> None:

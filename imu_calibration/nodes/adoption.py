@@ -363,12 +363,12 @@ def _stop_watch(
     options = HealthOptions(gravity, settings.update_gyro_bias, settings.gyro_bias_time)
     if before is not None and before.used.calibration is calibration:
         watch = before.compensation.watch
-        if watch is not None and watch.health.options == options:
-            old_transfer = before.compensation.transfer
-            if old_transfer is transfer or (
-                transfer is not None and transfer.is_close(old_transfer)
-            ):
-                return watch
+        old_transfer = before.compensation.transfer
+        same_transfer = old_transfer is transfer
+        if transfer is not None:
+            same_transfer = same_transfer or transfer.is_close(old_transfer)
+        if watch is not None and watch.health.options == options and same_transfer:
+            return watch
     return StopWatch(CalibrationHealth(calibration, transfer, options))
 
 
@@ -383,6 +383,7 @@ def _anchor_from_topic(
     """
     if settings.anyway:
         return calibration
+    # None: the uncorrected readings, with which the first calibration is compared.
     references: list[Calibration | None] = [None]
     if before is not None:
         references = [before.used.calibration, before.anchor]

@@ -166,20 +166,7 @@ class CalibrationNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('calibration_node', **options)
-        self.settings = declare_parameters(
-            self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node']
-        )
-        self._session_settings: dict[type, Any] = {
-            LiveSettings: declare_parameters(self, LiveSettings, self._change_session),
-            WindowSettings: declare_parameters(self, WindowSettings, self._change_session),
-        }
-        self._options = calibration_options(
-            {name: chosen or None for name, chosen in self._choices().items()}
-        )
-        self._session_settings[LiveByHandSettings] = declare_parameters(
-            self, LiveByHandSettings, self._change_place
-        )
-        robot = declare_parameters(self, RobotSettings)
+        robot = self._declare_settings()
 
         # The reference and the session, new or resumed.
         joints = joint_topics(robot, self.settings.table_file)
@@ -202,24 +189,14 @@ class CalibrationNode(Node):
         self._gatherer = LiveGatherer(
             self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id
         )
-        # Publishers of the results, and the thread that makes them.
-        self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
-        self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
-        self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
-        listeners = Listeners(
-            lambda text: self._publish(self._document, String(data=text)),
-            self._publish_residuals,
-            lambda coverage: self._publish(
-                self._coverage, markers_of(coverage, self.get_clock().now().to_msg())
-            ),
-        )
+        # The thread that makes the results.
         self.worker = CalibrationWorker(
             self._gatherer,
             live,
             self._make_live,
             session_files=session_files,
             autosave_period=self.settings.autosave_period,
-            listeners=listeners,
+            listeners=self._make_listeners(),
             hints=HINTS['calibration_node'],
             provenance=self._provenance(robot),
         )
@@ -240,6 +217,36 @@ class CalibrationNode(Node):
         )
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
+
+    def _declare_settings(self) -> RobotSettings:
+        """Declare all parameters; return those of the arm, which are not kept."""
+        self.settings = declare_parameters(
+            self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node']
+        )
+        self._session_settings: dict[type, Any] = {
+            LiveSettings: declare_parameters(self, LiveSettings, self._change_session),
+            WindowSettings: declare_parameters(self, WindowSettings, self._change_session),
+        }
+        self._options = calibration_options(
+            {name: chosen or None for name, chosen in self._choices().items()}
+        )
+        self._session_settings[LiveByHandSettings] = declare_parameters(
+            self, LiveByHandSettings, self._change_place
+        )
+        return declare_parameters(self, RobotSettings)
+
+    def _make_listeners(self) -> Listeners:
+        """Make the publishers of the results; return the functions that publish on them."""
+        document = self.create_publisher(String, 'imu/calibration', latched_qos())
+        self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
+        markers = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
+        return Listeners(
+            lambda text: self._publish(document, String(data=text)),
+            self._publish_residuals,
+            lambda coverage: self._publish(
+                markers, markers_of(coverage, self.get_clock().now().to_msg())
+            ),
+        )
 
     def _listen(self, joints: list[str]) -> None:
         """Subscribe to the streams; `joints` has the topic of the joint states, if there is one."""
@@ -364,30 +371,33 @@ class CalibrationNode(Node):
         state = self.worker.state
         streams = state.streams
 
-        # Faults of the topics, silent streams, and streams with faulty samples.
-        about_topics = []
-        for source in self._inputs.values():
-            about_topics += source.faults()
-        if 'joints' not in self._inputs and self.count_publishers(
-            self.resolve_topic_name('joint_states')
-        ):
-            about_topics.append(
-                'joint states are published and not listened to: '
-                "to calibrate on a table or an arm give 'table_file' or 'urdf_file'"
-            )
-        silent = []
+        # Faults of the topics and silent streams; streams with faulty samples if none is silent.
+        faults = self._topic_faults()
         trouble = []
         if streams is not None:
             for name in streams.silent:
-                silent.append(self._inputs[name].silence(streams.unusable.get(name, '')))
-            if streams.word == 'trouble' and not silent:
+                faults.append(self._inputs[name].silence(streams.unusable.get(name, '')))
+            if streams.word == 'trouble' and not streams.silent:
                 trouble.append(streams.message)
         if time.monotonic() - self._started > MAX_SILENCE_SECONDS:
-            self._complaints.now('calibration', about_topics + silent, state.faults)
+            self._complaints.now('calibration', faults, state.faults)
             self._complaints.now('streams', trouble, patience=REMINDER)
         for level, line in self._guide.lines(state):
             say(self.get_logger(), level, line)
-        return statuses_of(state, about_topics + silent)
+        return statuses_of(state, faults)
+
+    def _topic_faults(self) -> list[str]:
+        """Return the faults of the inputs, and a line on joint states that are not read."""
+        lines = []
+        for source in self._inputs.values():
+            lines += source.faults()
+        reads_joints = 'joints' in self._inputs
+        if not reads_joints and self.count_publishers(self.resolve_topic_name('joint_states')):
+            lines.append(
+                'joint states are published and not listened to: '
+                "to calibrate on a table or an arm give 'table_file' or 'urdf_file'"
+            )
+        return lines
 
 
 def main(arguments: list[str] | None = None) -> int:

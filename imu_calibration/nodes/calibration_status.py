@@ -141,7 +141,7 @@ class CalibrationGuide:
         yield from self._diagnosis(state)
 
     def _streams(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        """Yield lines on streams that begin, and on another kind of stamps."""
+        """Yield lines on streams that begin, and on another kind of stamps of the IMU."""
         received = set()
         if state.streams is not None:
             received = {name for name in state.streams.coming if name in self._inputs}
@@ -151,16 +151,17 @@ class CalibrationGuide:
                 f'{MESSAGE_TYPES[name]} messages are received on {self._inputs[name].source()}',
             )
         self._received = received
-        line = None if state.streams is None else state.streams.stamping
-        if line is None or line.word == self._logged_stamping:
+        stamping = None if state.streams is None else state.streams.stamping
+        if stamping is None or stamping.word == self._logged_stamping:
             return
-        # Regular stamps at the start, and irregular ones, have no line.
-        if line.word == COUNTED or (line.word == REGULAR and self._logged_stamping):
+        # Counted stamps are reported, and the return to regular ones.
+        is_regular_again = stamping.word == REGULAR and self._logged_stamping
+        if stamping.word == COUNTED or is_regular_again:
             if self._clock() - self._stamping_logged_at < REMINDER:
                 return  # logged later if it lasts
             self._stamping_logged_at = self._clock()
-            yield LOG_INFO, f'Imu: {line}'
-        self._logged_stamping = line.word
+            yield LOG_INFO, f'Imu: {stamping}'
+        self._logged_stamping = stamping.word
 
     def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         """Yield a line when the decisions on the sensors, or their completeness, have changed."""
@@ -218,13 +219,9 @@ def advice_of(state: WorkerState) -> str:
 
 
 STATUS_LEVELS = {
-    word: level
-    for level, words in (
-        (OK, ('good', 'determined', 'waiting', 'nothing found', 'off', '', 'helps')),
-        (WARN, ('trouble', 'weak', 'held', 'found', 'unexplained', 'unproven')),
-        (ERROR, ('silent', 'failed', 'harms')),
-    )
-    for word in words
+    **dict.fromkeys(('good', 'determined', 'waiting', 'nothing found', 'off', '', 'helps'), OK),
+    **dict.fromkeys(('trouble', 'weak', 'held', 'found', 'unexplained', 'unproven'), WARN),
+    **dict.fromkeys(('silent', 'failed', 'harms'), ERROR),
 }
 """Word of a stream, a parameter group, a session, a diagnosis or a decision -> its level."""
 
@@ -265,24 +262,16 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
         )
     )
     if state.session is not None:
-        statuses.append(
-            make_status(
-                STATUS_LEVELS[state.session.word],
-                'poses',
-                state.session.message,
-                values=state.session.values,
-            )
-        )
+        statuses.append(_live_status('poses', state.session, state.session.values))
     if state.diagnosis is not None:
-        statuses.append(
-            make_status(
-                STATUS_LEVELS[state.diagnosis.word],
-                'diagnosis',
-                state.diagnosis.message,
-                values={'outcome': state.diagnosis.word, **state.diagnosis.values},
-            )
-        )
+        values = {'outcome': state.diagnosis.word, **state.diagnosis.values}
+        statuses.append(_live_status('diagnosis', state.diagnosis, values))
     return statuses + [_group_status(group) for group in state.groups]
+
+
+def _live_status(name: str, state: LiveState, values: dict[str, Any]) -> DiagnosticStatus:
+    """Return the status of a session or a diagnosis."""
+    return make_status(STATUS_LEVELS[state.word], name, state.message, values=values)
 
 
 def _group_status(group: GroupState) -> DiagnosticStatus:
@@ -393,7 +382,8 @@ def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> 
 def _stamped(markers: list[Marker], frame_id: str, stamp: Time) -> MarkerArray:
     """Return markers with the same header."""
     for marker in markers:
-        marker.header.frame_id, marker.header.stamp = frame_id or 'imu_link', stamp
+        marker.header.frame_id = frame_id or 'imu_link'
+        marker.header.stamp = stamp
     return MarkerArray(markers=markers)
 
 

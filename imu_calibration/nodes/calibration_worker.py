@@ -137,7 +137,8 @@ class SessionFiles:
 
     def note_saved(self, n_windows: int) -> None:
         """Record the number of saved windows or poses."""
-        self.saved_at, self.n_saved = time.monotonic(), n_windows
+        self.saved_at = time.monotonic()
+        self.n_saved = n_windows
 
     def save(self, live: LiveSession, text: str | None) -> tuple[bool, str]:
         """
@@ -399,10 +400,14 @@ class CalibrationWorker(threading.Thread):
             response.set_result(result)
 
     def _solve_when_due(self) -> None:
-        """Publish a solution of new data, and of open windows once no message arrives."""
+        """
+        Publish a solution of new data, and of open windows once no message arrives.
+
+        The first solution after the end of the messages is followed by a diagnosis.
+        """
         silence = self._read_at - (self._watch.last_arrival or 0.0)
-        idle = not self._includes_pending and silence > IDLE
-        if idle:
+        messages_ended = not self._includes_pending and silence > IDLE
+        if messages_ended:
             self._includes_pending = True
             self._new_windows = True
         if not self._new_windows or not self._pacer.due(time.monotonic()):
@@ -410,7 +415,7 @@ class CalibrationWorker(threading.Thread):
         self._new_windows = False
         try:
             self._publish_solution(pending=self._includes_pending)
-            if idle:
+            if messages_ended:
                 self._diagnosis.want()
         except ImuCalibrationError as error:
             self._trouble = error.with_hint(self.hints)
@@ -546,6 +551,7 @@ class CalibrationWorker(threading.Thread):
             'diagnoses': self._diagnosis.n_answers,
             'being made': self._diagnosis.is_running,
         }
+        diagnosis = replace(diagnosis, values={**diagnosis.values, **progress})
         state = WorkerState(
             groups=groups,
             streams=self._watch.state(self._read_at, self.live.stamping),
@@ -554,9 +560,7 @@ class CalibrationWorker(threading.Thread):
             faults=tuple(line for line in self._faults.values() if line),
             gathered=self.live.n_windows,
             session=self.live.status(self.hints),
-            diagnosis=self.live.diagnosed(
-                replace(diagnosis, values={**diagnosis.values, **progress})
-            ),
+            diagnosis=self.live.diagnosed(diagnosis),
         )
 
         # Decision, texts and figures of the last solution.

@@ -116,7 +116,10 @@ class CompensatorDiagnostics:
         # Present faults, also for the log; a doubt about stamps is repeated less often.
         unready = self._unready()
         serious, notes = self._lines(compensation, unready)
-        notes += self._silence(compensation)
+        self._note_arrivals(compensation)
+        self._tell_stamps(compensation)
+        if monotonic() - self._last_arrival > QUIET:
+            notes.append(node.imu.silence())
         for source in node.inputs:
             notes += source.faults()
         node.complaints.now('compensation', notes, serious)
@@ -128,7 +131,7 @@ class CompensatorDiagnostics:
         adopted: Adopted | None = node.adopted
         notes += [] if adopted is None else adopted.caveats
 
-        # The worst of them is the level.
+        # The worst of them is the level; without any the state is reported.
         level = WARN if notes else OK
         if serious:
             level = ERROR
@@ -178,8 +181,8 @@ class CompensatorDiagnostics:
             )
         ]
 
-    def _silence(self, compensation: LiveCompensation | None) -> list[str]:
-        """Return a line on a silent stream; log the source and the stamps of a changed one."""
+    def _note_arrivals(self, compensation: LiveCompensation | None) -> None:
+        """Record the time of new messages, and log their source when it has changed."""
         node = self._node
         n_received = node.uncorrected
         if compensation is not None:
@@ -191,26 +194,28 @@ class CompensatorDiagnostics:
             if source != self._logged_source and node.imu.publishers:
                 self._logged_source = source
                 node.get_logger().info(f'Imu messages are received on {source}')
-        self._tell_stamps(compensation)
-        return [node.imu.silence()] if monotonic() - self._last_arrival > QUIET else []
 
     def _tell_stamps(self, compensation: LiveCompensation | None) -> None:
-        """Log a change of the kind or of the regular rate of the stamps, at most once a minute."""
+        """
+        Log a change of the kind or of the regular rate of the stamps, at most once a minute.
+
+        The first kind is logged only if the stamps are counted.
+        """
         line = None if compensation is None else compensation.slope.line
         if line is None:
             return
         rate = 0
         if line.word == REGULAR:  # the other lines state no rate
             rate = round(np.log(line.period_ns) / ANOTHER_RATE)
-        shown = (line.word, rate)
-        if shown == self._logged_stamps:
+        stamps = (line.word, rate)
+        if stamps == self._logged_stamps:
             return
         if line.word == COUNTED or self._logged_stamps is not None:
             if monotonic() - self._stamps_logged_at < REMINDER:
                 return  # logged later if it lasts
             self._stamps_logged_at = monotonic()
             self._node.get_logger().info(str(line))
-        self._logged_stamps = shown
+        self._logged_stamps = stamps
 
     def _uncorrected(self) -> str:
         """Return the treatment of messages without a calibration, readable."""

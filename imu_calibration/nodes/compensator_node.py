@@ -101,14 +101,26 @@ class CompensatorNode(Node):
         self.corrected_already = ''
         """Why the input is corrected already, so that no message is published; '' otherwise."""
 
-        # Topics. With the wait set the messages are received outside the executor.
+        self.uncorrected = 0
+        """Messages that were not corrected: published unchanged or not at all."""
+        self.complaints = Complaints(self.get_logger())
+        self._connect()
+        self.diagnostics = CompensatorDiagnostics(self)
+        self.create_service(Trigger, '~/reload', self._on_reload)
+        self._start()
+        self._refresh_timer: Timer | None = None
+        self._set_refresh(self.settings.covariance_rate)
+
+    def _connect(self) -> None:
+        """
+        Subscribe to the inputs and make the publishers of the output and its mark.
+
+        With the wait set the messages of the IMU are received outside the executor.
+        """
         announce(
             self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected']
         )
         self._frames = StaticFrames(self, self._guarded(self._on_transforms))
-        self.uncorrected = 0
-        """Messages that were not corrected: published unchanged or not at all."""
-        self.complaints = Complaints(self.get_logger())
         self.by_wait_set = relay_loop.available() and not self.settings.public_executor
         self._publisher = self.create_publisher(Imu, 'imu/data_corrected', output_qos())
         self._mark = self.create_publisher(String, self._publisher.topic_name + MARK, latched_qos())
@@ -131,11 +143,6 @@ class CompensatorNode(Node):
         self.temperature: MatchedInput | None = None
         self.inputs = [self.imu, self.documents]
         watch_inputs(self, self.inputs)
-        self.diagnostics = CompensatorDiagnostics(self)
-        self.create_service(Trigger, '~/reload', self._on_reload)
-        self._start()
-        self._refresh_timer: Timer | None = None
-        self._set_refresh(self.settings.covariance_rate)
 
     def _start(self) -> None:
         """Adopt the calibration file, or log for which calibration the node waits."""
@@ -267,7 +274,8 @@ class CompensatorNode(Node):
         """
         Return to the previous calibration where the present one increases the error at a stop.
         """
-        harmful, previous = self.adopted, self._previous
+        harmful = self.adopted
+        previous = self._previous
         watch = None if harmful is None else harmful.compensation.watch
         if harmful is None or previous is None or watch is None or watch.health.state.word != HARMS:
             return
@@ -340,7 +348,6 @@ class CompensatorNode(Node):
         """
         try:
             action(self.settings)
-            return ''
         except Awaited as awaited:
             self.awaited = str(awaited)
             self.get_logger().info(f'waits for {awaited}')
@@ -349,15 +356,16 @@ class CompensatorNode(Node):
         except ImuCalibrationError as error:
             why = error.with_hint(HINTS['compensator_node'])
             self.refusal = error.code
-            # A calibration in progress is not a fault.
-            if self.adopted is None and source == self._topic:
-                if may_become_ready(error, self._document):
-                    self._wait_until_ready(source, why)
-                    return why
-        self.unready = ''
-        self.problem = f'the calibration from {source} was refused: {why}'
-        self.diagnostics.publish_now()
-        return why
+            # The first calibration from the topic may be in progress, which is not a fault.
+            is_first = self.adopted is None and source == self._topic
+            if is_first and may_become_ready(error, self._document):
+                self._wait_until_ready(source, why)
+                return why
+            self.unready = ''
+            self.problem = f'the calibration from {source} was refused: {why}'
+            self.diagnostics.publish_now()
+            return why
+        return ''
 
     def _wait_until_ready(self, source: str, why: str) -> None:
         """Report a calibration in progress, whose next version may be applied."""
@@ -403,13 +411,17 @@ class CompensatorNode(Node):
     def _change_compensation(self, settings: CompensatorSettings) -> None:
         """Apply changed parameters; on an ImuCalibrationError all remain unchanged."""
         old = self.settings
-        # New consent, or another source, may adopt a calibration that was refused or ignored.
+        # New consent, or the topic as a new source, may adopt a calibration that was refused or
+        # ignored before.
         consents = settings.anyway and not old.anyway
-        changes_source = settings.takes_topic and not old.takes_topic
-        if settings.calibration_file and consents and not settings.takes_topic:
-            self._load_file(settings)
-        elif settings.takes_topic and self._document and (consents or changes_source):
+        if settings.takes_topic:
+            tries_again = bool(self._document) and (consents or not old.takes_topic)
+        else:
+            tries_again = bool(settings.calibration_file) and consents
+        if tries_again and settings.takes_topic:
             self._take_topic(settings)
+        elif tries_again:
+            self._load_file(settings)
         elif self.adopted is not None:
             self._put_in_force(with_settings(self.adopted, settings, self._frames))
         if settings.covariance_rate != old.covariance_rate:

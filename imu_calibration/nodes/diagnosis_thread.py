@@ -140,7 +140,7 @@ class DiagnosisThread:
         now = time.monotonic()
         is_periodic = bool(self.period) and is_news and now >= self._next_at
         is_due = (self._is_requested or is_periodic) and self._pacer.due(now)
-        if not (is_due or self._is_urgent) or self.is_running or self._ending:
+        if self.is_running or self._ending or not (is_due or self._is_urgent):
             return
         question = make_question()
         if question is None:

@@ -65,7 +65,8 @@ class DiagnosticsPublisher:
     """
 
     def __init__(self, node: Node, collect: Callable[[], list]):
-        self._node, self._collect = node, collect
+        self._node = node
+        self._collect = collect
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._timer = every(node, DIAGNOSTICS_SECONDS, self.publish_now)
 

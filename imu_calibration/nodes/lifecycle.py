@@ -265,7 +265,11 @@ error.
 
 
 def settings_of(node: str) -> list[type]:
-    """Return the settings classes that the module of `node` declares as parameters."""
+    """
+    Return the settings classes that the module of `node` declares as parameters, in this order.
+
+    They are the second arguments of `declare_parameters` in its source: no node is made.
+    """
     tree = ast.parse(Path(__file__).with_name(f'{node}.py').read_text())
     calls = []
     for call in ast.walk(tree):
@@ -375,16 +379,8 @@ def run_node(
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     not_of_ros = remove_ros_args(['', *arguments])[1:]
-    if '-h' in not_of_ros or '--help' in not_of_ros:
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # the reader of a pipe may close it
-        print(help_text(make_node))
-        return 0
     if not_of_ros:
-        return _failed(
-            'arguments of the node follow --ros-args, got'
-            f" '{shortened(not_of_ros[0])}' before it; write --ros-args -p NAME:=VALUE, and see"
-            ' --help'
-        )
+        return _print_help_or_refusal(make_node, not_of_ros)
 
     # Signals. rclpy's handlers, installed by init, end the wait and call these; without them Python
     # would also raise KeyboardInterrupt in mid-write. A node with a final message (`halt`) needs
@@ -436,6 +432,18 @@ def run_node(
     finally:
         _end(node)
     return int(getattr(node, 'failed', False))
+
+
+def _print_help_or_refusal(make_node: Callable[[], Any], not_of_ros: Sequence[str]) -> int:
+    """Process arguments that are not of ROS: --help, or a mistake; return the exit code."""
+    if '-h' in not_of_ros or '--help' in not_of_ros:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # the reader of a pipe may close it
+        print(help_text(make_node))
+        return 0
+    return _failed(
+        'arguments of the node follow --ros-args, got'
+        f" '{shortened(not_of_ros[0])}' before it; write --ros-args -p NAME:=VALUE, and see --help"
+    )
 
 
 def _failed(line: str) -> int:

@@ -168,10 +168,9 @@ class PlannerNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('planner_node', **options)
-        self.settings = declare_parameters(self, PlannerNodeSettings)
+        self.settings = settings = declare_parameters(self, PlannerNodeSettings)
         self._campaign_settings = declare_parameters(self, CampaignSettings, self._change_campaign)
         driver_settings = declare_parameters(self, DriverSettings, self._change_driver)
-        settings = self.settings
         robot = declare_parameters(self, RobotSettings)
         announce(
             self,
@@ -184,12 +183,7 @@ class PlannerNode(Node):
         self._table = live_reference(self, robot, settings.table_file).table_for(
             "planner_node moves the joints of 'table_file' or 'urdf_file'", 'table_missing'
         )
-        choices: dict[str, Any] = {name: getattr(settings, name) or None for name in MODELS}
-        if settings.tolerances_file:
-            choices['tolerances'] = files.user_path(settings.tolerances_file)
-        if settings.noise_file:
-            choices['noise'] = files.user_path(settings.noise_file)
-        self._options = calibration_options(choices)
+        self._options = calibration_options(self._choices())
 
         # State that several threads use.
         self._lock = threading.RLock()
@@ -217,21 +211,7 @@ class PlannerNode(Node):
         # Commands to the joints, and the thread that selects them.
         self._command = make_command(self, settings.command, self._refused)
         self._other_commanders = OtherCommanders(self, self._command)
-        self.worker = PlannerWorker(
-            self.driver,
-            self._make_campaign,
-            peers=Peers(
-                measure=self._measure,
-                latest=self._latest,
-                diagnose=self._diagnose,
-                send=self._send,
-                stop=self._stop_joints,
-                say=self._say,
-                obstacle=self._other_commanders.obstacle,
-            ),
-            lock=self._lock,
-        )
-        self.worker.stamp = lambda: self._stamp
+        self.worker = self._make_worker()
         self._connect()
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
@@ -241,6 +221,31 @@ class PlannerNode(Node):
         )
         for line in range_warnings(self._table):
             self.get_logger().warning(line)
+
+    def _choices(self) -> dict[str, Any]:
+        """Return the choices of the calibration that is planned for, by name."""
+        settings = self.settings
+        choices = {name: getattr(settings, name) or None for name in MODELS}
+        if settings.tolerances_file:
+            choices['tolerances'] = files.user_path(settings.tolerances_file)
+        if settings.noise_file:
+            choices['noise'] = files.user_path(settings.noise_file)
+        return choices
+
+    def _make_worker(self) -> PlannerWorker:
+        """Return the thread that selects the motions; its time is that of the joint states."""
+        peers = Peers(
+            measure=self._measure,
+            latest=self._latest,
+            diagnose=self._diagnose,
+            send=self._send,
+            stop=self._stop_joints,
+            say=self._say,
+            obstacle=self._other_commanders.obstacle,
+        )
+        worker = PlannerWorker(self.driver, self._make_campaign, peers=peers, lock=self._lock)
+        worker.stamp = lambda: self._stamp
+        return worker
 
     def _connect(self) -> None:
         """Subscribe to the inputs, and offer the services and the picture of the motion."""
@@ -485,38 +490,14 @@ class PlannerNode(Node):
     # Requests of the user.
 
     def _go(self, motions: int) -> tuple[bool, str]:
-        """
-        Begin so many motions, -1: all that are needed; return (success, message).
-
-        Refuses with the first precondition that is not met.
-        """
-        if self.driver.is_driving or self.worker.doing:
-            return False, (
-                f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop stops it'
-            )
-        if missing_ranges(self._table):
-            return False, range_warnings(self._table)[0]
-        if self.driver.position is None:
-            return False, self._joints.silence(self.driver.ignored_words().strip(' ()'))
-        stamp_fault = self.driver.stamp_fault(time.monotonic())
-        if stamp_fault:
-            return False, stamp_fault
-        if not self._command.is_heard:
-            return False, (
-                f'{self._command.name} has no subscriber: start the controller, or remap'
-                ' joint_trajectory'
-            )
-        obstacle = self._other_commanders.obstacle()
-        if obstacle:
-            return False, obstacle
-        if not self._calibration_clients['solve'].service_is_ready():
-            return False, (
-                f'service {self._calibration_clients["solve"].srv_name} does not exist; start'
-                ' calibration_node, which collects the windows'
-            )
+        """Begin so many motions, -1: all that are needed; return (success, message)."""
+        refusal = self._refusal_to_start()
+        if refusal:
+            return False, refusal
 
         # The position at the first start is the middle of the permitted ranges.
         if not self._is_placed:
+            assert self.driver.position is not None  # otherwise the start is refused
             limits = self.driver.limits.wound(self.driver.position, self.settings.max_turns)
             if self.settings.reach_deg:
                 limits = limits.reached(self.driver.position, self.settings.reach_deg)
@@ -530,6 +511,34 @@ class PlannerNode(Node):
                 ' small, the first large one slow'
             )
         return True, f'{extent}; limits: {self._limit_words()}'
+
+    def _refusal_to_start(self) -> str:
+        """Return the first precondition of a motion that is not met, '' if all are met."""
+        if self.driver.is_driving or self.worker.doing:
+            activity = self.worker.doing or self.driver.reason
+            return f'it is at work already: {activity}; ~/stop stops it'
+        if missing_ranges(self._table):
+            return range_warnings(self._table)[0]
+        if self.driver.position is None:
+            return self._joints.silence(self.driver.ignored_words().strip(' ()'))
+        stamp_fault = self.driver.stamp_fault(time.monotonic())
+        if stamp_fault:
+            return stamp_fault
+        if not self._command.is_heard:
+            return (
+                f'{self._command.name} has no subscriber: start the controller, or remap'
+                ' joint_trajectory'
+            )
+        obstacle = self._other_commanders.obstacle()
+        if obstacle:
+            return obstacle
+        solve = self._calibration_clients['solve']
+        if not solve.service_is_ready():
+            return (
+                f'service {solve.srv_name} does not exist; start'
+                ' calibration_node, which collects the windows'
+            )
+        return ''
 
     def _limit_words(self) -> str:
         """Return a text on the present limits of the joints."""
@@ -551,9 +560,9 @@ class PlannerNode(Node):
         try:
             response.success, response.message = action()
         except ImuCalibrationError as error:
-            response.success, response.message = False, error.with_hint(HINTS['planner_node'])
+            response.message = error.with_hint(HINTS['planner_node'])
         except Exception as error:
-            response.success, response.message = False, self._failed(error)
+            response.message = self._failed(error)
         self._say(LOG_INFO if response.success else LOG_ERROR, f'~/{service}: {response.message}')
         self._diagnostics.publish_now()
         return response
@@ -570,8 +579,9 @@ class PlannerNode(Node):
             self._coverage.publish(self._driven_marker)
         driver = self.driver
         worker = self.worker
-        campaign = self.worker.campaign
-        name, excess = worker.worst
+        campaign = worker.campaign
+        worst_name, worst_excess = worker.worst
+        ignored = [f'{name}:{count}' for name, count in driver.ignored.items()]
         values = {
             'state': driver.state.value,
             'motion': driver.motions,
@@ -579,17 +589,18 @@ class PlannerNode(Node):
             'it takes [s]': f'{worker.seconds:.1f}',
             'elapsed [s]': f'{worker.elapsed:.1f}',
             'outside tolerance': worker.outside,
-            'furthest outside': name,
-            'standard deviation over tolerance': f'{excess:.2f}',
+            'furthest outside': worst_name,
+            'standard deviation over tolerance': f'{worst_excess:.2f}',
             'commands': self._command.name,
-            'ignored joint states': ' '.join(
-                f'{name}:{count}' for name, count in driver.ignored.items()
-            ),
+            'ignored joint states': ' '.join(ignored),
         }
         if campaign is not None and campaign.findings is not None:
+            mates: list[str] = []
+            for finding in campaign.findings:
+                mates += finding.mates
             values |= {
                 'found': ' '.join(finding.effect for finding in campaign.findings),
-                'mates': ' '.join(mate for finding in campaign.findings for mate in finding.mates),
+                'mates': ' '.join(mates),
                 'separations': campaign.separations,
                 'separating': campaign.is_separating,
                 'told apart': ' '.join(campaign.told_apart),

@@ -160,13 +160,11 @@ class Playback(threading.Thread):
         """Publish the messages of a batch when they are due; `start` on the steady clock, s."""
         n_done = 0
         while n_done < len(batch.messages) and not self._ending.is_set():
+            now = float(batch.time[-1])  # as fast as possible: all are due
             if self._pace.factor:
                 now = (time.monotonic() - start) * self._pace.factor
-                n_due = int(np.searchsorted(batch.time, now, side='right'))
-                self._publish_clock(now)
-            else:
-                n_due = len(batch.messages)
-                self._publish_clock(float(batch.time[-1]))
+            n_due = int(np.searchsorted(batch.time, now, side='right'))
+            self._publish_clock(now)
             for publisher, message in zip(
                 batch.publisher[n_done:n_due], batch.messages[n_done:n_due], strict=True
             ):
@@ -184,7 +182,7 @@ class Playback(threading.Thread):
         self._clock_due = now + max(self._pace.factor, 1e-3) / self._pace.clock_rate
         stamp_ns = self._clock_start_ns + int(round(now * 1e9))
         message = Clock()
-        message.clock.sec, message.clock.nanosec = stamp_ns // 10**9, stamp_ns % 10**9
+        message.clock.sec, message.clock.nanosec = divmod(stamp_ns, 10**9)
         self._clock.publish(message)
 
     def _settle(self) -> None:

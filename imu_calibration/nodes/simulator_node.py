@@ -197,31 +197,14 @@ class SimulatorNode(Node):
         topics = [topic for _, topic in kinds]
         announce(self, ['joint_trajectory'], [*topics, '/clock'] if settings.clock else topics)
         self._table, self._motion = self._make_table()
-        imu_seed = settings.seed if settings.imu_seed < 0 else settings.imu_seed
-        given_imu = None
-        if settings.calibration_file:
-            truth = files.read_calibration(files.user_path(settings.calibration_file))
-            given_imu = (truth.model, truth.values)
-        model, values = true_imu(self._table, given_imu, settings.grade, seed=imu_seed)
-        start_ns = int(settings.start_time * 1e9) or time.time_ns()
-        causes = hidden_causes(
-            settings.hide.split('+') if settings.hide else [], imu_seed, settings.hide_size
-        )
-        self._simulation = LiveSimulation(
-            model,
-            values,
-            self._table,
-            motion=self._motion,
-            options=self._options(),
-            seed=settings.seed,
-            start_ns=start_ns,
-            causes=causes,
-        )
+        self._simulation = self._make_simulation()
         self._trajectories: queue.Queue[JointTrajectory] = queue.Queue()
         """Received trajectories, which the playback's thread starts between two batches."""
         self._trajectory_figures: dict[str, Any] = {'followed': 0, 'refused': 0, 'why refused': ''}
         """Numbers of trajectories, and the reason of the last refusal, for the diagnostics."""
-        self._publish_truth(model, values)
+        self._publish_truth(self._simulation.model, self._simulation.values)
+
+        # The publishers, and the thread that uses them.
         publishers = [
             self.create_publisher(kind, topic, output_qos(PLAYBACK_DEPTH)) for kind, topic in kinds
         ]
@@ -235,7 +218,7 @@ class SimulatorNode(Node):
             publishers,
             self._batches(),
             pace=pace,
-            clock_start_ns=start_ns,
+            clock_start_ns=self._simulation.start_ns,
             awaited=publishers[:1],
             ended='the profile has ended, {} messages were published',
         )
@@ -277,6 +260,27 @@ class SimulatorNode(Node):
             limits=limits_of(table),
             settings=self._controller_settings,
             repeat=settings.repeat,
+        )
+
+    def _make_simulation(self) -> LiveSimulation:
+        """Return the simulation of the IMU that the parameters describe, on the table."""
+        settings = self.settings
+        imu_seed = settings.seed if settings.imu_seed < 0 else settings.imu_seed
+        given_imu = None
+        if settings.calibration_file:
+            truth = files.read_calibration(files.user_path(settings.calibration_file))
+            given_imu = (truth.model, truth.values)
+        model, values = true_imu(self._table, given_imu, settings.grade, seed=imu_seed)
+        hidden = settings.hide.split('+') if settings.hide else []
+        return LiveSimulation(
+            model,
+            values,
+            self._table,
+            motion=self._motion,
+            options=self._options(),
+            seed=settings.seed,
+            start_ns=int(settings.start_time * 1e9) or time.time_ns(),
+            causes=hidden_causes(hidden, imu_seed, settings.hide_size),
         )
 
     def _options(self) -> SimulationOptions:

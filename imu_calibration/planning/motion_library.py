@@ -308,7 +308,7 @@ class MotionLibrary:
         self.place_of = np.array(nearest)
         """Index into `places` for each motion."""
 
-    def _motion(
+    def motion(
         self, kind: MotionKind, place: np.ndarray, segments: tuple[Segment, ...], text: str
     ) -> PlannedMotion:
         """Return a motion of the chain within its limits."""
@@ -317,10 +317,10 @@ class MotionLibrary:
     def _rests(self) -> Iterator[PlannedMotion]:
         """Yield a mere move to each place, and rests of several lengths there."""
         for place in self.spread:
-            yield self._motion(MotionKind.MOVE, place, (), '')
+            yield self.motion(MotionKind.MOVE, place, (), '')
             for dwell in DWELLS:
                 segments = self._builder(place).rest(dwell).segments
-                yield self._motion(MotionKind.POSE, place, segments, f'rest for {dwell:g} s')
+                yield self.motion(MotionKind.POSE, place, segments, f'rest for {dwell:g} s')
 
     def _spins(self) -> Iterator[PlannedMotion]:
         """Yield turns of each rotating joint: whole ones if endless, otherwise sweeps."""
@@ -414,7 +414,7 @@ class MotionLibrary:
         seconds_at_rate = (2 * np.pi * n_turns - ramp_angle) / speed
         noun = 'turn' if n_turns == 1 else 'turns'
         text = f'spin {self._rate_words(rates)} for {n_turns:.0f} whole {noun}'
-        return self._motion(kind, place, self._spun(place, rates, seconds_at_rate), text)
+        return self.motion(kind, place, self._spun(place, rates, seconds_at_rate), text)
 
     def _sweep(self, place: np.ndarray, rates: np.ndarray) -> PlannedMotion | None:
         """
@@ -430,14 +430,14 @@ class MotionLibrary:
         start[joint] = lower + 0.02 * (upper - lower)
         to_and_fro = np.stack([rates, -rates])
         for share in (1.0, 0.6, 0.35, 0.2, 0.1):
-            longest = self._longest_at_rate(start, share * to_and_fro, joint)
+            sweep_rates = share * to_and_fro
+            longest = self._longest_at_rate(start, sweep_rates, joint)
             if longest >= SPIN_TIME[0]:
                 seconds_at_rate = min(longest, SPIN_TIME[1])
-                segments = self._spun(start, share * to_and_fro, seconds_at_rate)
-                text = (
-                    f'sweep {self._rate_words(share * rates)} for {seconds_at_rate:.1f} s and back'
-                )
-                return self._motion(MotionKind.SPIN, start, segments, text)
+                segments = self._spun(start, sweep_rates, seconds_at_rate)
+                words = self._rate_words(sweep_rates[0])
+                text = f'sweep {words} for {seconds_at_rate:.1f} s and back'
+                return self.motion(MotionKind.SPIN, start, segments, text)
         return None
 
     def _longest_at_rate(self, start: np.ndarray, rates: np.ndarray, joint: int) -> float:
@@ -483,7 +483,7 @@ class MotionLibrary:
             if self.limits.turns[k]:
                 size = f'{np.degrees(amplitude[k]):.0f}°'
             sizes.append(f'{self.names[k]} by {size} at {frequency[k]:.2g} Hz')
-        return self._motion(kind, middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s')
+        return self.motion(kind, middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s')
 
     def _largest_amplitude(
         self, swings: np.ndarray, frequency: np.ndarray, seconds: float

@@ -392,13 +392,11 @@ class Planner:
             .move_to(position)
             .segments
         )
-        return PlannedMotion(
-            kind=MotionKind.MOVE,
-            joint_names=library.names,
-            place=np.asarray(position, float),
-            segments=segments,
-            text='a small motion of every joint and back',
-            limits=limits,
+        return library.motion(
+            MotionKind.MOVE,
+            np.asarray(position, float),
+            segments,
+            'a small motion of every joint and back',
         )
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
@@ -416,14 +414,8 @@ class Planner:
         if not np.any(is_wound):
             return None
         target = np.where(is_wound, middle, position)
-        return PlannedMotion(
-            kind=MotionKind.MOVE,
-            joint_names=library.names,
-            place=target,
-            segments=(),  # the move to the place
-            text='unwinding',
-            limits=limits,
-        )
+        # Without segments: only the move to its place.
+        return library.motion(MotionKind.MOVE, target, (), 'unwinding')
 
     def plan(
         self,

@@ -238,7 +238,8 @@ class WindowPredictor:
 
     def predict(self, motions: Sequence[tuple[Segment, ...]]) -> list[list[PlannedWindow]]:
         """Return the windows of each of several motions, a tuple of segments each."""
-        cuts, n_cuts = [], []
+        cuts = []
+        n_cuts = []
         for segments in motions:
             cuts_of_motion = list(self._cut(segments))
             cuts += cuts_of_motion

@@ -101,8 +101,8 @@ def _bars(figure, result, live):
     names = list(compress(calibration.param_names, live))
     colours = [STATUS[status] for status in compress(calibration.status, live)]
     axes = figure.subplots()
-    place = np.arange(len(names))[::-1]
-    low = min(1e-3, float(share.min()) / 2)
+    place = np.arange(len(names))[::-1]  # the first parameter at the top
+    low = min(1e-3, float(share.min()) / 2)  # where all bars begin
     axes.barh(place, share - low, left=low, height=0.68, color=colours)
     axes.axvline(1.0, color=INK, lw=1.0)
     axes.annotate(
@@ -148,11 +148,13 @@ def _heat_map(figure, matrix, names):
     """Draw the correlations of named parameters, with lines between the effects."""
     axes = figure.subplots()
     image = axes.imshow(matrix, cmap='RdBu_r', vmin=-1, vmax=1, interpolation='nearest')
+    # Effect of each parameter, and the first parameter of every further effect.
     groups = [short_name(name.rpartition('.')[0] + '.').strip() for name in names]
     edges = [k for k in range(1, len(groups)) if groups[k] != groups[k - 1]]
     for edge in edges:
         axes.axhline(edge - 0.5, color=GREY, lw=0.6)
         axes.axvline(edge - 0.5, color=GREY, lw=0.6)
+    # The name of each effect in the middle of its parameters.
     bounds = [0, *edges, len(groups)]
     middles = [(a + b - 1) / 2 for a, b in zip(bounds, bounds[1:])]
     labels = [groups[a] for a in bounds[:-1]]
@@ -221,10 +223,15 @@ def _dots(figure, result, budget):
     """Draw a line per effect with a dot per cause: its largest sd / tolerance."""
     axes = figure.subplots()
     effects = _effects(result)
-    place = np.arange(len(effects))[::-1]
+    place = np.arange(len(effects))[::-1]  # the first effect at the top
+
+    def largest_share(sd: np.ndarray) -> np.ndarray:
+        """Return the largest sd / tolerance of the parameters of each effect, (n_effects,)."""
+        return np.array([np.max(sd[part] / result.tolerances[part]) for _, part in effects])
+
     highest = 1.0
-    for cause, values in budget.causes.items():
-        share = np.array([np.max(values[part] / result.tolerances[part]) for _, part in effects])
+    for cause, sd in budget.causes.items():
+        share = largest_share(sd)
         highest = max(highest, share.max())
         shown = share > MIN_DRAWN_SHARE
         axes.plot(
@@ -236,8 +243,16 @@ def _dots(figure, result, budget):
             markersize=6,
             ls='none',
         )
-    total = np.array([np.max(budget.total[part] / result.tolerances[part]) for _, part in effects])
-    axes.plot(total, place, '|', color=INK, markersize=13, mew=1.6, label='total', ls='none')
+    axes.plot(
+        largest_share(budget.total),
+        place,
+        '|',
+        color=INK,
+        markersize=13,
+        mew=1.6,
+        label='total',
+        ls='none',
+    )
     axes.axvline(1.0, color=INK, lw=1.0)
     log_axis(axes.xaxis)
     axes.set(

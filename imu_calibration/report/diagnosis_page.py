@@ -52,18 +52,24 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     """
     diagnosis = result.diagnosis
     # Sensor -> significant residual that no finding explains.
-    rests = {sensor: rest for sensor, rest in diagnosis.unexplained.items() if rest.significant}
+    significant = {
+        sensor: residual
+        for sensor, residual in diagnosis.unexplained.items()
+        if residual.significant
+    }
     # Colour of the headline: a residual without a formula, with one, or none.
     word = 'good'
-    if any(rest.proposal is None for rest in rests.values()):
+    if any(residual.proposal is None for residual in significant.values()):
         word = 'bad'
-    elif rests or diagnosis.findings:
+    elif significant or diagnosis.findings:
         word = 'weak'
+
+    # Lines and spectra of what is not explained.
     beyond = list(timing_lines(diagnosis))
     spectra = []
-    for sensor, rest in diagnosis.unexplained.items():
-        beyond += beyond_lines(sensor, rest)
-        drawn = draw_tones(sensor, rest)
+    for sensor, residual in diagnosis.unexplained.items():
+        beyond += beyond_lines(sensor, residual)
+        drawn = draw_tones(sensor, residual)
         if drawn:
             spectra.append(drawn)
     return render(
@@ -73,7 +79,7 @@ def diagnosis_report(result: DiagnosisResult) -> str:
         word=word,
         result=result,
         diagnosis=diagnosis,
-        rests=rests,
+        rests=significant,
         draw_finding=draw_finding,
         draw_formula=draw_formula,
         unexplained_text=unexplained_text,
@@ -93,31 +99,16 @@ def diagnosis_report(result: DiagnosisResult) -> str:
 def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> Drawn:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
-    return draw(
-        f'finding-{number}',
-        (8.6, 3.1),
-        _against_cause,
-        diagnosis,
-        finding.gain.sensor,
-        finding.against,
-        label=label,
-    )
+    cause = (diagnosis, finding.gain.sensor, finding.against)
+    return draw(f'finding-{number}', (8.6, 3.1), _against_cause, *cause, label=label)
 
 
 def draw_formula(diagnosis: Diagnosis, proposal: Proposal) -> Drawn:
     """Return the residual against the variable of a proposed formula, before and after, as SVG."""
-    return draw(
-        f'formula-{proposal.sensor}',
-        (8.6, 3.1),
-        _against_cause,
-        diagnosis,
-        proposal.sensor,
-        _kinds_of(proposal),
-        label=(
-            'Residual against the variable of the formula, before and after:'
-            f' {" and ".join(proposal.columns)}'
-        ),
-    )
+    variable = ' and '.join(proposal.columns)
+    label = f'Residual against the variable of the formula, before and after: {variable}'
+    cause = (diagnosis, proposal.sensor, _kinds_of(proposal))
+    return draw(f'formula-{proposal.sensor}', (8.6, 3.1), _against_cause, *cause, label=label)
 
 
 def draw_over_time(result: DiagnosisResult) -> Drawn:
@@ -187,8 +178,8 @@ def cause_of(
     Return (axis, label, values) for the plot of a residual against the cause of an effect.
 
     The axis of the sensor whose residual the effect changes most; and, among the variables whose
-    kind is in `against`, label and values of the one that explains most of this change. If it
-    explains less than `MIN_DRAWN_FIT`, the change itself takes its place.
+    kind is in `against`, label and values of the one that explains most of this change, (n,). If it
+    explains less than `MIN_DRAWN_FIT`, or there are few values, the change itself takes its place.
     """
     traces = diagnosis.traces
     change = traces.before[sensor] - traces.after[sensor]
@@ -352,28 +343,7 @@ def _sensor_section(
     `against`: label -> values of the variables; `first`: label of the variable shown first.
     """
     factor, unit = for_people(UNITS[sensor])
-    rows: list[dict[str, Any]] = []
-    segments = traces.segments.get(sensor)
-    if segments:
-        signals = _row(
-            f'Measured and simulated on the segment with the largest difference, {unit}',
-            lambda k: _chart(
-                f'{sensor} {AXES[k]}',
-                'time, s',
-                segments[k].time,
-                {name: signal * factor for name, signal in segments[k].signals.items()},
-            ),
-        )
-        differences = _row(
-            f'Measured minus simulated on that segment, {unit}',
-            lambda k: _chart(
-                f'{sensor} {AXES[k]}',
-                'time, s',
-                segments[k].time,
-                {when: segments[k].difference(f'simulated {when}') * factor for when in WHEN},
-            ),
-        )
-        rows += [signals, differences]
+    rows = _segment_rows(traces, sensor)
 
     def residuals(axis: int, points: slice = slice(None)) -> dict[str, np.ndarray]:
         """Return 'before', 'after' -> residual of an axis in the units of the page."""
@@ -416,6 +386,32 @@ def _sensor_section(
         for name, rms, noise in traces.distances[sensor].bands():
             bands.append((name, rms.T * factor, float(np.sqrt(np.mean(noise**2))) * factor))
     return {'sensor': sensor, 'unit': unit, 'bands': bands, 'rows': rows}
+
+
+def _segment_rows(traces: Traces, sensor: str) -> list[dict[str, Any]]:
+    """Return the rows of signals and differences on the segment of each axis, none without it."""
+    segments = traces.segments.get(sensor)
+    if not segments:
+        return []
+    factor, unit = for_people(UNITS[sensor])
+
+    def chart(axis: int, series: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        """Return the chart of series over the time of the segment."""
+        in_unit = {name: values * factor for name, values in series.items()}
+        return _chart(f'{sensor} {AXES[axis]}', 'time, s', segments[axis].time, in_unit)
+
+    return [
+        _row(
+            f'Measured and simulated on the segment with the largest difference, {unit}',
+            lambda k: chart(k, segments[k].signals),
+        ),
+        _row(
+            f'Measured minus simulated on that segment, {unit}',
+            lambda k: chart(
+                k, {when: segments[k].difference(f'simulated {when}') for when in WHEN}
+            ),
+        ),
+    ]
 
 
 def histogram(residuals: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:

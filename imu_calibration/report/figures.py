@@ -230,13 +230,18 @@ def decade(value: float) -> str:
 
 def axis_legend(axes: Any, where: str = 'upper right', **more: Any) -> None:
     """Draw the legend of the three sensor axes."""
+    handles = axis_handles(lw=0)
+    axes.legend(handles=handles, loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)
+
+
+def axis_handles(lw: float) -> list[Any]:
+    """Return the entries of the three sensor axes in a legend, with lines of a width."""
     from matplotlib.lines import Line2D
 
-    handles = [
-        Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=0, label=name)
+    return [
+        Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=lw, label=name)
         for name, colour in AXIS_COLOURS.items()
     ]
-    axes.legend(handles=handles, loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)
 
 
 def draw_tones(sensor: str, rest: Unexplained) -> str:
@@ -283,11 +288,13 @@ def lever_figure(calibration: Calibration) -> Drawn | None:
 
 def _views(figure, arms, cov):
     """Draw the sensitive points, mm, (3, 3), with ellipses of two sd in three views."""
+    # All views have one scale, that shows the points and, where they are close, their sds.
     limit = 1.25 * max(float(np.max(np.abs(arms))), 3 * float(np.sqrt(np.diag(cov).min())), 1e-3)
     for axes, (across, up) in zip(figure.subplots(1, 3), PLANES):
         axes.axhline(0, color=GREY, lw=0.6)
         axes.axvline(0, color=GREY, lw=0.6)
         for element, colour in enumerate(AXIS_COLOURS.values()):
+            # Of the nine arm components, row by row, those of this point in the view.
             index = [3 * element + across, 3 * element + up]
             _point(axes, arms.ravel()[index], cov[np.ix_(index, index)], 'xyz'[element], colour)
         axes.plot(0, 0, '+', color=INK, markersize=9, mew=1.3)

@@ -4,7 +4,7 @@ Effect of the errors in navigation.
 Dead reckoning from the windows of this recording, before and after calibration.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -132,6 +132,8 @@ def expected_growth(
     """
     static = np.flatnonzero(errors.kind == 'static')[:MAX_RUNS]
     time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
+    # Variances of constant errors, (n_runs, 2): of the parameters, different in each pose, and of
+    # the biases.
     forces = errors.true['accelerometer'][static]
     gravity = float(np.median(np.linalg.norm(forces, axis=1)))
     uncertainty = Uncertainty(result.calibration)
@@ -139,19 +141,10 @@ def expected_growth(
     force_sd = float(np.max(result.calibration.noise('accelerometer')[1]))
     rate_sd = float(np.max(result.calibration.noise('gyroscope')[1]))
     instabilities = np.tile([3 * force_sd**2, 2 * rate_sd**2], (len(static), 1))
-    force_density, rate_density = noise_densities(result)
-    force_density *= np.sqrt(3)
-    rate_density *= np.sqrt(2)
-    noise_velocity = np.hypot(
-        force_density * time**0.5, gravity * rate_density * time**1.5 / np.sqrt(3)
-    )
-    noise_position = np.hypot(
-        force_density * time**1.5 / np.sqrt(3), gravity * rate_density * time**2.5 / np.sqrt(20)
-    )
     parts = {
         'parameters': _constant_growth(time, constants, gravity),
         'instability of the biases': _constant_growth(time, instabilities, gravity),
-        'noise': Growth(time, noise_velocity[None], noise_position[None]),
+        'noise': _noise_growth(time, noise_densities(result), gravity),
     }
     velocity_variance = sum(part.velocity**2 for part in parts.values())
     position_variance = sum(part.position**2 for part in parts.values())
@@ -185,6 +178,16 @@ def _constant_growth(time: np.ndarray, variances: np.ndarray, gravity: float) ->
         velocity=np.hypot(force * time, gravity * rate * time**2 / 2),
         position=np.hypot(force * time**2 / 2, gravity * rate * time**3 / 6),
     )
+
+
+def _noise_growth(time: np.ndarray, densities: list[float], gravity: float) -> Growth:
+    """Return the Growth of white noise (`expected_growth`), one run; as of `noise_densities`."""
+    force, rate = densities
+    force *= np.sqrt(3)
+    rate *= np.sqrt(2)
+    velocity = np.hypot(force * time**0.5, gravity * rate * time**1.5 / np.sqrt(3))
+    position = np.hypot(force * time**1.5 / np.sqrt(3), gravity * rate * time**2.5 / np.sqrt(20))
+    return Growth(time, velocity[None], position[None])
 
 
 def noise_densities(result: CalibrationResult) -> list[float]:
@@ -264,14 +267,7 @@ def _at_origin(calibration: Calibration, ref: Reference) -> Reference:
     if arm is None:
         return ref
     force = ref.force_s + lever_matrix(ref.rate_s, ref.alpha_s) @ arm
-    return Reference(
-        time=ref.time,
-        mat_sn=ref.mat_sn,
-        force_s=force,
-        rate_s=ref.rate_s,
-        alpha_s=ref.alpha_s,
-        gravity=ref.gravity,
-    )
+    return replace(ref, force_s=force)
 
 
 def _growths(figure, before, after, parts):

@@ -11,7 +11,16 @@ from imu_calibration.allan.terms import predicted
 from imu_calibration.core.units import NOISE_QUANTITY, for_people
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
-from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, MARKER, Drawn, draw, log_axis
+from imu_calibration.report.figures import (
+    AXIS_COLOURS,
+    FAINT,
+    GREY,
+    MARKER,
+    Drawn,
+    axis_handles,
+    draw,
+    log_axis,
+)
 from imu_calibration.report.page import render
 
 
@@ -53,10 +62,7 @@ def _curves(figure, result, sensor):
     axes.set(xlabel='averaging time τ, s', ylabel=f'Allan deviation, {unit}')
     from matplotlib.lines import Line2D
 
-    handles = [
-        Line2D([], [], color=hue, marker=MARKER[name], markersize=4, lw=1.3, label=name)
-        for name, hue in AXIS_COLOURS.items()
-    ]
+    handles = axis_handles(lw=1.3)
     if any(result.record.trends[k] for k in columns):
         handles.append(Line2D([], [], color=GREY, ls=':', label='with its trends'))
     axes.legend(handles=handles, loc='upper right', ncols=len(handles))

@@ -57,7 +57,9 @@ def _box(axes, up):
     mat_ns = align(np.asarray(up, float))
     toward_viewer = np.cross(VIEW[0], VIEW[1])
     edges = np.diag(HALF_EDGES)
-    # The visible faces, by their normal in the sensor frame.
+    # The visible faces: those whose normal, an axis k of the sensor or its opposite, points to the
+    # viewer. A face has the half edge along its normal, and the corners at plus and minus the two
+    # other ones.
     for k, sign in itertools.product(range(3), (1.0, -1.0)):
         normal = sign * np.eye(3)[k]
         if (mat_ns @ normal) @ toward_viewer <= 0:
@@ -133,7 +135,7 @@ def _motion(figure, plan):
         else:
             unit = 'mm'
             values = 1000 * position[:, k]
-        # No line across the panel where an angle begins a new turn.
+        # No line across the panel where an angle goes on at the other end of its turn.
         steps = np.abs(np.diff(values, prepend=values[0]))
         axes.plot(
             time,
@@ -142,44 +144,35 @@ def _motion(figure, plan):
             lw=1.2,
             label=f'{name}, {unit}',
         )
-    bottom, top = axes.get_ylim()
-    begins = np.concatenate([[0.0], plan.ends[:-1]])
-    shown = set()  # kinds that are in the legend
-    for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True):
-        axes.fill_between(
-            [begin, end],
-            top,
-            top + 0.06 * (top - bottom),
-            color=KIND[motion.kind],
-            lw=0,
-            label=None if motion.kind in shown else str(motion.kind),
-        )
-        shown.add(motion.kind)
+    _kinds(axes, plan)
     axes.set(xlabel='time, s', ylabel='position')
     axes.legend(ncols=4, loc='upper center', bbox_to_anchor=(0.5, -0.16))
+
+
+def _kinds(axes, plan):
+    """Draw a band above the curves, in the colour of each motion's kind while it lasts."""
+    bottom, top = axes.get_ylim()
+    band_top = top + 0.06 * (top - bottom)
+    begins = np.concatenate([[0.0], plan.ends[:-1]])
+    labelled = set()  # kinds that are in the legend
+    for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True):
+        label = None if motion.kind in labelled else str(motion.kind)
+        axes.fill_between([begin, end], top, band_top, color=KIND[motion.kind], lw=0, label=label)
+        labelled.add(motion.kind)
 
 
 def _progress(figure, plan):
     """Draw a line for each parameter, the worst of all, the tolerance, and the least time."""
     axes = figure.subplots()
-    shown = set()  # sensors that are in the legend
     time = np.concatenate([[0.0], plan.ends])
-    history = plan.history
-    names = [
-        name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted
-    ]
-    for name, values in zip(names, history.T, strict=True):
+    history = plan.history  # a column for each requested parameter
+    labelled = set()  # sensors that are in the legend
+    for name, values in zip(itertools.compress(plan.model.param_names, plan.wanted), history.T):
         sensor = name.split('.')[0]
         colour = AXIS_COLOURS['x'] if sensor == SENSORS[0] else AXIS_COLOURS['z']
-        axes.plot(
-            time,
-            np.maximum(values, 1e-3),
-            color=colour,
-            lw=0.9,
-            alpha=0.6,
-            label=None if sensor in shown else sensor,
-        )
-        shown.add(sensor)
+        label = None if sensor in labelled else sensor
+        axes.plot(time, np.maximum(values, 1e-3), color=colour, lw=0.9, alpha=0.6, label=label)
+        labelled.add(sensor)
     axes.plot(time, history.max(axis=1), color=GREY, lw=2.2, label='worst of all')
     axes.axhline(1.0, color=FAINT, ls='--', lw=1.2)
     axes.annotate(

@@ -33,8 +33,10 @@ from imu_calibration.simulation.table_controller import TableController
 
 LOUDEST_HUM = 0.25
 """Rms of the machine's vibration on each axis in its loudest gear, m/s^2."""
-GEAR_AMPLITUDES, GEAR_SECONDS = (0.0, 1.0, 0.5, 0.0, 0.75), 11.0
-"""Relative amplitudes of the gears of the machine in their order, and time in each gear, s."""
+GEAR_AMPLITUDES = (0.0, 1.0, 0.5, 0.0, 0.75)
+"""Relative amplitudes of the gears of the machine, in their order."""
+GEAR_SECONDS = 11.0
+"""Time in each gear, s."""
 ALIASED = 0.31
 """Frequency of the vibration after aliasing, as a share of the sample rate."""
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting, text_setting
-from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints, free_limits
 from imu_calibration.simulation.motion_builder import Profile
 
@@ -345,12 +345,13 @@ class TableController:
         return JointMotion(time, *motion)
 
     def _profile_motion(self, time: np.ndarray) -> JointMotion:
-        """Return the motion of the joints before the first trajectory, at times of shape (m,)."""
+        """
+        Return the motion of the joints before the first trajectory, at times of shape (m,).
+
+        The times of the result are not set.
+        """
         if self._profile is None:
-            zero = np.zeros((len(time), len(self.joint_names)))
-            return JointMotion(
-                time, position=zero + self._home, rate=zero, acceleration=zero, jerk=zero
-            )
+            return rest_at(np.tile(self._home, (len(time), 1)))
         if not self._repeat:
             return self._profile.at(time)
         # Each repetition starts from the position at the end of the previous one.
