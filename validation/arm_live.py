@@ -271,12 +271,15 @@ def run(folder, plots):
     if importlib.util.find_spec('rclpy') is None:
         section.say('Skipped: rclpy is not installed.')
         return section
-    rows, bins, case, found = [], [], None, None
+    rows = []
+    bins = []
     for name in NAMES:
+        # The arm of one recording, the readings of the other one.
         arm_from = NAMES[1 - NAMES.index(name)]
         case = prepare(folder, name, arm_from, seconds=STRETCH_S)
         found, count = residuals(case, play(case))
-        before, after, ahead = rms(found['turned']), rms(found['moved']), looking_ahead(case)
+        before = rms(found['turned'])
+        after = rms(found['moved'])
         lost = 2 * len(case.imu_a) - sum(count.values())
         section.claim(
             f"{name}: one IMU predicts another's accelerometer live, rms without and with the arm",
@@ -290,27 +293,23 @@ def run(folder, plots):
             f'{lost} of {2 * len(case.imu_a)}',
             lost == 0,
         )
-        per_axis = [
-            f'{rms(found[which][:, k]):.2f}' for which in ('turned', 'moved') for k in range(3)
-        ]
-        lengths = [f'{typical(found[which]):.1f}' for which in ('turned', 'moved')]
-        rows.append(
-            (
-                name,
-                str(len(found['moved'])),
-                *per_axis,
-                *lengths,
-                f'{after:.2f}',
-                *(f'{rms(ahead[which]):.2f}' for which in ahead),
-            )
-        )
+
+        # Without and with the arm by axis and by length, then predictions that look ahead.
+        per_axis = []
+        lengths = []
+        for which in ('turned', 'moved'):
+            per_axis += [f'{rms(column):.2f}' for column in found[which].T]
+            lengths.append(f'{typical(found[which]):.1f}')
+        ahead = [f'{rms(residual):.2f}' for residual in looking_ahead(case).values()]
+        n_samples = str(len(found['moved']))
+        rows.append((name, n_samples, *per_axis, *lengths, f'{after:.2f}', *ahead))
         bins.append((name, *by_rate(case, found)))
-    axes = [f'{when} {k}' for when in ('before', 'after') for k in 'xyz']
     section.table(
         (
             'recording',
             'samples',
-            *axes,
+            *(f'before {axis}' for axis in 'xyz'),
+            *(f'after {axis}' for axis in 'xyz'),
             'before, median length',
             'after, median length',
             'after, all',
@@ -334,7 +333,7 @@ def run(folder, plots):
             guard=GUARD,
         )
     )
-    _draw(section, plots, case, found)
+    _draw(section, plots, case, found)  # of the last recording
     return section
 
 

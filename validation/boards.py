@@ -29,25 +29,26 @@ def design_mm(folder, name, pair):
 
 def run(folder, plots):
     """Return the section."""
-    section, pairs = (
-        Section('Arms between IMUs on one board (array_2, array_5)'),
-        list(combinations(BOARD, 2)),
-    )
+    section = Section('Arms between IMUs on one board (array_2, array_5)')
+    pairs = list(combinations(BOARD, 2))
     arms = {name: arms_of(folder, name, pairs) for name in NAMES}
-    errors = {
-        name: np.array(
+
+    # Errors of the arms in each recording, mm, shape (n_pairs, 3).
+    errors = {}
+    for name in NAMES:
+        errors[name] = np.array(
             [1e3 * arms[name][pair].arm - design_mm(folder, name, pair) for pair in pairs]
         )
-        for name in NAMES
-    }
-    apart = errors[NAMES[1]] - errors[NAMES[0]]
-    worst = max(np.max(np.linalg.norm(e, axis=1)) for e in errors.values())
+    worst = max(np.max(np.linalg.norm(error, axis=1)) for error in errors.values())
     section.claim(
         'arm of every pair against the design, length of the difference',
         'within 1 mm',
         f'at most {worst:.2f} mm',
         worst < 1.0,
     )
+
+    # Differences between the recordings, in their sds.
+    apart = errors[NAMES[1]] - errors[NAMES[0]]
     expected = np.array(
         [1e3 * np.hypot(*(arms[name][pair].arm_sd for name in NAMES)) for pair in pairs]
     )
@@ -59,17 +60,19 @@ def run(folder, plots):
         f' mm, sds {expected.min():.2f} to {expected.max():.2f} mm',
         in_sd.max() < 3.0,
     )
-    ratios = np.array(
-        [
-            np.linalg.norm(arms[n][p].arm) / np.linalg.norm(design_mm(folder, n, p)) * 1e3
-            for n in NAMES
-            for p in pairs
-        ]
-    )
+
+    # Lengths over those of the design, and the clipped part of the moving time.
+    ratios = []
+    shares = []
+    for name in NAMES:
+        for pair in pairs:
+            length = np.linalg.norm(arms[name][pair].arm)
+            ratios.append(length / np.linalg.norm(design_mm(folder, name, pair)) * 1e3)
+            shares.append(arms[name][pair].diagnostics['clipped_share'])
     section.claim(
         'baselines against the design',
         'a plain derivative makes them 2 to 6 % too long',
-        f'{100 * (ratios.min() - 1):+.1f} to {100 * (ratios.max() - 1):+.1f} %',
+        f'{100 * (min(ratios) - 1):+.1f} to {100 * (max(ratios) - 1):+.1f} %',
     )
     rows = []
     for k, pair in enumerate(pairs):
@@ -95,7 +98,6 @@ def run(folder, plots):
         ),
         rows,
     )
-    shares = [arms[name][pair].diagnostics['clipped_share'] for name in NAMES for pair in pairs]
     section.say(
         text(
             'boards', expected=_rms(np.linalg.norm(expected, axis=1)), clipped=100 * np.mean(shares)

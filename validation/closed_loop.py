@@ -217,43 +217,14 @@ def run(names, seed, profile='random'):
     """Print a line for each loop and return the rows."""
     rows = []
     for seed, (name, make) in enumerate(measured_sessions(names, profile), seed):
-        start, found = time.process_time(), []
+        start = time.process_time()
+        found = []
         try:
-            measured = make(seed)
-            first = diagnose(measured.samples, measured.table)
-            sizes = {
-                effect: {part: value for part, (value, _) in own.items()}
-                for effect, own in sizes_of(first).items()
-            }
-            found.append(
-                {'cause': name, 'kind': 'formula' if name in TEMPLATES else 'effect'}
-                | compared(sizes, first.proposed or first.calibration, measured, seed + 1000)
-            )
-            for finding in first.findings:
-                for mate in finding.indistinguishable_from:
-                    other = exchanged(first.calibration, finding, mate, measured)
-                    if other is not None:
-                        expected = {
-                            name: own
-                            for name, own in values_of(other).items()
-                            if name == mate or name in sizes
-                        }
-                        found.append(
-                            {'cause': f'{mate} for {finding.effect}', 'kind': 'pair'}
-                            | compared(expected, other, measured, seed + 2000)
-                        )
+            for row in _loops(name, make(seed), seed):
+                found.append(row)
         except ImuCalibrationError as error:
-            found.append(
-                {
-                    'cause': name,
-                    'kind': 'refused',
-                    'found': [],
-                    'again': [],
-                    'new': [],
-                    'z': [],
-                    'why': str(error),
-                }
-            )
+            nothing = {'found': [], 'again': [], 'new': [], 'z': []}
+            found.append({'cause': name, 'kind': 'refused', **nothing, 'why': str(error)})
         for row in found:
             print(
                 f'{row["cause"]}: found {", ".join(row["found"]) or "-"}; again'
@@ -266,20 +237,48 @@ def run(names, seed, profile='random'):
     return rows
 
 
+def _loops(name, measured, seed):
+    """
+    Yield the row of a session, and one of each effect that is collinear with a finding.
+
+    The loop of such a mate begins with the calibration that has it in place of the finding.
+    """
+    first = diagnose(measured.samples, measured.table)
+    sizes = {}  # effect -> parameter -> value
+    for effect, sizes_of_effect in sizes_of(first).items():
+        sizes[effect] = {part: value for part, (value, _) in sizes_of_effect.items()}
+    yield {'cause': name, 'kind': 'formula' if name in TEMPLATES else 'effect'} | compared(
+        sizes, first.proposed or first.calibration, measured, seed + 1000
+    )
+    for finding in first.findings:
+        for mate in finding.indistinguishable_from:
+            other = exchanged(first.calibration, finding, mate, measured)
+            if other is None:
+                continue
+            expected = {
+                effect: values
+                for effect, values in values_of(other).items()
+                if effect == mate or effect in sizes
+            }
+            yield {'cause': f'{mate} for {finding.effect}', 'kind': 'pair'} | compared(
+                expected, other, measured, seed + 2000
+            )
+
+
 def table_of_rows(rows):
     """Return the summary as a Markdown table."""
     lines = []
     for kind in ('effect', 'formula', 'pair'):
-        own = [row for row in rows if row['kind'] == kind]
-        named = [row for row in own if row['found']]
-        z = np.array([value for row in own for value in row['z']])
+        of_kind = [row for row in rows if row['kind'] == kind]
+        named = [row for row in of_kind if row['found']]
+        z = np.array([value for row in of_kind for value in row['z']])
         lines.append(
             (
                 kind,
-                str(len(own)),
+                str(len(of_kind)),
                 str(len(named)),
                 str(sum(row['again'] == row['found'] for row in named)),
-                str(sum(bool(row['new']) for row in own)),
+                str(sum(bool(row['new']) for row in of_kind)),
                 '–' if not z.size else f'{np.sqrt(np.mean(z**2)):.2f}',
                 '–' if not z.size else f'{np.mean(np.abs(z) < 2):.2f} of {z.size}',
             )

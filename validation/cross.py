@@ -215,7 +215,7 @@ def run(folder, plots):
                 'at most 1.5 in every group',
                 ', '.join(f'{group} {value:.1f}' for group, value in groups.items()),
                 max(groups.values()) <= 1.5,
-                True,
+                headline=True,
             )
     for name in RECORDINGS:
         for made, used in ((0, 1), (1, 0)):
@@ -234,7 +234,7 @@ def run(folder, plots):
         'at most 1.5 in every group',
         ', '.join(f'{group} {value:.2f}' for group, value in groups.items()),
         max(groups.values()) <= 1.5,
-        True,
+        headline=True,
     )
     for what, found, noticed in must_be_refused(folder):
         section.claim(

@@ -172,26 +172,31 @@ def off_faces(imu, ranges):
 
 
 def _verdict(interval, better='ours', other='norm fit'):
-    return better if interval[0] > 0 else other if interval[1] < 0 else 'no difference seen'
+    if interval[0] > 0:
+        return better
+    return other if interval[1] < 0 else 'no difference seen'
 
 
 def run(folder, plots):
     """Return the section."""
     section = Section('Who predicts better: poses that took no part')
-    rows, few, faces, everything = [], [], [], {}
+    rows = []  # every pose left out once
+    few = []  # few poses for the fit
+    faces = []
+    errors_of = {}  # recording -> errors of the poses that were left out
     for name, topic in BY_HAND:
-        rng, gravity, imu = (
-            np.random.default_rng(SEED),
-            gravity_of(folder, name),
-            load(folder, name, topic),
-        )
+        rng = np.random.default_rng(SEED)
+        gravity = gravity_of(folder, name)
+        imu = load(folder, name, topic)
+        recording = label(name, topic)
         ranges = find_still(imu)
-        values, interval, everything[label(name, topic)] = leave_one_out(imu, ranges, gravity, rng)
-        rows.append(_row(label(name, topic), len(ranges), values, interval))
+        values, interval, errors_of[recording] = leave_one_out(imu, ranges, gravity, rng)
+        rows.append(_row(recording, len(ranges), values, interval))
         values, (ratio, interval) = few_poses(imu, ranges, gravity, rng)
-        shown = f'{ratio:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]'
-        few.append((*_start(label(name, topic), FEW, values), shown, _verdict(np.log(interval))))
-        faces.append((label(name, topic), f'{off_faces(imu, ranges).max():.0f} deg'))
+        ratio_text = f'{ratio:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]'
+        # The logarithm of the ratio is 0 where both are equally good.
+        few.append((*_start(recording, FEW, values), ratio_text, _verdict(np.log(interval))))
+        faces.append(f'{off_faces(imu, ranges).max():.0f} deg ({recording})')
     head = (
         'recording',
         'poses',
@@ -206,11 +211,9 @@ def run(folder, plots):
     section.say(text('held_out_few', splits=SPLITS, few=FEW))
     section.table((*head[:5], 'norm fit / ours [95 %]', 'better'), few)
     _six_faces(section, folder)
-    section.say(
-        text('held_out_imucal', faces=', '.join(f'{angle} ({name})' for name, angle in faces))
-    )
+    section.say(text('held_out_imucal', faces=', '.join(faces)))
     _count(section, rows, few)
-    _draw(section, plots, everything)
+    _draw(section, plots, errors_of)
     return section
 
 
@@ -232,22 +235,16 @@ def _row(name, count, values, interval):
 
 
 def _six_faces(section, folder):
-    errors, rng = faces_and_the_rest(folder), np.random.default_rng(SEED)
+    errors = faces_and_the_rest(folder)
+    rng = np.random.default_rng(SEED)
     rows = []
     for name in ('uncalibrated', 'norm fit', 'imucal', 'ours'):
         if name in errors:
-            interval = (
-                1e3 * bootstrap_difference(errors['ours'], errors[name], rng)
-                if name != 'ours'
-                else None
-            )
-            rows.append(
-                (
-                    name,
-                    f'{1e3 * rms(errors[name]):.2f}',
-                    '' if interval is None else f'[{interval[0]:+.2f}, {interval[1]:+.2f}]',
-                )
-            )
+            minus_ours = ''
+            if name != 'ours':
+                low, high = 1e3 * bootstrap_difference(errors['ours'], errors[name], rng)
+                minus_ours = f'[{low:+.2f}, {high:+.2f}]'
+            rows.append((name, f'{1e3 * rms(errors[name]):.2f}', minus_ours))
     section.say(text('held_out_faces', rests=len(errors['ours'])))
     section.table(('method', 'rms of the rests, mm/s²', 'minus ours [95 %]'), rows)
 

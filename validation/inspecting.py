@@ -23,10 +23,16 @@ def remarks(lines):
     return [line for line in below if line not in good] + [f'good      {names}'] * bool(good)
 
 
+def indented(lines):
+    """Return lines with an indentation."""
+    return [f'  {line}' for line in lines]
+
+
 def run(folder, plots):
     """Return the section."""
     section = Section('Pre-flight: `inspect` on every recording')
-    quoted, codes, refused = [], [], 0
+    quoted = []
+    refused = 0
     with TemporaryDirectory() as work:
         for name, topic in ALL:
             options = options_of(folder, name, topic, work)
@@ -35,41 +41,44 @@ def run(folder, plots):
                 at = options.index('--table')
                 del options[at : at + 2]
             code, lines, error = run_verb('inspect', folder / name, options)
-            codes.append(code)
-            refused += code == 1
-            quoted += [
-                f'{label(name, topic)}: exit code {code}',
-                *(f'  {line}' for line in ([error] if code == 1 else remarks(lines))),
-            ]
-        bare = run_verb('inspect', folder / 'xsens_counts', [])
-        several = run_verb('inspect', folder / SEVERAL, [])
-        quoted += [
-            '',
-            f'xsens_counts without --nominal: exit code {bare[0]}',
-            *(f'  {line}' for line in remarks(bare[1])),
-            '',
-            f'{SEVERAL} without --imu-topic: exit code {several[0]}',
-            *(f'  {line}' for line in remarks(several[1])),
-        ]
+            shown = remarks(lines)
+            if code == 1:
+                refused += 1
+                shown = [error]
+            quoted += [f'{label(name, topic)}: exit code {code}', *indented(shown)]
+
+    # A recording in counts without its units, and one with several IMUs of which none is chosen.
+    bare_code, bare_lines, _ = run_verb('inspect', folder / 'xsens_counts', [])
+    several_code, several_lines, _ = run_verb('inspect', folder / SEVERAL, [])
+    quoted += [
+        '',
+        f'xsens_counts without --nominal: exit code {bare_code}',
+        *indented(remarks(bare_lines)),
+        '',
+        f'{SEVERAL} without --imu-topic: exit code {several_code}',
+        *indented(remarks(several_lines)),
+    ]
     section.claim(
         'every recording is read',
         f'{len(ALL)} of {len(ALL)}',
         f'{len(ALL) - refused} of {len(ALL)}',
         refused == 0,
     )
+    names_counts = any('count' in line for line in bare_lines)
     section.claim(
         'counts are noticed when nobody says so',
         'named',
-        'named' if any('count' in line for line in bare[1]) else 'not named',
-        any('count' in line for line in bare[1]),
+        'named' if names_counts else 'not named',
+        names_counts,
     )
-    topics = [line.split()[0] for line in several[1] if line.startswith('/imu') and ' ' in line]
-    looked_at = [line for line in several[1] if line in topics]
+    # Rows of the table of topics, and headings of the topics that were inspected.
+    topics = [line.split()[0] for line in several_lines if line.startswith('/imu') and ' ' in line]
+    looked_at = [line for line in several_lines if line in topics]
     section.claim(
         'several topics, none chosen: every one is looked at',
         f'{len(topics)} of {len(topics)}, exit code 3: their gyroscopes clip',
-        f'{len(looked_at)} of {len(topics)}, exit code {several[0]}',
-        looked_at == topics and several[0] == 3,
+        f'{len(looked_at)} of {len(topics)}, exit code {several_code}',
+        looked_at == topics and several_code == 3,
     )
     section.say(text('inspecting'))
     section.quote(quoted)

@@ -65,7 +65,9 @@ def outcome(cause, options):
 
 def run(folder, plots):
     """Return the section."""
-    section, rows, improved = Section('Worlds with causes outside the catalogue'), [], []
+    section = Section('Worlds with causes outside the catalogue')
+    rows = []
+    improved = []  # whether each sensor that is helped improves
     for cause, table, options in worlds()[WORLDS]:
         cells, helps = outcome(cause, options)
         improved += helps
@@ -76,7 +78,7 @@ def run(folder, plots):
         'all of them',
         f'{sum(improved)} of {len(improved)}',
         all(improved),
-        True,
+        headline=True,
     )
     section.say(text('misfit'))
     section.table(

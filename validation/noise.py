@@ -102,16 +102,19 @@ def interval_of_share(counts, seed=0):
 
 def run(folder, plots):
     """Return the section."""
-    section, rows, counts = Section('Noise at rest: one half predicts the other'), [], []
+    section = Section('Noise at rest: one half predicts the other')
+    rows = []
+    counts = []  # points (inside, all) of each recording
+    axes = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
     for name, topic in RESTING:
         try:
             found = compare(load(folder, name, topic))
         except InputError as error:
             rows.append((label(name, topic), 'refused: ' + str(error).partition(';')[0], ''))
             continue
+        # Only axes whose curve the model explains.
         explained = [points for points, excess in found if excess == 1]
         counts.append((sum(points.sum() for points in explained), sum(map(len, explained))))
-        axes = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
         strange = [
             f'{axis} ({np.sqrt(excess):.1f} times)'
             for axis, (_, excess) in zip(axes, found)
@@ -124,7 +127,8 @@ def run(folder, plots):
                 ', '.join(strange),
             )
         )
-    (inside, every), (least, most) = np.sum(counts, axis=0), interval_of_share(np.array(counts))
+    inside, every = np.sum(counts, axis=0)
+    least, most = interval_of_share(np.array(counts))
     section.claim(
         'noise fitted to the first half: Allan variances of the second inside their 95 % bands',
         f'at least {INSIDE:.0%}',

@@ -172,9 +172,10 @@ def run(folder, plots):
     calibration = calibrate_through_a_bag(imu, joints)
     rows = [row for row in compare(calibration) if row[-1] != 'held']
     ratio = np.array([(value - true) / sd for _, value, true, sd, _ in rows])
-    asked = [
-        status for name, *_, status in rows if 'size_effect' not in name and 'lever_arm' not in name
-    ]
+    statuses = []  # of biases and matrices
+    for name, *_, status in rows:
+        if 'size_effect' not in name and 'lever_arm' not in name:
+            statuses.append(status)
     section.claim(
         'truth of python-ins within three of our standard deviations',
         f'all {len(rows)} parameters that are not held',
@@ -185,15 +186,14 @@ def run(folder, plots):
     section.claim(
         'biases and matrices are all determined',
         '24 of 24',
-        f'{asked.count("determined")} of 24',
-        asked.count('determined') == 24,
+        f'{statuses.count("determined")} of 24',
+        statuses.count('determined') == 24,
     )
-    tilt = [
-        (n, v, s)
-        for n, v, s in zip(calibration.param_names, calibration.values, calibration.sd)
-        if 'table_tilt' in n
-    ]
-    size, sd = np.degrees(np.hypot(*(v for _, v, _ in tilt))), np.degrees(max(s for *_, s in tilt))
+
+    # The tilt has two components.
+    is_tilt = ['table_tilt' in name for name in calibration.param_names]
+    size = np.degrees(np.hypot(*calibration.values[is_tilt]))
+    sd = np.degrees(max(calibration.sd[is_tilt]))
     true = np.hypot(*TILT_DEG)
     section.claim(
         'tilt of the table, size',

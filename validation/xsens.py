@@ -44,7 +44,8 @@ def run(folder, plots):
     """Return the section."""
     section = Section('Raw counts: Xsens MTi (xsens_counts)')
     found, differences = figures(folder)
-    (offset, scale), (offset_w, scale_w) = differences['accelerometer'], differences['gyroscope']
+    offset, scale = differences['accelerometer']
+    rate_offset, rate_scale = differences['gyroscope']
     section.claim(
         'xsens_counts: accelerometer offsets against the factory',
         'within 10 counts',
@@ -60,11 +61,13 @@ def run(folder, plots):
     section.claim(
         'gyroscope scale factors against the factory',
         'within 0.3 %',
-        f'{listed(100 * scale_w, 2)} %',
-        np.max(np.abs(scale_w)) < 0.003,
+        f'{listed(100 * rate_scale, 2)} %',
+        np.max(np.abs(rate_scale)) < 0.003,
     )
     section.claim(
-        'gyroscope offsets against the factory', 'another turn-on', f'{listed(offset_w, 1)} counts'
+        'gyroscope offsets against the factory',
+        'another turn-on',
+        f'{listed(rate_offset, 1)} counts',
     )
     statistics = found.statistics
     section.claim(

@@ -295,13 +295,14 @@ def _stated_noise(options: CalibrationOptions, grade: str, imu_rate: float) -> d
 def notes_on(table: Table) -> list[str]:
     """Return the notes of a plan for a table, a line each."""
     lines = [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(table))]
-    # No motion determines the scales better than gravity is known.
+    # No motion determines the scales better than gravity is known. The remedies are listed by sets
+    # of terms, here the one of gravity.
     gravity_sd = table.gravity_sd_value
     if gravity_sd >= STANDARD_GRAVITY_SD:
         share = gravity_sd / table.gravity_value
         lines.append(
             f'warning: the scales of the accelerometer are known to {100 * share:.2g} %, as'
-            f' gravity is; {REMEDIES[(GRAVITY,)]}'
+            f' gravity is; {REMEDIES[GRAVITY,]}'
         )
     return lines
 

@@ -166,6 +166,7 @@ def simulate(
         seed=imu_seed,
         catalogue=catalogue_of(catalogue),
     )
+    # The point at which a given calibration was linearised is no part of the truth.
     for name in effects:
         sensor, hidden_size = hidden_effect(
             model, name, imu_seed, share=size, moment=0.6 * motion.duration

@@ -46,7 +46,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.preprocessing.checks import Preflight, visible_findings
     from imu_calibration.preprocessing.sample_recording import read_recording
 
-    # Read both IMUs; joints are not used.
+    # Read both IMUs, with their faults; joints are not used.
     topics_of_both = _topics_of_both(options)
     choices = options.choices()
     readings = readings_of(choices)

@@ -46,6 +46,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.preprocessing.checks import refuse
 
+    # All topics, then findings and calibration of each IMU.
     hints = options.hints()
     summaries = inspect_imus(existing(options.bag), options.stand(), options.choices())
     out = Terminal.of()
@@ -65,6 +66,8 @@ def run(options: Options) -> VerbResult:
         missing = _show_calibration(out, summary, hints)
         codes.append(summary.exit_code or (3 if missing else 0))
         reasons += [*summary.reasons, *missing]
+
+    # Topics that belong together, and the exit code.
     for pair in split_topics(summaries):
         out.print()
         out.print(

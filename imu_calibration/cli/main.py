@@ -70,6 +70,7 @@ class ProgressBars:
             self._begin_phase(phase)
         if not self._streams[1].isatty():
             return
+        # One bar for all phases, which a thread draws.
         if self._bar is None:
             from tqdm import tqdm
 
@@ -156,7 +157,7 @@ def run(options: Namespace) -> int:
     reasons = ()
     try:
         with contextlib.ExitStack() as stack:
-            if options.json or options.quiet:
+            if options.json or options.quiet:  # the lines of the verb are not shown
                 stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
             if not options.quiet:
                 bars = stack.enter_context(ProgressBars(verbose=options.verbose))

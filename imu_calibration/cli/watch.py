@@ -221,7 +221,12 @@ def ratio_of(status: NodeStatus) -> float:
 
 
 def bar(ratio: float, width: int = BAR) -> str:
-    """Return a bar that shrinks with the uncertainty of a parameter; ``|`` marks its tolerance."""
+    """
+    Return a bar that shrinks with the uncertainty of a parameter; ``|`` marks its tolerance.
+
+    Its share of the width is ``ln(ratio / EMPTY_RATIO) / ln(FULL_RATIO / EMPTY_RATIO)``, with the
+    uncertainty in tolerances (`ratio`); question marks where that is NaN.
+    """
     span = math.log(FULL_RATIO / EMPTY_RATIO)
     tick = round(width * math.log(1 / EMPTY_RATIO) / span)
     if math.isnan(ratio):

@@ -6,6 +6,7 @@ The IMU is judged apart from table and clock, in one convention of axes and orig
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -353,13 +354,14 @@ def _compared(
     in_other_axes = np.array([errors.get(name, 0.0) for name in common]) > sd
     excluded = not_estimated | in_other_axes
 
-    # 3. A row for each parameter.
+    # 3. A row for each parameter; without any known uncertainty no ratio has a meaning.
     units = {}
     for effect in first.model.effects:
         for k, name in enumerate(effect.param_names()):
             units[name] = effect.unit_of(k)
     rows = []
     for k, name in enumerate(common):
+        ratio = None if excluded[k] or not n_known else _ratio(difference[k], sd[k])
         rows.append(
             Row(
                 name,
@@ -367,11 +369,12 @@ def _compared(
                 second=float(second.values[index_second[k]]),
                 sd=float(sd[k]),
                 unit=units[name],
-                ratio=None if excluded[k] or not n_known else _ratio(difference[k], sd[k]),
+                ratio=ratio,
             )
         )
 
-    # 4. Tests. Table and clock are judged separately: they are no property of the IMU.
+    # 4. Tests, with both uncertainties. Table and clock are judged separately: they are no property
+    #    of the IMU.
     groups = _groups(common, difference, covariance, ~excluded) if n_known == 2 else []
     effects_of_reference = [e for e in first.model.effects if e.section == 'reference']
     names_of_reference = {'.'.join(effect.key) for effect in effects_of_reference}
@@ -380,7 +383,7 @@ def _compared(
     rejected_reference = _holm(of_reference)
     rejected = _holm(of_imu)
 
-    # 5. The verdict as text.
+    # 5. What differs, what was not compared, and the verdict as text.
     lines = list(notes)
     differences = []
     for group in groups:
@@ -399,31 +402,40 @@ def _compared(
         lines.append(
             f'{n_not_estimated} parameters are held or fixed in one of them and were not compared'
         )
-    if in_other_axes.any():
-        names = [name for name, is_turned in zip(common, in_other_axes) if is_turned]
+    names_in_other_axes = list(compress(common, in_other_axes))
+    if names_in_other_axes:
         lines.append(
             f'not compared, because their axes differ by {np.degrees(angle):.2g} deg:'
-            f' {listed(names)}'
+            f' {listed(names_in_other_axes)}'
         )
     if of_reference:
         word = 'differ' if rejected_reference else 'agree'
         lines.append(f'table and clock {word}, which is no property of the IMU')
-    if of_imu:
-        verdict = 'the calibrations disagree' if rejected else 'the calibrations agree'
-        if in_other_axes.any():
-            verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'
-    else:
-        cause = 'no parameter of the IMU is determined in both'
-        if n_known < 2:
-            cause = 'the uncertainties of imported values are unknown'
-        verdict = f'agreement of the calibrations cannot be tested: {cause}'
+    agree = not rejected if of_imu else None
     return Comparison(
         rows=tuple(rows),
-        agree=not rejected if of_imu else None,
-        lines=(*lines, verdict),
+        agree=agree,
+        lines=(*lines, _verdict(agree, len(names_in_other_axes), n_known)),
         reference_agree=not rejected_reference if of_reference else None,
         differences=tuple(differences),
     )
+
+
+def _verdict(agree: bool | None, n_in_other_axes: int, n_known: int) -> str:
+    """
+    Return whether two calibrations agree as text; `agree`: None where that cannot be tested.
+
+    `n_known`: number of calibrations with a known uncertainty.
+    """
+    if agree is None:
+        cause = 'no parameter of the IMU is determined in both'
+        if n_known < 2:
+            cause = 'the uncertainties of imported values are unknown'
+        return f'agreement of the calibrations cannot be tested: {cause}'
+    verdict = 'the calibrations agree' if agree else 'the calibrations disagree'
+    if n_in_other_axes:
+        verdict += f'; {n_in_other_axes} parameters in other axes were not compared'
+    return verdict
 
 
 def _ratio(difference: float, sd: float) -> float:

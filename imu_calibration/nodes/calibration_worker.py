@@ -563,7 +563,7 @@ class CalibrationWorker(threading.Thread):
             diagnosis=self.live.diagnosed(diagnosis),
         )
 
-        # Decision, texts and figures of the last solution.
+        # Figures of the session; decision, texts and figures of the last solution.
         lines: list[str] = []
         values = {
             self.gathered: self.live.n_windows,

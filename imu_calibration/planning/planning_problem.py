@@ -143,6 +143,16 @@ class PlanningProblem:
             seconds[start, end] = sum(segment.duration for segment in segments)
         return seconds
 
+    @cached_property
+    def visits(self) -> list[tuple[list[PlannedWindow], float]]:
+        """(windows, length in s) of each motion without its move, and of each move with windows."""
+        motions = zip(self.windows, self.seconds.tolist(), strict=True)
+        visits = [(windows, length) for windows, length in motions if length > 0]
+        for key, windows in self.move_windows.items():
+            if windows:
+                visits.append((windows, float(self.move_seconds[key])))
+        return visits
+
     def move_information(self, place: int) -> np.ndarray:
         """
         Return the information about z and the biases in the move from a place to each motion.
@@ -312,18 +322,14 @@ class PlanningProblem:
         `share` of the biases' covariance is common to a session of at most `session` s; `factor`:
         on the variance of the noise within windows.
         """
-        moves = [key for key, windows in self.move_windows.items() if windows]
-        motions = np.flatnonzero(self.seconds > 0)
-        visits = [self.windows[number] for number in motions]
-        visits += [self.move_windows[key] for key in moves]
         # Upper bound of the information of each visit.
-        information = np.zeros((len(visits), *self.coordinates.prior_information.shape))
-        for number, windows in enumerate(visits):
+        information = np.zeros((len(self.visits), *self.coordinates.prior_information.shape))
+        for number, (windows, _) in enumerate(self.visits):
             for window in windows:
                 information[number] += additive_bound(
                     window, self.noise, share=1.0 - share, factor=factor
                 )
-        seconds = np.concatenate([self.seconds[motions], [self.move_seconds[key] for key in moves]])
+        seconds = np.array([length for _, length in self.visits])
         prior = self.prior
         rows = self.coordinates.requested_rows
         if share:
@@ -412,11 +418,8 @@ class PlanningProblem:
         For the bound every motion fills the whole time, all at once, and the biases are independent
         between windows.
         """
-        visits = list(zip(self.windows, self.seconds.tolist(), strict=True))
-        for key, windows in self.move_windows.items():
-            visits.append((windows, float(self.move_seconds[key])))
         information = self.prior
-        for windows, length in visits:
+        for windows, length in self.visits:
             if windows:
                 per_visit = sum(additive_bound(window, self.noise) for window in windows)
                 n_visits = max(seconds / length, 1.0)

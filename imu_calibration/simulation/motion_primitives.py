@@ -200,7 +200,12 @@ def _table(
     }
 
 
-GIMBALS = _table([AXIS_VECTORS[axis] for axis in 'ZYX'])
+def _gimbals(order: str, up_axis: str) -> dict[str, Any]:
+    """Return a table with axes in an order from the base, e.g. 'ZYX', and its vertical."""
+    return _table([AXIS_VECTORS[axis] for axis in order], AXIS_VECTORS[up_axis])
+
+
+GIMBALS = _gimbals('ZYX', 'Z')
 
 
 def avrutov_rates_deg(sample: int) -> np.ndarray:
@@ -293,11 +298,6 @@ SKEW_60_RPY_DEG = np.degrees(
 A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three
 sensor axes.
 """
-
-
-def _gimbals(order: str, up_axis: str) -> dict[str, Any]:
-    """Return a table with axes in an order from the base, e.g. 'ZYX', and its vertical."""
-    return _table([AXIS_VECTORS[axis] for axis in order], AXIS_VECTORS[up_axis])
 
 
 PAPER_PROFILES: dict[str, ProfileEntry] = {
