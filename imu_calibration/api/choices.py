@@ -221,7 +221,7 @@ def readings_of(choices: Mapping[str, Any]) -> RawReadings | None:
     stated = _stated(choices)
     if nominal is None and not any(stated.values()):
         return None
-    # What is described, and then what is stated, but not both for one sensor.
+    # The described readings with the stated units; both for one sensor are refused.
     mapping: Mapping[str, Any] = {}
     if isinstance(nominal, RawReadings):
         mapping = nominal.to_mapping()

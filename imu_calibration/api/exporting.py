@@ -80,7 +80,8 @@ def export_calibration(
     figures = None if noise is None else files.read_noise(noise)
     motion = None
     if bag is not None:
-        # Of a text log: quantities whose units the calibration describes are not converted twice.
+        # Text logs: the calibration converts the quantities with described units, so that the log
+        # must not.
         raw_quantities = log_options(calibration.readings, {}).raw
         topics = topics._replace(log=replace(topics.log, raw=raw_quantities))
         motion = _motion(calibration, bag, stand, topics=topics, exclude=exclude)

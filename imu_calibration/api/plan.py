@@ -126,7 +126,7 @@ class Planned:
         require_no_plan(folder, report=report, force=force)
         place = files.make_folder(folder)
         moves_joints = bool(self.plan.moved_joints)
-        # Made before anything is replaced: an error leaves the earlier plan as it is.
+        # Made before a file is replaced: after an error the earlier plan is unchanged.
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
 

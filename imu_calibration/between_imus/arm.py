@@ -140,7 +140,7 @@ def _fit_arm(rows: ArmRows) -> Fit:
     force_delay_column = -rows.force_slope[:, :, None]
 
     # The column of the rates' delay is proportional to the arm: the first fit is made without it,
-    # the others with the arm of the fit before.
+    # each further one with the arm of the fit before.
     without_rate_delay = np.concatenate([lever, bias_columns, force_delay_column], axis=2)
     robust = _robust_fit(without_rate_delay, rows.difference, rows.alpha_noise)
     for _ in range(2):

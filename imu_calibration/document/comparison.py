@@ -383,7 +383,7 @@ def _compared(
     rejected_reference = _holm(of_reference)
     rejected = _holm(of_imu)
 
-    # 5. What differs, what was not compared, and the verdict as text.
+    # 5. Differences, omitted parameters and verdict as text.
     lines = list(notes)
     differences = []
     for group in groups:

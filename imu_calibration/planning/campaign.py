@@ -482,12 +482,12 @@ def with_finding(
     effect = next(each for each in model.effects if (each.sensor, each.name) == cause)
     values = model.start_from(calibration.model, calibration.values)
     values[model.slices[cause]] = [sizes.get(name, 0.0) for name in effect.param_names()]
-    # Covariance and status: those of the prior for the effect, of the calibration for the others.
-    others = [model.param_names.index(name) for name in calibration.param_names]
+    # Covariance and status: of the prior for the effect, of the calibration for known parameters.
+    known = [model.param_names.index(name) for name in calibration.param_names]
     covariance = np.diag(model.prior()[1] ** 2)
     status = [HELD] * len(values)
-    covariance[np.ix_(others, others)] = calibration.covariance
-    for index, known_status in zip(others, calibration.status, strict=True):
+    covariance[np.ix_(known, known)] = calibration.covariance
+    for index, known_status in zip(known, calibration.status, strict=True):
         status[index] = known_status
     return replace(
         calibration,

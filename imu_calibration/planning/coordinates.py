@@ -156,7 +156,7 @@ def _basis(gauge: np.ndarray) -> np.ndarray:
     if in_gauge.any():
         null_space = scipy.linalg.null_space(gauge[:, in_gauge] / np.abs(gauge).max())
     free = np.flatnonzero(~in_gauge)
-    # First a column for each free parameter, then the directions of the others.
+    # First a column for each free parameter, then the directions of the parameters in the gauge.
     basis = np.zeros((len(in_gauge), len(free) + null_space.shape[1]))
     basis[free, np.arange(len(free))] = 1.0
     basis[np.ix_(in_gauge, len(free) + np.arange(null_space.shape[1]))] = null_space

@@ -81,7 +81,7 @@ class PlannedMotion:
         Return all segments from the present position, with whole turns of endless joints unchanged.
         """
         move = self.travel(position)
-        # An endless joint moves the shortest way: the move may end whole turns beside the place.
+        # An endless joint moves the shortest way: the move may end at the place plus full turns.
         shift = (move[-1].end if move else np.asarray(position, float)) - self.place
         shifted = tuple(replace(segment, start=segment.start + shift) for segment in self.segments)
         return move + shifted

@@ -64,7 +64,7 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     elif significant or diagnosis.findings:
         word = 'weak'
 
-    # Lines and spectra of what is not explained.
+    # Lines and spectra of the unexplained residuals.
     beyond = list(timing_lines(diagnosis))
     spectra = []
     for sensor, residual in diagnosis.unexplained.items():

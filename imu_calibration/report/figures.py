@@ -294,7 +294,7 @@ def _views(figure, arms, cov):
         axes.axhline(0, color=GREY, lw=0.6)
         axes.axvline(0, color=GREY, lw=0.6)
         for element, colour in enumerate(AXIS_COLOURS.values()):
-            # Of the nine arm components, row by row, those of this point in the view.
+            # The two components of this point in the view, of the nine ones row by row.
             index = [3 * element + across, 3 * element + up]
             _point(axes, arms.ravel()[index], cov[np.ix_(index, index)], 'xyz'[element], colour)
         axes.plot(0, 0, '+', color=INK, markersize=9, mew=1.3)

@@ -57,9 +57,8 @@ def _box(axes, up):
     mat_ns = align(np.asarray(up, float))
     toward_viewer = np.cross(VIEW[0], VIEW[1])
     edges = np.diag(HALF_EDGES)
-    # The visible faces: those whose normal, an axis k of the sensor or its opposite, points to the
-    # viewer. A face has the half edge along its normal, and the corners at plus and minus the two
-    # other ones.
+    # The visible faces: the normal, an axis k of the sensor or its opposite, points to the viewer.
+    # A face is at the half edge along its normal, with corners at plus and minus the two other ones.
     for k, sign in itertools.product(range(3), (1.0, -1.0)):
         normal = sign * np.eye(3)[k]
         if (mat_ns @ normal) @ toward_viewer <= 0:
@@ -135,7 +134,7 @@ def _motion(figure, plan):
         else:
             unit = 'mm'
             values = 1000 * position[:, k]
-        # No line across the panel where an angle goes on at the other end of its turn.
+        # No line across the panel where an angle continues at the other end of its turn.
         steps = np.abs(np.diff(values, prepend=values[0]))
         axes.plot(
             time,
