@@ -164,8 +164,8 @@ class PathWatch:
         path_rests = path.rests[before]
 
         # 1. Expected time of the path. During a rest of the path it does not follow from positions
-        #    and passes at the pace of the joints. A remainder below a step is kept; otherwise a slow
-        #    pace would never end a rest.
+        #    and passes at the pace of the joints. A remainder below a step is kept; otherwise a
+        #    slow pace would never end a rest.
         pace = self.pace if path_rests else 1.0
         expected = self.progress + self._remainder + elapsed * pace
 

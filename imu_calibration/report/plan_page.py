@@ -58,7 +58,7 @@ def _box(axes, up):
     toward_viewer = np.cross(VIEW[0], VIEW[1])
     edges = np.diag(HALF_EDGES)
     # The visible faces: the normal, an axis k of the sensor or its opposite, points to the viewer.
-    # A face is at the half edge along its normal, with corners at plus and minus the two other ones.
+    # A face is at the half edge along its normal, its corners at plus and minus the two other ones.
     for k, sign in itertools.product(range(3), (1.0, -1.0)):
         normal = sign * np.eye(3)[k]
         if (mat_ns @ normal) @ toward_viewer <= 0:
