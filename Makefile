@@ -61,7 +61,7 @@ $(STAMP): $(filter-out $(addprefix constraints/,docs.txt rosdebian.txt validate.
 	@echo 'Installing $(PINS) into $(VENV): a minute or two, once.'
 	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
 	@$(PIP) $$($(ALL_PINS) | grep -oE '^(pip|setuptools|wheel)==[0-9.]+')
-	@$(ALL_PINS) | grep '^[A-Za-z]' | split -n r/2 --filter='$(PIP) --prefer-binary --no-deps --no-build-isolation --use-pep517 --requirement /dev/stdin'
+	@$(ALL_PINS) | sed -n 's/ *#.*//; /^[A-Za-z]/p' | xargs -d '\n' -n 45 -P 4 $(PIP) --prefer-binary --no-deps --no-build-isolation --use-pep517
 	@$(PIP) --no-deps --no-build-isolation --use-pep517 --editable .
 	@touch $@
 
