@@ -294,7 +294,7 @@ def _add_coefficients(
     total: np.ndarray,
     model: SensorModel,
     effect: Effect,
-    sensor_values: dict[str, np.ndarray],
+    sensor_values: Mapping[str, np.ndarray],
     layout: ColumnLayout,
 ) -> None:
     """

@@ -60,6 +60,10 @@ def launch(monkeypatch):
         for name in classes:
             setattr(made, name, stand_in(name))
         monkeypatch.setitem(sys.modules, module, made)
+    # It imports its classes of launch anew: the stand-ins here, and not them in a later test.
+    name = 'imu_calibration.nodes.launch_arguments'
+    monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, name)
     Recorded.made = []
 
 

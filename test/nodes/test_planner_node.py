@@ -466,25 +466,24 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
             lag=0.8,
             time_factor=2.0,
         )
-        times, places = [], []
-
-        def note(message):
-            times.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
-            places.append(list(message.position))
-
-        loop.node.create_subscription(JointState, 'joint_states', note, 1000)
-        loop.ask('start')
-        loop.until(
-            lambda: loop.value('state') == 'moving' and places[-1] != places[0], 'the first motion'
+        places = []
+        loop.node.create_subscription(
+            JointState, 'joint_states', lambda message: places.append(list(message.position)), 1000
         )
-        duration = float(loop.value('it takes [s]'))
+
+        def away():
+            """The largest angle from where the joints were at first, rad."""
+            return np.abs(np.subtract(places[-1], places[0])).max() if places else 0.0
+
+        loop.ask('start')
+        loop.until(lambda: loop.value('state') == 'moving' and away() > 0.05, 'the first motion')
         assert loop.call('/planner_node/stop').success
         loop.until(lambda: len(places) > 100 and np.ptp(places[-50:], axis=0).max() == 0.0, 'rest')
         loop.until(
             lambda: loop.value('state') == 'stopped' and '~/stop' in loop.drive(), 'the stop'
         )
-        moved = np.flatnonzero(np.diff(places, axis=0).any(axis=1))
-        assert times[moved[-1] + 1] - times[moved[0]] < 0.5 * duration
+        # The first motion ends where it began; it was stopped on the way.
+        assert away() > 0.05
         assert loop.call('/planner_node/stop').success  # twice is no harm
         loop.ask('start')  # goes on with what is known; slowly at first
         loop.until(lambda: loop.value('state') == 'moving', 'another motion')

@@ -255,9 +255,10 @@ def press_ctrl_c(*ended):
         assert 'Traceback' not in terminal.shown(), terminal.shown()
 
 
-GIVEN = ('calibrate.launch', 'compensate.launch')
-"""Launch files that another test starts as printed, with further arguments."""
-FURTHER = [command for command in STARTING[3:] if not any(name in command for name in GIVEN)]
+BY_HAND = next(command for command in STARTING if 'calibrate.launch' in command)
+COMPENSATE = next(command for command in STARTING if 'corrected:=' in command)
+"""Both are started with further arguments by another test, the others here."""
+FURTHER = [command for command in STARTING[3:] if command not in (BY_HAND, COMPENSATE)]
 
 
 @pytest.mark.long
@@ -330,9 +331,6 @@ def test_launch_arguments_are_parameters_of_the_node_which_is_started_again(term
 
     An argument that is not given keeps the default of the node.
     """
-    by_hand, compensate = (
-        next(command for command in STARTING if name in command) for name in GIVEN
-    )
     workspace = home[0] / 'ws'
     rng = np.random.default_rng(1)
     still = {
@@ -343,7 +341,7 @@ def test_launch_arguments_are_parameters_of_the_node_which_is_started_again(term
     imu.noise(**still).save(workspace, report=False)
     noise = str(workspace / 'noise.yaml')
     launched = terminals(
-        f'{compensate} respawn:=true anyway:=true gravity:=9.78 noise_file:={noise}'
+        f'{COMPENSATE} respawn:=true anyway:=true gravity:=9.78 noise_file:={noise}'
     )
     launched.wait(r'calibration \w+ from .* adopted')
     found = dumped(terminals, launched, '/compensator_node')
@@ -357,7 +355,7 @@ def test_launch_arguments_are_parameters_of_the_node_which_is_started_again(term
     launched.wait(f'(?s){started}.*{started}.* adopted')
     press_ctrl_c(launched)
 
-    launched = terminals(f'{by_hand} gravity:=9.8')
+    launched = terminals(f'{BY_HAND} gravity:=9.8')
     launched.wait('by hand')
     assert dumped(terminals, launched, '/calibration_node')['gravity'] == 9.8
     press_ctrl_c(launched)
