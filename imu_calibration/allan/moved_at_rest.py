@@ -46,6 +46,8 @@ def tilt_at_rest(time: np.ndarray, mean: np.ndarray) -> float:
     length = np.linalg.norm(mean[:, :3], axis=1)
     if len(time) < LEAST_REST_CHUNKS or not np.isfinite(mean).all() or not length.min() > 0:
         return 0.0
+
+    # Measured direction u, and its change by the rates from their mean, the sum of u x rate dt.
     direction = mean[:, :3] / length[:, None]
     step = np.diff(time, prepend=time[0])[:, None]
     rate = mean[:, 3:] - mean[:, 3:].mean(axis=0)
@@ -65,7 +67,8 @@ def tilt_at_rest(time: np.ndarray, mean: np.ndarray) -> float:
     predicted = predicted - basis @ (basis.T @ predicted)
     measured = measured - basis @ (basis.T @ measured)
 
-    # measured = factor predicted
+    # measured = factor predicted, by least squares. The tilt counts if it is large, explained by
+    # the rates, and of about their size.
     power = float(np.sum(predicted**2))
     total = float(np.sum(measured**2))
     tilt = np.sqrt(total / (n_segments * n_means))

@@ -273,6 +273,7 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
     temperature = _Thinned()
     frame_id = ''
     outliers = RestOutliers()
+    # Chunks of each epoch of the clock, without outliers.
     for cleaned in without_outliers(cleaner.all_of(blocks), outliers):
         for epoch, imu in cleaned.imu:
             frame_id = frame_id or imu.frame_id
@@ -293,13 +294,13 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
         dropped['outlier'] = outliers.replaced
     epochs = [item.chunks() for _, item in sorted(series.items())]
     return Survey(
-        epochs,
-        _period(epochs),
-        temperature.result(),
-        preflight.findings,
-        preflight.resolution,
-        dropped,
-        frame_id,
+        epochs=epochs,
+        period=_period(epochs),
+        temperature=temperature.result(),
+        findings=preflight.findings,
+        resolution=preflight.resolution,
+        dropped=dropped,
+        frame_id=frame_id,
         absent=preflight.streams['imu'].absent,
         unusable=preflight.unusable,
     )

@@ -100,8 +100,11 @@ def compared_fit(held_out: HeldOutData[Any], sensor: str, applied: np.ndarray) -
     model = held_out.solution.model
     is_of_other = model.mask(lambda effect: effect.sensor not in (sensor, 'reference'))
 
+    # Error of the solution, with the applied parameters of the other sensor.
     folds = [np.where(is_of_other, applied, values) for values in held_out.folds]
     solution_error = judged.rms(smallest_errors(held_out, sensor, folds))
+
+    # The first plain fit has the reference as described, the others estimate it.
     chosen: PlainFit | None = None
     for equations in held_out.plain_equations(sensor, applied):
         estimate = equations.estimate(held_out.masks)

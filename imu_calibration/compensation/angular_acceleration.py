@@ -339,7 +339,7 @@ class TimedDerivative:
             self.alpha = NO_SLOPE
             self.n_used = 0
             return self.alpha
-        # As many equal steps have about this Sxx, and with it this noise.
+        # Number of samples at equal steps with about this Sxx, and therefore this noise.
         share = min(float(spread) / self._full_spread, 1.0)
         self.n_used = min(max(round(self.taps * share ** (1 / 3)), 2), self.taps)
         values = np.array(self._values)[::-1]

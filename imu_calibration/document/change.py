@@ -99,7 +99,7 @@ def changes_since(stored: Proof, proof: Proof) -> tuple[RegimeChange, ...]:
             earlier = stored[sensor].regimes.get(regime)
             if earlier is None or earlier.unit != errors.unit:
                 continue
-            if not earlier.after > 0.0 or not errors.after > 0.0:
+            if not earlier.after > 0.0 or not errors.after > 0.0:  # no ratio
                 continue
             ratio = errors.after / earlier.after
             interval_factor = np.exp(QUANTILE * np.hypot(_log_sd(earlier), _log_sd(errors)))

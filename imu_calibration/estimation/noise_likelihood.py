@@ -62,7 +62,7 @@ class NoiseLikelihood:
         self._sessions = rows.sessions
         self._common = common
         self._reduced: dict[tuple[float, ...], tuple[float, np.ndarray]] = {}
-        """(shape of the noise, variance ratio of sessions) -> result of `_eliminated`."""
+        """(offset, bias, time, sd of the offset of each recording) -> result of `_eliminated`."""
         self._losses: dict[tuple, float] = {}
         """(the same, choice of parameters or None for all) -> result of `loss`."""
         self._choices = [tuple(choice) for choice in choices]

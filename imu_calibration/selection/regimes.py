@@ -265,6 +265,7 @@ class RegimeSearch:
         self.ranges: list[Ranges] = []
         """Of each variable, the ranges with neither too few nor too many of the blocks."""
         for variable in variables:
+            # At least `FEWEST` blocks inside, or an eighth of few blocks.
             marks = variable.marks
             member = variable.ranges
             n_inside = member @ marks.sum(axis=0)
@@ -330,6 +331,8 @@ class RegimeSearch:
         for columns in smooth:
             least_energy = min(least_energy, rest.energy(whitening.whiten(columns)))
         limit = variance_cost(least_energy, len(self.time)) - SURE
+
+        # The likeliest ranges with their best bounds.
         regimes = []
         for ranges, number in likeliest:
             refined = self._refined(rest, whitening, ranges, number)

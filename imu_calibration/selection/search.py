@@ -352,7 +352,7 @@ class Search:
             # the model.
             if question.name in self.resolved:
                 continue
-            remaining = [*chosen[:place], *chosen[place + 1 :]]
+            remaining = [q for q in chosen if q is not question]
             for other in self.others(remaining):
                 if other is question:
                     continue

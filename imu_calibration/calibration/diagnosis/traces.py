@@ -171,8 +171,9 @@ class DistanceSums:
         """
         n = len(window)
         at_rest = window.kind == 'static'
-        if n < 4 or not window.period:
+        if n < 4 or not window.period:  # too short for a spectrum
             return
+
         # Parseval: sum of (x - mean)^2 = sum of |X_k|^2 freedom_k / n over the frequencies above
         # zero, with two degrees of freedom each, and one at the Nyquist frequency.
         n_bands = len(BAND_EDGES) - 1
@@ -184,6 +185,8 @@ class DistanceSums:
         self._freedom[: 2 if at_rest else 1] += np.bincount(band, freedom, n_bands)
         self._n_samples += n
         self._n_windows += 1
+
+        # Squares of the residual in each band and of its mean, before and after.
         for sensor, sensor_noise in noise.items():
             self._noise[sensor] += sensor_noise.low_variance / n
             of_window = _WindowSquares(n, at_rest, within=np.zeros(2), mean=np.zeros(2))

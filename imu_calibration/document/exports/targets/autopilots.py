@@ -115,8 +115,8 @@ def numbers_ardupilot(imu: AffineImu) -> Numbers:
         linear = [float(value) / PER_PARAMETER for value in imu.thermal[sensor]]
         polynomial = f'{TCAL}_{TCAL_SENSORS[sensor]}'
         parameters |= _by_axis(f'{polynomial}1_*', linear)
-        parameters |= _by_axis(f'{polynomial}2_*', np.zeros(3).tolist())
-        parameters |= _by_axis(f'{polynomial}3_*', np.zeros(3).tolist())
+        parameters |= _by_axis(f'{polynomial}2_*', [0.0] * 3)
+        parameters |= _by_axis(f'{polynomial}3_*', [0.0] * 3)
     return parameters
 
 
