@@ -199,7 +199,11 @@ class RecordingTimes:
         index: int,
     ) -> float:
         """
-        Return the standard deviation of coefficient `index` over it, from a recording of `seconds`.
+        Return sd / value of coefficient `index`, as a recording of `seconds` would determine it.
+
+        All coefficients c of the model are fitted. With the expected variances ``D c`` and the
+        covariance C of the measured ones, the information on relative changes of c is ``diag(c) D'
+        C^-1 D diag(c)``.
         """
         moments = self._moments(seconds)
         design = moments.design(processes)
@@ -566,7 +570,11 @@ class _Clock:
 
 
 def _blocks(surveyed: Survey, parts: list[list[StillPart]], clock: _Clock) -> Blocks:
-    """Return the means of equal numbers of chunks within the parts, about `MAX_TREND_BLOCKS`."""
+    """
+    Return means over blocks of equal numbers of chunks, about `MAX_TREND_BLOCKS` in all parts.
+
+    `parts` are those of each epoch of the clock.
+    """
     n_chunks = sum(part.chunks.stop - part.chunks.start for part in chain.from_iterable(parts))
     size = max(int(np.ceil(n_chunks / MAX_TREND_BLOCKS)), 1)
     times = []

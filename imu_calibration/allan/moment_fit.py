@@ -502,7 +502,7 @@ class _ScoreOfCoefficient(_Score):
         self.index = index
 
     def relative_sd(self) -> float:
-        """Return the sd of the coefficient by its information, over it; infinite for 0."""
+        """Return sd / value of the coefficient, all others fitted too; infinite for the value 0."""
         if not self.fit.coefficients[self.index] > 0:
             return np.inf
         whiten = Whitener(self._excess * self.fit.covariance)

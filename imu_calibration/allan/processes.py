@@ -208,7 +208,7 @@ class ScaleCovariance:
 
     def tensor(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
         """
-        Return the products of all pairs, shape (n_processes, n_processes, n_scales, n_scales).
+        Return `product` of each pair, shape (n_processes, n_processes, n_scales, n_scales).
         """
         scales = len(self.factors)
         count = len(processes)
@@ -237,7 +237,12 @@ class ScaleCovariance:
         return np.einsum('pg,pg->p', self._weight, inside + corners)
 
     def _sum_at_spikes(self, other: NoiseProcess) -> np.ndarray:
-        """Sum products with the correlation of quantisation, which is spikes at nine lags."""
+        """
+        Return the sums of products with the correlation of quantisation, shape (n_pairs,).
+
+        That is zero except at the nine lags ``i short - j long`` at which ends of both differences
+        meet, with the products of their weights.
+        """
         total = np.zeros(len(self._first))
         for i, at_short in enumerate(SECOND_DIFFERENCE):
             for j, at_long in enumerate(SECOND_DIFFERENCE):

@@ -334,7 +334,12 @@ class AxisNoise:
 
 
 def identify_axis(moments: Moments) -> AxisNoise:
-    """Return the noise of one axis from its Allan variances."""
+    """
+    Return the noise of one axis from its Allan variances.
+
+    The likeliest form of the model gives the figures, with intervals that include other likely
+    forms; processes that occur only in these are alternatives.
+    """
     # Averaging times of the fit, the scatter between rests, and the form.
     moments, excess = _fit_range(moments)
     moments = replace(moments, scatter=scatter_of(moments))

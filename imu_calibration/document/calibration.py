@@ -469,7 +469,7 @@ LARGEST_BIAS = {'accelerometer': 16 * STANDARD_GRAVITY, 'gyroscope': 4000 * DEG}
 
 
 def worst_scale(calibration: Calibration, sensor: str) -> float:
-    """Return the scale factor of a sensor that lies worst in the table of `core.scales`."""
+    """Return the scale factor of a sensor, smallest or largest, in the worse `ScaleRange`."""
     diagonal = np.diag(np.asarray(calibration.of(sensor, Role.LINEAR)))
     smallest = float(diagonal.min())
     largest = float(diagonal.max())

@@ -123,7 +123,7 @@ class Evidence:
         return matrix, right
 
     def fit(self, used: Sequence[int]) -> ParameterFit:
-        """Return (values, covariance) of the parameters `used`, fitted to all folds."""
+        """Return (values, covariance) of the parameters `used`, in that order, from all rows."""
         ordered = tuple(sorted(used))
         if ordered not in self._fits:
             self._fits[ordered] = self._fitted(self.total, ordered)

@@ -237,7 +237,11 @@ class DistanceSums:
         )
 
     def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
-        """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
+        """
+        Return measure -> Gain of the windows up to now, in the order of `MEASURES`.
+
+        `of`: kind of the residuals that were added, `OF_MODEL` or `APPLIED` of `selection.gain`.
+        """
         windows = self._windows[sensor]
         n = np.array([window.n_samples for window in windows], float)
         at_rest = np.array([window.at_rest for window in windows], bool)
