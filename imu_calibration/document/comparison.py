@@ -182,9 +182,8 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
         jacobian[:, k] = (above - below) / (2 * step[k])
     # The upper triangle of L is zero by definition.
     status = np.array(calibration.status, object)
-    matrix_status = status[model.part('accelerometer', Role.LINEAR)]
-    if len(matrix_status):
-        matrix_status.reshape(3, 3)[np.triu_indices(3, 1)] = FIXED
+    matrix_status = status[model.part('accelerometer', Role.LINEAR)].reshape(3, 3)
+    matrix_status[np.triu_indices(3, 1)] = FIXED  # a view: changes `status`
     return replace(
         calibration,
         values=values,
@@ -376,21 +375,18 @@ def _compared(
     # 4. Tests, with both uncertainties. Table and clock are judged separately: they are no property
     #    of the IMU.
     groups = _groups(common, difference, covariance, ~excluded) if n_known == 2 else []
-    effects_of_reference = [e for e in first.model.effects if e.section == 'reference']
-    names_of_reference = {'.'.join(effect.key) for effect in effects_of_reference}
+    names_of_reference = set()
+    for effect in first.model.effects:
+        if effect.section == 'reference':
+            names_of_reference |= {name.rpartition('.')[0] for name in effect.param_names()}
     of_reference = [group for group in groups if group.name in names_of_reference]
-    of_imu = [group for group in groups if group.name not in names_of_reference]
+    of_imu = [group for group in groups if group not in of_reference]
     rejected_reference = _holm(of_reference)
     rejected = _holm(of_imu)
 
     # 5. Differences, omitted parameters and verdict as text.
-    lines = list(notes)
-    differences = []
-    for group in groups:
-        if group.name in rejected | rejected_reference:
-            lines.append(group.text)
-        if group.name in rejected:
-            differences.append(group.text)
+    all_rejected = rejected | rejected_reference
+    lines = [*notes, *(group.text for group in groups if group.name in all_rejected)]
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
     if rejected & linear and MOUNT_AXES in (first.gauge.get('axes'), second.gauge.get('axes')):
         lines.append(
@@ -417,7 +413,7 @@ def _compared(
         agree=agree,
         lines=(*lines, _verdict(agree, len(names_in_other_axes), n_known)),
         reference_agree=not rejected_reference if of_reference else None,
-        differences=tuple(differences),
+        differences=tuple(group.text for group in of_imu if group.name in rejected),
     )
 
 

@@ -62,13 +62,12 @@ def read_text(path: str | PathLike[str], what: str) -> str:
     """
     try:
         with io.TextIOWrapper(open_regular(path), encoding='utf-8') as stream:
-            text = stream.read(documents.MAX_DOCUMENT_CHARACTERS + 1)
+            return stream.read(documents.MAX_DOCUMENT_CHARACTERS + 1)
     except (OSError, ValueError) as error:
         raise InputError(
             f'the {what} {path} must be a readable text file: {_why(error)}; correct the path',
             code='file_unreadable',
         ) from error
-    return text
 
 
 def read_bytes(path: str | PathLike[str], what: str) -> bytes:

@@ -146,9 +146,10 @@ class Evidence:
 
     def heldout(self, used: Sequence[int]) -> float:
         """Return the loss of each fold under the fit to the other folds, summed."""
-        key = ('held out', *sorted(used))
+        ordered = tuple(sorted(used))
+        key = ('held out', *ordered)
         if key not in self._losses:
-            self._losses[key] = self._heldout(tuple(sorted(used)))
+            self._losses[key] = self._heldout(ordered)
         return self._losses[key]
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
