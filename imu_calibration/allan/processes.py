@@ -356,8 +356,8 @@ def _lags(short: np.ndarray, long: np.ndarray, length: float) -> np.ndarray:
     for k in range(3):
         parts.append(short - k * long + local)
 
-    # The number of pairs is linear between these lags (`ScaleCovariance._pair_weight`), with two
-    # more on the way to each, because the correlations are not linear.
+    # The number of pairs is linear between these lags (`ScaleCovariance._pair_weight`); a quarter
+    # and half of each are included too.
     n_short = _n_terms(length, short)
     n_long = _n_terms(length, long)
     for bend in (-n_short, n_long - n_short, n_long):

@@ -237,9 +237,10 @@ def _iteration(accel: _SensorSums, gyro: _SensorSums) -> list[str]:
     """
     Return the lines that compute the true force in u and the true rate in v.
 
-    By the same steps as `compensation.compensate`.
+    By the same steps as `compensation.compensate`. Variables of the kernel: a and b are force and
+    rate from matrix and bias only, p and q those of the previous step. The derivative of the rate,
+    formerly in a, is already in g.
     """
-    # ax, ay, az are already in gx, gy, gz: a is the force, b the rate, from matrix and bias only.
     lines = _assigned('a', accel.linear, '    ') + _assigned('b', gyro.linear, '    ')
     lines += [
         '    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz',
@@ -249,7 +250,7 @@ def _iteration(accel: _SensorSums, gyro: _SensorSums) -> list[str]:
     for sums, true, linear in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
         if any(sums.disturbance):
             lines += _assigned(true, _less(_vector(linear), sums.disturbance), '        ')
-    # p and q are the force u and the rate v of the previous step.
+    # The sum of the changes in a step.
     components = ('ux', 'uy', 'uz', 'vx', 'vy', 'vz')
     previous = ('px', 'py', 'pz', 'qx', 'qy', 'qz')
     change = ' + '.join(f'abs({new} - {old})' for new, old in zip(components, previous))

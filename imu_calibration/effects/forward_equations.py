@@ -207,7 +207,7 @@ def _warp_columns(references: References, effect: Effect, sensor: str) -> list[n
     if effect.derivative is not None:
         return [effect.derivative(references.at(sensor))]
 
-    # To first order a lag near zero is a delay of the clock, whose references are known already.
+    # To first order a lag near zero is a delay of the clock, whose references are computed anyway.
     clock = model.find('reference', Role.DELAY)
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
         effect = clock
