@@ -28,11 +28,18 @@ PROBLEMS = {
     'readme-check': 'E   README.md: 1 line is not listed',
     'lint': 'benchmarks/run.py:7: error: no attribute "runs"',
     'test-all': 'E   assert 3 == 4',
+    'oracles': 'error: no matching distribution',
 }
 PLACE = 'test/test_a.py:7: '
 """What pytest prints above an error of a function of the test."""
 NOTE = 'note: the latitude must agree with the rates'
-STAGES = {'demo-check': 'demo', 'readme-check': 'readme', 'lint': 'lint', 'test-all': 'tests'}
+STAGES = {
+    'demo-check': 'demo',
+    'readme-check': 'readme',
+    'lint': 'lint',
+    'test-all': 'tests',
+    'oracles': 'lint',
+}
 
 
 def result_of_run(folder, failing):
@@ -59,7 +66,15 @@ def result_of_run(folder, failing):
 
 @pytest.mark.parametrize(
     'failing',
-    (('lint', 'test-all'), ('lint', 'readme-check'), ('lint',), ('test-all',), ('demo-check',), ()),
+    (
+        ('lint', 'test-all'),
+        ('lint', 'readme-check'),
+        ('lint',),
+        ('test-all',),
+        ('demo-check',),
+        ('oracles',),
+        (),
+    ),
 )
 def test_each_failing_stage_is_named_with_its_first_error(tmp_path, failing):
     done = result_of_run(tmp_path, failing)
