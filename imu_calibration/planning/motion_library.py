@@ -309,7 +309,7 @@ class MotionLibrary:
         """Index into `places` for each motion."""
 
     def motion(
-        self, kind: MotionKind, place: np.ndarray, segments: tuple[Segment, ...], text: str
+        self, kind: MotionKind, place: np.ndarray, segments: tuple[Segment, ...], *, text: str
     ) -> PlannedMotion:
         """Return a motion of the chain within its limits."""
         return PlannedMotion(kind, self.names, place, segments, text, self.limits)
@@ -317,10 +317,10 @@ class MotionLibrary:
     def _rests(self) -> Iterator[PlannedMotion]:
         """Yield a mere move to each place, and rests of several lengths there."""
         for place in self.spread:
-            yield self.motion(MotionKind.MOVE, place, (), '')
+            yield self.motion(MotionKind.MOVE, place, (), text='')
             for dwell in DWELLS:
                 segments = self._builder(place).rest(dwell).segments
-                yield self.motion(MotionKind.POSE, place, segments, f'rest for {dwell:g} s')
+                yield self.motion(MotionKind.POSE, place, segments, text=f'rest for {dwell:g} s')
 
     def _spins(self) -> Iterator[PlannedMotion]:
         """Yield turns of each rotating joint: whole ones if endless, otherwise sweeps."""
@@ -414,7 +414,7 @@ class MotionLibrary:
         seconds_at_rate = (2 * np.pi * n_turns - ramp_angle) / speed
         noun = 'turn' if n_turns == 1 else 'turns'
         text = f'spin {self._rate_words(rates)} for {n_turns:.0f} whole {noun}'
-        return self.motion(kind, place, self._spun(place, rates, seconds_at_rate), text)
+        return self.motion(kind, place, self._spun(place, rates, seconds_at_rate), text=text)
 
     def _sweep(self, place: np.ndarray, rates: np.ndarray) -> PlannedMotion | None:
         """
@@ -437,7 +437,7 @@ class MotionLibrary:
                 segments = self._spun(start, sweep_rates, seconds_at_rate)
                 words = self._rate_words(sweep_rates[0])
                 text = f'sweep {words} for {seconds_at_rate:.1f} s and back'
-                return self.motion(MotionKind.SPIN, start, segments, text)
+                return self.motion(MotionKind.SPIN, start, segments, text=text)
         return None
 
     def _longest_at_rate(self, start: np.ndarray, rates: np.ndarray, joint: int) -> float:
@@ -483,7 +483,7 @@ class MotionLibrary:
             if self.limits.turns[k]:
                 size = f'{np.degrees(amplitude[k]):.0f}°'
             sizes.append(f'{self.names[k]} by {size} at {frequency[k]:.2g} Hz')
-        return self.motion(kind, middle, swing, f'swing {", ".join(sizes)} for {seconds:g} s')
+        return self.motion(kind, middle, swing, text=f'swing {", ".join(sizes)} for {seconds:g} s')
 
     def _largest_amplitude(
         self, swings: np.ndarray, frequency: np.ndarray, seconds: float

@@ -396,7 +396,7 @@ class Planner:
             MotionKind.MOVE,
             np.asarray(position, float),
             segments,
-            'a small motion of every joint and back',
+            text='a small motion of every joint and back',
         )
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
@@ -415,7 +415,7 @@ class Planner:
             return None
         target = np.where(is_wound, middle, position)
         # Without segments: only the move to its place.
-        return library.motion(MotionKind.MOVE, target, (), 'unwinding')
+        return library.motion(MotionKind.MOVE, target, (), text='unwinding')
 
     def plan(
         self,
