@@ -47,12 +47,14 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
     time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
     movements = {}
 
+    # Accelerometer: lengths of gravity, with the columns of bias and matrix.
     norm_residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
     base = columns[:, model.base_index('accelerometer')]
     of_accelerometer = _movement_of_norms(time, norm_residual, base)
     if of_accelerometer is not None:
         movements['accelerometer'] = of_accelerometer
 
+    # Gyroscope: rates at rest without the effects of the model.
     at_rest = np.zeros_like(poses.force)
     true_force, _ = model.compensate(values, poses.force, at_rest, **poses.conditions)
     rate_residual, _ = model.rate_rows(values, true_force, poses.rate, **poses.conditions)

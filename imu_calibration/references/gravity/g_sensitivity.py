@@ -120,6 +120,8 @@ def _loss(covariance: np.ndarray, design: np.ndarray, values: np.ndarray) -> flo
     white = scipy.linalg.solve_triangular(factor, np.hstack([design, values]), lower=True)
     basis, triangle = np.linalg.qr(white[:, :n_columns])
     residual = white[:, n_columns:] - basis @ (basis.T @ white[:, n_columns:])
+
+    # Determinants from the factors C = L L' and L^-1 A = Q R: products of squared diagonals.
     spare = len(values) - n_columns
     log_determinants = (
         2 * np.log(np.diag(factor)).sum() + 2 * np.log(np.abs(np.diag(triangle))).sum()

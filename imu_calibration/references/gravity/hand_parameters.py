@@ -282,8 +282,7 @@ class HandModel:
             values, force, np.zeros_like(force), time=time, temperature_c=temperature_c
         )
         norm = np.linalg.norm(true, axis=1)
-        by_reading = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
-
+        by_reading = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T  # M^-T u, shape (k, 3)
         columns = np.zeros((len(force), self.size))
         columns[:, 0:3] = by_reading
         # Row i of the lower triangular matrix has the elements up to i.

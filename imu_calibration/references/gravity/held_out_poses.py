@@ -397,6 +397,7 @@ class _Turns(PlainEquations):
         hand = self.hand
         model = hand.hand_model
         fitted = self.plan.fitted
+        # The bias, where it is fitted.
         is_bias = np.zeros(len(values), bool)
         is_bias[model.gyro_bias] = True
         moved = values.copy()

@@ -446,6 +446,7 @@ class LiveByHand(LiveSession):
         imu = imu if self.options.nominal is None else self.options.nominal.apply(imu)
         self._store.add(self._check.push(imu))
         self._n_unsearched += len(imu)
+        # Search for rest after enough samples, and so that searches take a small share of the time.
         period = self._check.statistics().period
         if self._n_unsearched * period < SEARCH_STEP or not self._pacer.due(self._clock()):
             return []

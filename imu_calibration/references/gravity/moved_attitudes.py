@@ -43,6 +43,8 @@ def require_no_sway(
     """
     if imu.absent:
         return
+
+    # Stretches in one attitude without a rest.
     at_rest = np.zeros(len(imu), bool)
     for start, stop in rests:
         at_rest[start:stop] = True
@@ -54,6 +56,8 @@ def require_no_sway(
             forces.append(imu.force_s[start:stop])
             rates.append(imu.rate_s[start:stop])
             length.append(1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start]))
+
+    # With them there must be enough attitudes, and both sensors must measure the sway.
     means = [force.mean(axis=0) for force in forces]
     if distinct_attitudes(np.array([*rest_force, *means]).reshape(-1, 3)) < least:
         return

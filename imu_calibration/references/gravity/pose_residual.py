@@ -155,6 +155,7 @@ def regimes_by_hand(
         Residual of each pose, by a fit without it.
 
     """
+    # Each pose is a window; all are of one kind, at rest, so that any two may be exchanged.
     names = AXES if residual.shape[1] == len(AXES) else (NORM,)
     poses = np.arange(len(residual))
     exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
@@ -162,7 +163,7 @@ def regimes_by_hand(
     regimes = []
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
-        # A constant and the residual, whitened.
+        # A model of a constant without prior information, and the residual, whitened.
         white = np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None]
         axis_residual = AxisResidual(white, np.zeros(1), np.zeros(1))
         whitening = IndependentErrors(sd)

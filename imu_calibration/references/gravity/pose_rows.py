@@ -174,13 +174,15 @@ def _norm_block(
     residual, baseline_columns = hand.hand_model.norm_rows(
         hand.values, poses.force, **poses.conditions
     )
-    # The derivative of the norm by the reading is, but for the sign, the column of the bias.
+    # Columns. The derivative of the norm by the reading is, but for the sign, that by the bias.
     by_reading = baseline_columns[:, 0:3]
     rows = np.zeros((count, space.size + 1))
     rows[:, : baseline_columns.shape[1]] = baseline_columns
     rows[:, -1] = residual
     for label, columns in at_rest.items():
         rows[:, space.parts[label]] = np.einsum('ki,kip->kp', by_reading, columns)
+
+    # Variance of the norm by the noise of the mean, and by the usual drift of the bias.
     variance = np.sum((by_reading * poses.force_sem) ** 2, axis=1)
     drift = by_reading**2 @ _natural_variance(poses, 'accelerometer')
     return Rows(

@@ -121,6 +121,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
     differ much from the nominal ones. The search therefore begins in several places, and the best
     solution with a positive diagonal is returned.
     """
+    # Bias and matrix of the accelerometer: the possible solution of least cost from all starts.
     values = model.nominal.copy()
     if 'accelerometer' not in model.absent:
         index = model.base_index('accelerometer')
@@ -133,6 +134,8 @@ def first_state(model: HandModel, poses: Poses) -> State:
             if cost < least_cost:
                 values = end
                 least_cost = cost
+
+    # Directions with it, and the bias of the gyroscope.
     linear = model.linear(values)
     true = np.linalg.solve(linear.force_matrix, (poses.force - linear.force_bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)

@@ -206,6 +206,7 @@ class Accumulator(_CentredRows):
         The mean row of two windows is their mean, and their difference is added to the centred
         rows. Without such neighbours the oldest row is removed.
         """
+        # From the oldest row on: a pair becomes one row, a row without a partner remains.
         thinned = []
         index = 0
         older = len(self.rows) // 2
@@ -218,7 +219,7 @@ class Accumulator(_CentredRows):
             self._stack_difference(first, second)
             thinned.append(_joined(first, second))
             index += 2
-        thinned += self.rows[index:]
+        thinned += self.rows[index:]  # the newer half
         if len(thinned) == len(self.rows):
             del thinned[0]
         self.rows = thinned

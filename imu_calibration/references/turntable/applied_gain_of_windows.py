@@ -169,6 +169,8 @@ def _locked_errors(
                 errors_of_sides.append(_errors(group, table, side))
             else:
                 errors_of_sides.append(residuals(group, table, side.model, values=side.values))
+
+        # The errors of a group are those of its windows, one after the other.
         edges = np.cumsum([0, *map(len, group)])
         for window, first, last in zip(group, edges, edges[1:]):
             errors_of_window = []
@@ -182,6 +184,7 @@ def _locked_errors(
 
 def _applied_parameters(investigation: Investigation, chosen: Sequence[Question]) -> _Side:
     """Return the model with some effects, estimated without the locked windows."""
+    # The baseline with these effects, at the values that the windows of the selection give.
     problem = investigation.problem
     gathered = problem.recording.model  # with all effects under test
     model = replace(problem.baseline, temperature_ref_c=gathered.temperature_ref_c)
@@ -190,6 +193,8 @@ def _applied_parameters(investigation: Investigation, chosen: Sequence[Question]
     values = model.start_from(gathered, problem.values(chosen))
     model = model.at(values)
     latest = latest_settling(model, values, sd_of_chosen(problem.search, model, chosen))
+
+    # Compensation applies effects that it cannot undo at their centre.
     centre: Centre = {}
     if not_applied(model):
         accumulator = problem.recording.accumulated(gathered)

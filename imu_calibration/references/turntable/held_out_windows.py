@@ -118,6 +118,7 @@ class HeldOutWindows(HeldOutData[Solution]):
         Effects and plain fit are estimated by least squares from the same pieces, so that only the
         effects differ; the effects have their priors.
         """
+        # The amplitudes of the effects of the sensor that were estimated.
         model = self.solution.model
         free = np.zeros(len(self.solution.values), bool)
         for effect in model.effects:

@@ -208,8 +208,8 @@ def needed_motions(
     Return the standard motion that reduces the sd of each undetermined parameter most.
 
     Every motion of the catalogue is tried: its information is added to that of the recording. A
-    table that turns the sensor about one axis only can
-    do few of them (`possible`): where none of these would help, the IMU must be remounted.
+    table that turns the sensor about one axis only can do few of them (`possible`): where none of
+    these would help, the IMU must be remounted.
 
     Returns
     -------

@@ -41,14 +41,17 @@ def _next_point(solution: Solution) -> np.ndarray:
     the information I of the solution and ``P = (LINEAR_STEPS step)^-2``: ``(I + P)^-1 I d``. A time
     constant is positive: it is at least the share `LEAST_TIME_CONSTANT` of the one before.
     """
+    # Time constants.
     model = solution.model
     values = solution.values.copy()
     for effect in model.relinearised:
         if effect.time_constant:
             last = model.slices[effect.key].stop - 1
             values[last] = max(values[last], LEAST_TIME_CONSTANT * model.point_of(effect)[-1])
+
+    # Delays and lags: the step d, and the diagonal of P.
     step = np.zeros(len(values))
-    precision = np.zeros(len(values))  # the diagonal of P
+    precision = np.zeros(len(values))
     for effect in model.relinearised:
         if effect.warp is not None:
             part = model.slices[effect.key]
@@ -57,6 +60,8 @@ def _next_point(solution: Solution) -> np.ndarray:
     warps = np.flatnonzero(precision)
     if not len(warps):
         return values
+
+    # (I + P)^-1 I d = d - (I + P)^-1 P d, so that the last term is subtracted from the solution.
     information = np.linalg.inv(solution.covariance[np.ix_(warps, warps)])
     regularised = information + np.diag(precision[warps])
     values[warps] -= np.linalg.solve(regularised, precision[warps] * step[warps])

@@ -341,6 +341,7 @@ class HeldOut:
         rows_of_folds = [
             _linearised(self.blocks[fold::TABLE_FOLDS], solution) for fold in range(TABLE_FOLDS)
         ]
+        # Rows [design | residual] of the prior and of the remaining folds.
         prior_rows = np.column_stack([prior.root, prior.root @ (prior.mean - values)])
         values_without = []
         for fold in range(TABLE_FOLDS):

@@ -220,7 +220,7 @@ def _two_axis(gravity: float) -> list[Reference]:
     cos = np.cos(w * MOTION_TIME)
     sin = np.sin(w * MOTION_TIME)
     for inner, outer in ((0, 1), (1, 2), (2, 0)):
-        third = 3 - inner - outer
+        third = 3 - inner - outer  # the remaining one of the axes 0, 1, 2
         rate, alpha, up = np.zeros((3, len(MOTION_TIME), 3))
         rate[:, inner] = w
         rate[:, outer] = w * cos

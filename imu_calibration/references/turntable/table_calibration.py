@@ -201,6 +201,8 @@ def solve_in_passes(
     Each pass reduces all windows with the columns of a model. Where a drift has settled, the last
     third of the recording is judged; its start follows from the solution of a pass.
     """
+    # Until the linearisation is valid at the solution, and the judged part is the one that follows
+    # from it.
     next_model = _at_time_constants(source, model, options)
     judged_from = 0.0
     for _ in range(MAX_TABLE_PASSES):

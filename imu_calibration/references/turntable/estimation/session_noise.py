@@ -133,11 +133,15 @@ def band_misfit(
         Degrees of freedom of both.
 
     """
+    # Variances of all rows and of both parts.
     overall = total / max(dof_total, 1)
     if dof_slow < 1:
         return BandMisfit(overall, np.zeros(3), overall, np.zeros(3, bool))
     of_slow = slow / dof_slow
     of_fast = np.maximum(total - slow, 0.0) / max(dof_total - dof_slow, 1)
+
+    # Separate weights where the fast part exceeds the slow one, which few degrees of freedom may
+    # underestimate: a variance of n degrees of freedom has the relative sd sqrt(2 / n).
     cautious = of_slow * (1 + CAUTIOUS_SDS * np.sqrt(2 / dof_slow))
     apart = of_fast > MIN_VARIANCE_RATIO * cautious
     return BandMisfit(overall, np.where(apart, cautious, of_slow), of_fast, apart, dof_slow)

@@ -287,6 +287,8 @@ def start(system: WeightedSystem) -> np.ndarray:
     model = system.model
     values = model.start()
     values = np.where(np.isfinite(values), values, 0.0)
+    # Rows ``weight [1 | true input] @ [bias; matrix'] = weight output`` of the means, and the same
+    # of the nominal sensor with a small weight.
     weight = np.sqrt(system.count / system.count.max())[:, None]
     nominal = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     penalty = START_PENALTY * np.eye(4)
@@ -403,6 +405,8 @@ def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> 
         dependence = attitude_dependence(system, sensor, values, noise=noise)
         if dependence is not None:
             attitude[sensor] = dependence
+
+        # Means of all windows.
         misfit = system.misfit(sensor, system.means[sensor], values)
         white = system.mean_rows(misfit[:, :, None], noise).white()
         dof = max(white.size - _parameters_of_means(system, sensor), 1)

@@ -116,6 +116,7 @@ def predict_session_offsets(rows: Rows) -> np.ndarray:
     With the whitened ones u and residuals r of the rows of a recording, and the variance s^2 of
     the offsets, it is the best linear prediction ``u'r / (u'u + 1 / s^2)``.
     """
+    # Ones and residuals, whitened without the offsets that are predicted.
     ones = np.ones_like(rows.equations[:, :, -1])
     columns = np.stack([ones, rows.equations[:, :, -1]], axis=2)
     white = replace(rows, session_variance=0.0).whitening()(columns)

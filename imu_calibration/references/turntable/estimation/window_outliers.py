@@ -112,6 +112,7 @@ class _MeanFit:
 
         The test concerns the residuals of the windows with the numbers `of_kind`.
         """
+        # h, A' h and s of each axis. An offset that the parameters imitate is not tested.
         column = np.zeros(self.residual.shape + (1,))
         column[window] = 1.0
         column = self.whitening(column)[:, :, 0]
@@ -120,6 +121,8 @@ class _MeanFit:
         visible = squares - np.einsum('ap,pq,aq->a', gradient, self.covariance, gradient)
         if np.any(visible < LEAST_VISIBLE * squares):
             return 1.0
+
+        # b, and the residual with it.
         offset = (column * self.residual).sum(axis=0) / visible
         imitated = np.einsum('kap,pq,aq->ka', self.design, self.covariance, gradient)
         improved = self.residual - (column - imitated) * offset

@@ -196,6 +196,8 @@ def propose(
     without_formula = fits.fit()
     if without_formula.excess <= 0:
         return None
+
+    # Formulas join in the order of their likelihood, until one is not stable or adds too little.
     choices: list[FormulaChoice] = []
     share = 0.0
     for formula in formulas:
@@ -207,6 +209,8 @@ def propose(
             break
         choices = more_choices
         share = larger_share
+
+    # A smooth formula must remove more: any smooth curve resembles any other.
     smooth = any(choice.formula.smooth for choice in choices)
     least_share = MIN_SMOOTH_SHARE if smooth else MIN_FORMULA_SHARE
     if not choices or share < least_share:

@@ -184,11 +184,14 @@ class _CutWindows:
     @classmethod
     def of(cls, windows: Sequence[Window]) -> '_CutWindows':
         """Return the windows, or a random part of a long recording, cut into blocks."""
+        # Blocks so long that moving windows have about `MAX_RESIDUAL_BLOCKS` of them.
         moving_time = sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1)
         length = max(MIN_BLOCK_SECONDS, moving_time / MAX_RESIDUAL_BLOCKS)
         used = _used_windows(windows, length)
         windows_in_use = [windows[k] for k in used]
         cuts = [_cut(window, length) for window in windows_in_use]
+
+        # The rows and samples of all windows, one window after the other.
         motions = []
         first_samples = []
         n_samples = 0

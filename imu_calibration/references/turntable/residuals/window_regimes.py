@@ -48,6 +48,7 @@ def find_regimes(
         Columns of a formula for the residual, which a regime must exceed.
 
     """
+    # By chance: residuals exchanged between windows of one kind and about the same rate.
     exchange = exchanges(
         blocks.window,
         problem.recording.kind[blocks.window],
@@ -56,7 +57,8 @@ def find_regimes(
     search = ScatterSearch(
         blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange
     )
-    # Two tests on each axis: of another offset, and of a larger scatter.
+    # Regimes of another offset. Two tests on each axis share the level: of an offset, and of a
+    # larger scatter.
     level = REGIME_LEVEL / len(AXES) / 2
     offsets_of: dict[str, list[RestRegime]] = {}
     if axes:
@@ -65,6 +67,7 @@ def find_regimes(
         for name in axes:
             axis = AXES.index(name)
             whitening = WhitenedAxis(whitener, axis)
+            # Parameters of the model that act on the axis: their columns in its design.
             places = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
             parameters = blocks.index[axis][places]
             residual = AxisResidual(
@@ -80,6 +83,7 @@ def find_regimes(
                 formula=None if formula is None else formula[:, :, axis],
             )
 
+    # Without any, those of a larger scatter.
     regimes: list[RestRegime] = []
     for axis, name in enumerate(AXES):
         regimes += offsets_of.get(name) or search.scatters(

@@ -109,6 +109,7 @@ class WindowRows:
         axes = []
         for number, sensor in enumerate(space.sensors):
             for axis, means in enumerate(mean_rows(space, noise, sensor)):
+                # Only moving windows have rows within, weighted by the variance of their kind.
                 width = means.equations.shape[2]
                 within = np.zeros((len(kind), width, width))
                 if moving.any():

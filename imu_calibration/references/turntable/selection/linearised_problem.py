@@ -322,6 +322,8 @@ class LinearisedProblem:
             other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
             used = self.search.indices(with_exchanged(chosen, place, other))
             losses.append(self.evidence.loss(used))
+        # Parabola a x^2 + b x + c over the logarithm relative to that of this time constant, with
+        # the minimum at -b / (2 a), within the neighbours.
         logs = np.log(self.constants[near])
         curve = np.polyfit(logs - logs[1], losses, 2)
         shift = 0.0

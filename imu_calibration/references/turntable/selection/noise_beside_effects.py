@@ -272,6 +272,8 @@ def _with_moving_factors(
                 variances[axis], column_variances[axis] = scatter
             else:
                 variances[axis] = of_axis @ space.within_sum(sensor, axis, of_kind) @ of_axis / dof
+        # The same factor for rows, slow parts and means, of which the means have at least the noise
+        # at rest.
         correlation = 1.0
         if is_correlated:
             correlation = float(np.clip(np.mean(column_variances / variances), 1.0, None))

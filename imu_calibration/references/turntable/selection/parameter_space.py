@@ -346,6 +346,7 @@ def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Ques
     places = bank_places(space.recording)
     candidates = []
     for effect in effects:
+        # Label -> parameters: of an effect of the model, or at each time constant of its bank.
         if effect.key in model.slices:
             parts = {effect.name: model.slices[effect.key]}
         else:
@@ -434,6 +435,7 @@ def scatter_of_each(
     for sensor in space.sensors:
         variance = np.array([noise[sensor].row_variance(name) for name in recording.kind])
         expected = variance * np.maximum(recording.count - 1, 1)[:, None]
+        # With the centred rows B of a window and the weights w of the residual: w'B'B w.
         squares = []
         for axis in range(3):
             of_axis = weights[space.places(sensor, axis)]

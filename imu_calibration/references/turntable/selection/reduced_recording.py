@@ -324,6 +324,7 @@ def reduce_recording(
         Sensor -> list of BankEntry (`make_bank`).
 
     """
+    # Statistics of each window, and its factors, which are kept packed: they need most memory.
     reduced = []
     factors: dict[tuple[str, str], list[np.ndarray]] = {
         key: [] for key in product(sensors_of(windows), FACTOR_PARTS)
@@ -334,11 +335,13 @@ def reduce_recording(
             for (sensor, part), kept in factors.items():
                 factor = getattr(window.sensors[sensor], part)
                 kept.append(np.zeros(0) if factor is None else packed(factor))
-            bare = {}  # without the factors, which are kept packed
+            bare = {}  # statistics without the factors
             for sensor, known in window.sensors.items():
                 bare[sensor] = replace(known, within=known.within[:0].copy(), slow=None)
             reduced.append(replace(window, sensors=bare))
         report(REDUCING, len(reduced), len(windows))
+
+    # Variables of all windows as arrays.
     descriptions = [_describe(window) for window in windows]
     describe = {}
     for name in descriptions[0]:

@@ -119,13 +119,14 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     """
     start = np.where(np.isfinite(model.start()), model.start(), 0.0)
     prior, sd = model.prior()
-    # About `THINNED_SAMPLES` of a moving window.
+    # About `THINNED_SAMPLES` of a moving window: one of `stride` samples.
     thinned = []
     for window in windows:
         stride = len(window.time) // THINNED_SAMPLES
         if window.kind != 'static' and stride > 1:
             window = window.select(slice(None, None, stride))
         thinned.append(window)
+    # Normal matrix of the rows [derivatives by the parameters | residual at the start].
     normal = np.zeros((len(start) + 1,) * 2)
     references = references_of(thinned, model, table)
     for sensor in sensors_of(windows):
@@ -137,6 +138,8 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
                 output_of_window = output_of_window.mean(axis=0, keepdims=True)
             outputs.append(output_of_window)
         output = np.concatenate(outputs)
+
+        # output = design @ coefficients(parameters), linearised at the start.
         base = coefficients(model, sensor, start)
         slope = coefficient_jacobian(model, sensor, start)
         weight = 1 / sample_sd_at_rest(windows, sensor) ** 2
