@@ -207,7 +207,7 @@ def _rest_block(
     poses = hand.poses
     count = len(poses)
     residual, baseline_columns = hand.rate_rows()
-    earth = baseline_columns.shape[2]
+    earth = baseline_columns.shape[2]  # the place after the parameters of the baseline
     rows = np.zeros((count, 3, space.size + 1))
     rows[:, :, :earth] = baseline_columns
     rows[:, :, earth] = hand.state.up

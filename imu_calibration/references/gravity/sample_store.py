@@ -99,6 +99,7 @@ class HandStore:
         imu = self.samples()
         if imu is None:
             return False
+        # Below the limit by some, so that samples are not discarded at every call.
         if len(rests) > most_rests:
             first_kept = rests[len(rests) - int(SHARE_KEPT * most_rests)]
             self._discard(imu, slice(0, first_kept.start))

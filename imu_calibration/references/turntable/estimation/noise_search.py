@@ -323,6 +323,7 @@ class BiasProcessSearch:
 
         First the sd of the offsets is refined, then that of the bias process.
         """
+        # The price of offsets is the same for all sds that are not zero.
         _, bias, time = shape
         offset = _polish(
             lambda x: self.likelihood.loss(NoiseShape(x, bias, time), used), shape.offset
@@ -350,6 +351,7 @@ def _descend(loss: Callable[[float], float], grid: Iterable[float]) -> float:
     for value in grid:
         values.append(value)
         losses.append(loss(value))
+        # At least five values are tried.
         if len(losses) > 4 and losses[-1] > losses[-2] > losses[-3]:
             break
     return float(values[losses.index(min(losses))])

@@ -394,9 +394,9 @@ def find_tones(
 
 def _significant(tones: Iterable[Tone], n_tests: int) -> dict[tuple[str, str | None], Tone]:
     """
-    Return (axis, joint) -> the most significant tone, without tones of a larger p-value than noise.
+    Return (axis, joint) -> the most significant tone, of the tones that noise does not explain.
 
-    The p-values are multiplied by the number of tests and axes.
+    Their p-values, multiplied by the numbers of tests and axes, are below `TONE_P_VALUE`.
     """
     significant = []
     for tone in tones:

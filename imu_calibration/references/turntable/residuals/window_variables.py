@@ -88,6 +88,7 @@ def _cyclic(name: str, degrees: np.ndarray, starts: np.ndarray) -> Variable:
     edges = np.linspace(0.0, 360.0, N_BINS + 1)
 
     def words(_: str, bounds: tuple[float, float]) -> str:
+        # From 0 to 359 deg; the end of a full turn remains 360.
         low, high = (round(bound % 360.0) % 360 if bound != 360.0 else 360 for bound in bounds)
         return f'while the {name} is {low} to {high} deg'
 

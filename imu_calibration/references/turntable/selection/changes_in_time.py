@@ -122,6 +122,7 @@ class WindowRows:
 
     def selected(self, clear: np.ndarray) -> 'WindowRows':
         """Return the rows with other windows that count (mask, shape (n,))."""
+        # The means of the others have nearly no weight, and their rows within none.
         scatter = np.where(clear, 1.0, NO_WEIGHT)[:, None] * np.ones(3)
         means = []
         for sensor in self.space.sensors:
