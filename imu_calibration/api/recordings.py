@@ -470,7 +470,7 @@ def table_of(
     if not isinstance(stand, Arm):
         if Path(stand).suffix not in DESCRIPTIONS:
             return files.read_table(stand, gravity=gravity, gravity_sd=gravity_sd)
-        stand = Arm(stand)
+        stand = Arm(stand)  # a robot description without further data
 
     # A robot: data that the user does not give are those of the first recording in a file.
     if isinstance(stand.site, Mapping | None):

@@ -270,10 +270,10 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
 
     def arrow(start, end, rgb):
         """Return an arrow."""
-        along = end - start
-        length = float(np.linalg.norm(along))
+        vector = end - start
+        length = float(np.linalg.norm(vector))
         return messages.ArrowPrimitive(
-            pose=pose(start, _from_x(along / length)),
+            pose=pose(start, _from_x(vector / length)),
             shaft_length=0.8 * length,
             shaft_diameter=0.025,
             head_length=0.2 * length,
@@ -281,6 +281,7 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
             color=color(rgb),
         )
 
+    # Cells are (place, colour, diameter), as the arguments of `ball`.
     balls = [ball(*cell) for cell in sphere_cells(coverage)]
     seen_places, seen_colour, diameter = seen_of(coverage)
     balls += [ball(place, seen_colour, diameter) for place in seen_places]
@@ -305,13 +306,13 @@ def _named(numbers: Iterable[float]) -> dict[str, float]:
     return dict(zip('xyzw', map(float, numbers)))
 
 
-def _from_x(along: np.ndarray) -> np.ndarray:
+def _from_x(direction: np.ndarray) -> np.ndarray:
     """
     Return the quaternion (x, y, z, w) of the shortest turn from x to a unit vector.
 
     For -x it is half a turn about z.
     """
-    quaternion = np.array([0.0, -along[2], along[1], 1 + along[0]])
+    quaternion = np.array([0.0, -direction[2], direction[1], 1 + direction[0]])
     if quaternion[3] > 1e-9:
         return quaternion / np.linalg.norm(quaternion)
     return np.array([0.0, 0.0, 1.0, 0.0])

@@ -15,7 +15,7 @@ from imu_calibration.core.settings import flag_setting, path_setting, setting, t
 from imu_calibration.document import files
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import announce, declare_parameters, run_node
-from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
+from imu_calibration.nodes.playback import CLOCK_RATE, PLAYBACK_DEPTH, Batch, Pace, Playback
 from msg_adapters.rosbag2 import Rosbag2
 
 PAUSE = 0.01
@@ -85,7 +85,7 @@ class BagPlayerNode(Node):
         first_ns = self._first_ns()
         pace = Pace(
             self.settings.rate,
-            100.0 if self.settings.clock else 0.0,
+            CLOCK_RATE if self.settings.clock else 0.0,
             self.settings.wait_for_subscribers,
         )
         self._playback = Playback(

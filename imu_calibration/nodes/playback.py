@@ -19,6 +19,8 @@ from rosgraph_msgs.msg import Clock
 
 from msg_adapters.storage import read_ahead
 
+CLOCK_RATE = 100.0
+"""Messages on /clock per second, where a node publishes them."""
 SHORTEST_SLEEP = 0.001
 """Seconds; messages that are due by then are published together."""
 PLAYBACK_DEPTH = 20_000

@@ -33,7 +33,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, run_node
-from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
+from imu_calibration.nodes.playback import CLOCK_RATE, PLAYBACK_DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
@@ -211,7 +211,9 @@ class SimulatorNode(Node):
         self._publisher_of = dict(zip(topics, publishers, strict=True))
         """Relative name of a topic -> its publisher."""
         pace = Pace(
-            settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers
+            settings.time_factor,
+            CLOCK_RATE if settings.clock else 0.0,
+            settings.wait_for_subscribers,
         )
         self._playback = Playback(
             self,
