@@ -218,7 +218,8 @@ def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) 
     """
     Return the middles of the windows over the common time of both IMUs, s on A's clock.
 
-    The first one is on a sample of A, and each window overlaps the next `SAMPLES_LEAST` ones.
+    The first one is on a sample of A. They are ``length / SAMPLES_LEAST`` apart, at least a period
+    of A.
     """
     step = max(a.period, length / SAMPLES_LEAST)
     # Half a window, and 0.1 s for windows that are shifted by a delay.
@@ -272,7 +273,7 @@ def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
 
     at_rest = _directions_at_rest(a, b, offset)
     if at_rest is None:
-        # So many windows of the rates overlap each other and have common errors.
+        # Windows of the rates overlap: about so many consecutive ones have common errors.
         return _rotation_between(rate_a, rate_b, offset, overlap=SAMPLES_LEAST)
     return _rotation_between(*at_rest, offset, overlap=1)
 
