@@ -85,8 +85,8 @@ def identifying(*axes):
     """
     Identify these axes of a recording only: 0, and those whose noise is not that of the one before.
 
-    Counted are the axes with a curve. The others get the figures of the one before, and keep their
-    curves and faults of readings.
+    Counted are the axes with a curve. The others get the figures of the one before, which are not
+    compared again, and keep their curves and faults of readings.
     """
     calls, identify_axis, known = count(), identify.identify_axis, []
 
