@@ -15,6 +15,7 @@ from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.turntable.estimation.session_noise import white_noise
+from imu_calibration.references.turntable.selection.investigation import investigate
 from imu_calibration.references.turntable.selection.testable_effects import (
     testable_effects as asked_of,
 )
@@ -27,6 +28,7 @@ from imu_calibration.simulation.session import (
     simulate_session,
 )
 
+from worlds.candidates import with_candidates
 from worlds.compensation_cases import random_calibration
 from worlds.diagnosing import diagnose
 from worlds.hiding import record
@@ -37,6 +39,7 @@ FEW = '+'.join(RECTIFICATION) + (
     '+accel_quadratic+gyro_quadratic+gyro_g_sensitivity+accel_bias_drift+gyro_bias_drift'
 )
 SHORT = {'profile': 'random_short', 'duration': 180.0}
+COARSE = {'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
 def test_the_variance_is_that_of_a_hum_whatever_turns_below_it():
@@ -196,7 +199,7 @@ def test_compensation_live_and_of_a_recording_take_the_rectification_out():
 
 def test_those_of_both_sensors_are_found_and_told():
     hidden = dict.fromkeys(RECTIFICATION)
-    recording = record(21312, hidden, through_bag=False, machine=True, **SHORT)
+    recording = record(21312, hidden, through_bag=False, machine=True, **SHORT, **COARSE)
     found = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
     assert {finding.effect for finding in found.findings} == set(RECTIFICATION)
     for finding in found.findings:
@@ -207,3 +210,13 @@ def test_those_of_both_sensors_are_found_and_told():
             abs(value - t) < 4 * sd + 0.2 * abs(t)
             for (value, sd, _), t in zip(finding.parameters.values(), true, strict=True)
         )
+
+
+def test_that_of_one_sensor_is_not_found_in_the_other():
+    hidden = RECTIFICATION[1]
+    kind = {'profile': 'quick', **COARSE}
+    recording = record(21312, {hidden: None}, through_bag=False, machine=True, **kind)
+    model = with_candidates(recording.model, '+'.join(RECTIFICATION))
+    found = investigate(recording.windows, recording.table, model)
+    assert {question.name for question in found.problem.questions} == set(RECTIFICATION)
+    assert [question.name for question in found.named] == [hidden]
