@@ -495,7 +495,8 @@ def test_g_sensitivity_test_keeps_its_level():
             np.arange(15.0),
         )
         values.append(g_sensitivity_evidence(poses)['g_sensitivity_p_value'])
-    assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.05  # four sd of 300 trials
+    # 5 to 29 of 300: a level of 5 % is outside once in a thousand draws.
+    assert 0.015 < np.mean(np.array(values) < 0.05) < 0.10
 
 
 def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_see():
