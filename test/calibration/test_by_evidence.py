@@ -147,10 +147,12 @@ def test_a_lag_is_estimated_and_its_error_of_the_scale_removed(lag):
 
 
 def test_a_bend_of_the_rate_leaves_no_error_in_the_matrix(bent):
-    found = bent.asked.calibration
+    found, plain = bent.asked.calibration, bent.plain
     for name, true in zip(PARAM_NAMES[ROWS], bent.truth[ROWS]):
         place = found.param_names.index(name)
         assert abs(found.values[place] - true) < 4.5 * found.sd[place]
+    assert 'added' not in plain.statistics
+    assert not any(QUADRATIC in name for name in plain.param_names)
 
 
 def test_diagnose_hands_over_what_calibrate_does(case):
@@ -168,7 +170,7 @@ def test_diagnose_hands_over_what_calibrate_does(case):
 def test_a_clean_session_adds_nothing():
     pair = make_pair(None, 12, **COARSE)
     found = imu.calibrate(pair.first.block, Table.from_mapping(pair.table), candidates=FEW)
-    assert not set(found.calibration.statistics) & {'added', 'denied'}
+    assert not set(found.calibration.statistics) & {'added', 'denied', 'unexplained'}
 
 
 def test_the_search_begins_with_the_effects_that_it_may_not_test():
@@ -386,9 +388,11 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     monkeypatch.undo()
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_, **settings: False)
     faint = imu.calibrate(late[0].block, late[1], candidates=LAGS).calibration
-    assert set(faint.statistics['unexplained']) == {'accelerometer', 'gyroscope'}
+    rms = {sensor: rest['rms'] for sensor, rest in faint.statistics['unexplained'].items()}
+    assert set(rms) == {'accelerometer', 'gyroscope'}
+    assert 0.2 < rms['accelerometer'] < 0.35 and 2e-3 < rms['gyroscope'] < 4e-3
     assert (
-        'time_offset' in faint.statistics['denied']
+        faint.statistics['denied'] == ['time_offset']
         and 'added' not in faint.statistics
         and OFFSET not in faint.param_names
     )
