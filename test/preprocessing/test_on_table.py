@@ -101,6 +101,26 @@ def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds
         calibrate_recordings(later(shaft[0], seconds), shaft[1])
 
 
+def test_the_delay_between_the_streams_of_three_joints_is_named(gimbals):
+    table, time = gimbals[1], np.arange(1000) * 0.04
+    zero = np.zeros((len(time), 3))
+
+    def turning(time):
+        phase = np.outer(time, [0.62, 0.86, 1.14])
+        position = np.sin(phase) + np.sin(0.37 * phase)
+        return JointMotion(time, position, np.gradient(position, 0.04, axis=0), zero, zero)
+
+    told = turning(time)
+    rate = reference_motion(table, told).rate_s
+    for delay, words in ((2.0, ' 2.0 s behind '), (-2.0, ' 2.0 s ahead ')):
+        felt = reference_motion(table, turning(time - delay))
+        window = Window(
+            WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, felt.force_s, felt.rate_s, told
+        )
+        sums = ProductSums(felt.rate_s.T @ rate, rate.T @ rate, felt.rate_s.T @ felt.rate_s)
+        assert words in same_motion(sums, [window], table).text
+
+
 def test_one_joint_the_other_way_round_is_told_from_a_wrong_imu(shaft):
     with refused(InputError, 'on_table', 'shaft turns the other way round', 'measured x is minus'):
         calibrate_recordings(joints(shaft[0], sign=-1.0), shaft[1])
@@ -217,6 +237,7 @@ def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_diffe
 @pytest.mark.parametrize(
     ('signs', 'corrected'),
     [
+        ((-1, 1, 1), ['outer']),
         ((1, -1, 1), ['middle']),
         ((1, 1, -1), ['inner']),
         ((-1, 1, -1), ['outer', 'inner']),
@@ -350,7 +371,7 @@ def frozen(block, *, joint, start, stop):
 
 def test_one_joint_that_stands_still_is_named_with_the_time(gimbals):
     block, table = gimbals
-    count, joint = len(block.joints.position), 1
+    count, joint = len(block.joints.position), 2
     with refused(InputError, 'frozen', table.joint_names[joint], ' s to '):
         calibrate_recordings(
             frozen(block, joint=joint, start=count // 3, stop=3 * count // 4), table
