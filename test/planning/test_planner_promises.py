@@ -172,7 +172,7 @@ def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_di
     rests = {
         tuple(motion.place.round(6)) for motion in plan.motions if motion.kind is MotionKind.POSE
     }
-    assert len(rests) >= LEAST_RESTS and 15.0 < plan.lower_bound_seconds <= plan.seconds < 30.0
+    assert len(rests) >= LEAST_RESTS and 15.0 < plan.lower_bound_seconds < plan.seconds < 30.0
     profile = Profile(
         'plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names)
     )
