@@ -176,7 +176,8 @@ def check_velocity(
     if rms.min() < 1e-12:
         return False, np.inf
     scaled = columns / rms
-    inverse = np.linalg.pinv(scaled.T @ scaled)
+    # Of two arrays: the product of one with itself is computed otherwise, and rounded otherwise.
+    inverse = np.linalg.pinv(scaled.T @ (columns / rms))
     estimate = inverse @ (scaled.T @ velocity[good]) / rms
     noise_sd = np.sqrt(np.mean((velocity[good] - columns @ estimate) ** 2))
     # Their sd: of the samples only `dof` are independent, at least four.
