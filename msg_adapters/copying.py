@@ -75,7 +75,7 @@ def copy_with_corrected(
     late_ns : int
         Subtracted from the stamps of the corrected messages.
     source_frame_id : str, optional
-        Frame of the messages that are corrected; see `msg_adapters.bag.open_recording`.
+        Frame of the messages that are corrected; default: of all, which must have one frame.
     log : LogOptions
         As for `msg_adapters.bag.open_recording`.
     check : callable, optional
@@ -118,9 +118,10 @@ def copy_with_corrected(
             for raw in bag.stretches(topics):
                 measured = np.flatnonzero(raw.topic == imu_number)
                 _write(writer, ids[raw.topic], raw, measured, corrected_id, patch)
+            # Within the writer: an error removes the bag.
+            choice.check()
             if check is not None:
                 check()
-        choice.check()
         return recording.lost | dict(patch.dropped)
 
 

@@ -203,12 +203,14 @@ class RecordingTimes:
 
         All coefficients c of the model are fitted. With the expected variances ``D c`` and the
         covariance C of the measured ones, the information on relative changes of c is ``diag(c) D'
-        C^-1 D diag(c)``.
+        C^-1 D diag(c)``. C is quadratic in c, as Allan variances are in the noise: with the tensor
+        T of the pairs (p, q) of processes, ``C_ij = sum_pq c_p c_q T_pqij``.
         """
         moments = self._moments(seconds)
         design = moments.design(processes)
         tensor = moments.tensor(processes)
-        whiten = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))
+        covariance = np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor)
+        whiten = Whitener(covariance)
         columns = whiten(design * coefficients)  # of relative changes of the coefficients
         information = columns.T @ columns
         # With a unit diagonal, so that the inverse is accurate.

@@ -81,10 +81,10 @@ def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
     names = [path.name if path.is_dir() else path.stem for path in unit_paths]
     units = []
     for path, name in zip(unit_paths, names):
-        # A folder without bags is a unit too, which then fails.
+        # A folder without bags is a unit too: its failure is shown, where it would be missed else.
         bags = bags_of(path) or [path]
-        # Files that differ in their suffix only have it in their names.
-        units.append((name if names.count(name) == 1 else bags[0].name, bags))
+        # With its suffix, a file has another name than a file or folder that differs only in that.
+        units.append((name if names.count(name) == 1 else path.name, bags))
     if not units:
         raise InputError(
             f'{folder} must hold one bag or one sub-folder with bags per unit, there is none; give'

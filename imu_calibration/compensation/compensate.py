@@ -325,9 +325,10 @@ def saturation_marks(
     calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray
 ) -> np.ndarray:
     """
-    Return the square of the saturation level of (force, rate), shape (n, 2).
+    Return the variances of `Corrected.marks` for measured force and rate, shape (n, 2).
 
-    0 for a sample of which no component reaches the level.
+    Of a sample of which a component reaches the saturation level, it is the square of this level:
+    the true value may lie anywhere beyond. Of other samples it is 0.
     """
     marks = np.zeros((len(force_s), 2))
     for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):

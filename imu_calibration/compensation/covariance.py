@@ -60,7 +60,11 @@ class Sensitivity:
     """Error of the derivative in the present motion."""
 
     def with_slope_error(self, slope_error: SlopeError) -> 'Sensitivity':
-        """Return the same with another derivative of the rate: its weights and its error."""
+        """
+        Return the same with another derivative of the rate: its weights and its error.
+
+        Without weights they are those of the full window, which the sensitivity has already.
+        """
         weights = slope_error.weights
         if weights is None:
             return replace(self, slope_error=slope_error)

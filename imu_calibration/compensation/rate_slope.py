@@ -554,7 +554,8 @@ class RateSlope:
 
         Its covariance is ``N / Sxx``, ``Sxx = sum((t - mean t)^2)``, N the covariance of the rate.
         """
-        # The newest stamps and the rates that were stored with them.
+        # The newest stamps and the rates that were stored with them: before the kind of the stamps
+        # is known, `_recent` has rates; afterwards derivatives.
         n = min(len(self._stamps), len(self._recent))
         stamps = np.array(list(self._stamps)[len(self._stamps) - n :], np.int64)
         readings = np.array(list(self._recent)[len(self._recent) - n :]).reshape(-1, 3)

@@ -186,16 +186,17 @@ def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
 
     ``rotation_from_rpy`` gives the matrix back to rounding.
 
-    At a pitch of a quarter turn only one combination of roll and yaw is defined; yaw follows from
-    the remainder (Shoemake), so that their errors cancel there.
+    At a pitch of a quarter turn only one combination of roll and yaw is defined. Yaw is therefore
+    that of the remainder ``matrix Rx(roll)' = Rz(yaw) Ry(pitch)``, whose second column is
+    ``(-sin yaw, cos yaw, 0)`` (Shoemake): errors of roll and yaw cancel there.
     """
     roll = np.arctan2(matrix[2, 1], matrix[2, 2])
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
     sin = np.sin(roll)
     cos = np.cos(roll)
-    yaw = np.arctan2(
-        sin * matrix[0, 2] - cos * matrix[0, 1], cos * matrix[1, 1] - sin * matrix[1, 2]
-    )
+    sin_yaw = sin * matrix[0, 2] - cos * matrix[0, 1]
+    cos_yaw = cos * matrix[1, 1] - sin * matrix[1, 2]
+    yaw = np.arctan2(sin_yaw, cos_yaw)
     return np.array([roll, pitch, yaw])
 
 

@@ -562,9 +562,12 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
         k^2   = 1 / time^2 + 2 S / (time white)
         level = 1 / (time k)^2
         b     = (1 - level) / (white (cosh(k T / 2) + k time sinh(k T / 2)))
+        r     = tanh(k T / 2)
+        integral(h) = (level T + 2 (1 - level) r / (k (1 + k time r))) / white
 
-    Of several processes the variances add up (parallel sums are concave), with the white noise
-    added to any one of them: the largest sum counts.
+    Of several processes the least variances add up to a bound, because the least variance is a
+    concave function of the covariance. The white noise may belong to any one of them: the largest
+    of these bounds counts.
 
     Parameters
     ----------
@@ -578,9 +581,9 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
     for process in noise.bias_processes:
         k = np.sqrt(1 / process.time**2 + 2 * process.sd**2 / (process.time * white))
         level = 1 / (process.time * k) ** 2
-        tanh = np.tanh(k * seconds / 2)
+        r = np.tanh(k * seconds / 2)
         integral_of_h = (
-            level * seconds + 2 * (1 - level) * tanh / (k * (1 + k * process.time * tanh))
+            level * seconds + 2 * (1 - level) * r / (k * (1 + k * process.time * r))
         ) / white
         others = tuple(other for other in noise.bias_processes if other is not process)
         variance_of_others = common_variance(replace(noise, bias_processes=others), seconds)

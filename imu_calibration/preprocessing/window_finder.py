@@ -238,8 +238,11 @@ class MotionGatherer:
         """
         Move the streams whose clocks were not reset to the new epoch.
 
-        `old`: the `MotionChunks` of the epoch before, whose joints are used further.
+        They are those without samples in the queue, which waits for the next epoch. `old`: the
+        `MotionChunks` of the epoch before.
         """
+        # The joints at the end of the epoch are still needed: the next samples of the IMU are
+        # interpolated between them and later ones. Those of the IMU were used up.
         if not self._queue['joints']:
             self._chunks.add(joints=old.remaining_joints())
         for name in STREAMS:

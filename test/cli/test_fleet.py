@@ -14,7 +14,7 @@ import yaml
 from refusal import refused
 
 from imu_calibration.api.resources import config_file
-from imu_calibration.cli.fleet_run import fleet_unit_rows, summary_html
+from imu_calibration.cli.fleet_run import find_units, fleet_unit_rows, summary_html
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
@@ -148,6 +148,15 @@ def test_the_summary_is_that_of_the_units(result):
     assert float(found['spread_over_sd']) > 10, (
         'units of one grade differ by far more than a calibration is uncertain'
     )
+
+
+def test_a_folder_and_a_file_that_differ_in_their_suffix_have_names_of_their_own(tmp_path):
+    for run in ('run_1', 'run_2'):
+        (tmp_path / 'units/a' / run).mkdir(parents=True)
+        (tmp_path / 'units/a' / run / 'metadata.yaml').touch()
+    (tmp_path / 'units/a.mcap').touch()
+    units = dict(find_units(tmp_path / 'units', tmp_path / 'output'))
+    assert {name: len(bags) for name, bags in units.items()} == {'a': 2, 'a.mcap': 1}
 
 
 def test_a_unit_has_the_word_of_each_sensor(result):

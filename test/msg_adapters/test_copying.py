@@ -99,6 +99,16 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
             tmp_path / 'a', tmp_path / 'b', '/imu/data_raw', corrected_topic='/c', correct=fail
         )
     assert [path.name for path in tmp_path.iterdir()] == ['a']
+    with refused(InputError, 'frame_unknown', 'elsewhere', 'imu_link'):
+        copy_with_corrected(
+            tmp_path / 'a',
+            tmp_path / 'b',
+            '/imu/data_raw',
+            corrected_topic='/c',
+            correct=lambda s: corrected_samples(s.force_s, s.rate_s),
+            source_frame_id='elsewhere',
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ['a']
     with refused(InputError, 'topic_taken'):
         copy_with_corrected(
             tmp_path / 'a',

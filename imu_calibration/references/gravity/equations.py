@@ -258,10 +258,11 @@ class _Equations:
         )
         main = np.zeros((len(true), 3, model.size))
         main[:, :, 0:3] = np.eye(3)
-        # After three biases, row i of the matrix has the places 3 + 3 i to 5 + 3 i; of the lower
-        # triangular one the elements up to i.
+        # After three biases, row i of the matrix begins at the place 3 + 3 i. Of its lower triangle
+        # it has i + 1 elements; those above the diagonal are fixed.
         for i in range(3):
-            main[:, i, 3 + 3 * i : 4 + 4 * i] = true[:, : i + 1]
+            first = 3 + 3 * i
+            main[:, i, first : first + i + 1] = true[:, : i + 1]
         main[:, :, model.extra_index('accelerometer')] = slopes
         return self._of_each_pose(
             poses.force - self.force_bias - true @ self.force_matrix.T - further_output,

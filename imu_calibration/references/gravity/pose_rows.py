@@ -147,6 +147,8 @@ def _columns(
     It is computed at the baseline's solution, for the true force, shape (m, 3), and the further
     inputs of `HandModel.further_output`; `tau`: the time constant of a warm-up, s.
     """
+    # A model in which the effect is the only one beyond bias and matrix, linearised at the time
+    # constant: what `further_output` returns is then of this effect alone.
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     sensors = replace(hand.model, accelerometer=BASE, gyroscope=BASE, point=point)
     sensors = sensors.with_effect(effect.sensor, effect.name)

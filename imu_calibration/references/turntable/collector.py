@@ -103,9 +103,11 @@ def to_bytes(
     model : SensorModel
         The model of its columns.
     extension : ModelExtension
-        Effects added to the requested model; the solution of a search is computed again.
+        Effects added to the requested model, saved without `clipped`: the solution of windows
+        without clipped samples is computed again.
 
     """
+    # Filled by `_packed`. Of the catalogue only the definitions of the user's effects are needed.
     arrays: list[np.ndarray] = []
     session_fields = {name: getattr(gathered, name) for name in SAVED_PARTS}
     model_fields = {f.name: getattr(model, f.name) for f in fields(model) if f.name != 'catalogue'}

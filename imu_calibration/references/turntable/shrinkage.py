@@ -13,8 +13,9 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     With the distance d of an effect from its prior, its covariance C and ``chi2 = d' C^-1 d`` in k
     directions, d is multiplied by ``1 - k / chi2``, at least 0 (James and Stein). The other
     parameters are updated as if the effect were known at the shrunk value. An absent effect then
-    adds little error to the other parameters, a significant effect is kept, and the standard
-    deviations are valid in both cases.
+    adds little error to the other parameters, and a significant effect is kept. The effects are
+    shrunk one after the other, each from the values that the one before left; covariance and
+    standard deviations remain those of the estimate.
 
     Parameters
     ----------
@@ -25,7 +26,7 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     """
     values = solution.values.copy()
     prior = make_prior(solution.model).mean
-    covariance = of_fit(solution.terms)
+    covariance = of_fit(solution.terms)  # of the least squares, without allowances for the model
     for part in parts:
         index = np.arange(part.start, part.stop)[~solution.held[part]]
         if not len(index):

@@ -33,7 +33,8 @@ def extended_solution(
         Limits to write into the model.
 
     """
-    # Linearised where the rows of the recording are, so that their statistics are used again.
+    # Linearised where the rows of the recording are, so that their statistics are used again: the
+    # point of the baseline, and of effects that only the rows have; arms folded into the columns.
     model_of_rows = problem.recording.model
     model = replace(
         problem.baseline,
@@ -43,6 +44,7 @@ def extended_solution(
     )
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
+    # Of some axes only the slow part is compared (`ParameterSpace.slow_only`).
     trusted = {
         sensor: _in_trusted_band(noise, problem.space.slow_only[sensor])
         for sensor, noise in problem.noise.items()
