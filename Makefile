@@ -38,7 +38,7 @@ endif
 
 STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
-# Every line of the list and of those that it names. The lists are complete: nothing is resolved, and two processes install half of one each.
+# Every line of the list and of those that it names. The lists are complete: nothing is resolved, and each of four processes installs 45 at a time.
 ALL_PINS = cat $(PINS) $$(sed -n 's|^-r |constraints/|p' $(PINS))
 # Four processes on two cores: live tests mostly wait. conftest.py orders the files. test/run_lanes.py repeats live tests that failed.
 LANES = $(PY) test/run_lanes.py

@@ -501,7 +501,7 @@ def _sensors(
         return _Readings((force,), ImuSamples(stamp_ns, force_s, absent, 'imu_link'))
     raw_rate = table.values(by_quantity['rate'].names)
 
-    # Most rows with a reading have both sensors: each row is a sample.
+    # Most rows of the rarer sensor have both: each row is a sample.
     has_both = np.isfinite(force_s).all(axis=1) & np.isfinite(raw_rate).all(axis=1)
     accelerometer = finite_stream(stamp_ns, force_s)
     gyroscope = finite_stream(stamp_ns, raw_rate)
@@ -930,7 +930,7 @@ def _split_unit(text: str) -> tuple[str, str]:
 
     The last colon is before the unit, except that `SCALED_UNITS` contain a colon.
     """
-    scaled = re.fullmatch(r'(.*?):((counts|increments):.*)', text)
+    scaled = re.fullmatch(f'(.*?):((?:{"|".join(SCALED_UNITS)}).*)', text)
     if scaled:
         return scaled[1], scaled[2]
     names, colon, unit = text.rpartition(':')

@@ -262,7 +262,7 @@ def walk(buffer: np.ndarray) -> Walk:
     others = []
     position = 0
     last_length = -1
-    n_equal = 0  # messages of `last_length` that directly precede the present one
+    n_equal = 0  # messages of `last_length` before the present one, records of other kinds aside
     end = len(buffer)
     while position + PREFIX.size <= end:
         opcode, length = PREFIX.unpack_from(view, position)

@@ -533,14 +533,16 @@ def _record_for(axis: AxisNoise, times: RecordingTimes) -> dict[str, float | Non
         if not is_needed or term.status == DETERMINED or not np.isfinite(term.interval[1]):
             continue
         # The fitted model, with this process first if it is not part of it.
-        fitted = dict(zip(axis.fit.processes, axis.fit.coefficients))
-        coefficients = fitted if name in axis.fit.names else {PROCESSES[name]: 0.0} | fitted
-        coefficients[PROCESSES[name]] = (term.value or term.interval[1]) ** 2
+        fitted = dict(zip(axis.fit.names, axis.fit.coefficients))
+        coefficients = fitted if name in fitted else {name: 0.0} | fitted
+        coefficients[name] = (term.value or term.interval[1]) ** 2
         # Processes of zero size have no relative sd.
         positive = {process: value for process, value in coefficients.items() if value > 0}
-        processes = tuple(positive)
+        names = list(positive)
         needed[name] = times.needed(
-            processes, np.array(list(positive.values())), processes.index(PROCESSES[name])
+            tuple(PROCESSES[process] for process in names),
+            np.array(list(positive.values())),
+            names.index(name),
         )
     return needed
 

@@ -90,7 +90,7 @@ def still_parts(
         Smallest step between readings of each column.
 
     """
-    # Chunks in which a sensor repeats its reading, and those at another rate.
+    # Chunks in which a sensor repeats its reading, and those at the usual rate.
     frozen = np.logical_or(*frozen_chunks(chunks, resolution).values())
     seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0  # of a chunk
     usual_rate = _at_the_usual_rate(chunks, period)

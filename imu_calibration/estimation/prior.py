@@ -21,6 +21,13 @@ class Prior:
     gauge: np.ndarray
     """Rows of `root` that fix an origin and carry no information, shape (k, n_params)."""
 
+    @property
+    def root_without_gauge(self) -> np.ndarray:
+        """The rows of `root` that carry information, shape (k, n_params)."""
+        # The gauge follows the rows of the parameters; sums are behind it (`make_prior`).
+        n_params = len(self.mean)
+        return np.delete(self.root, slice(n_params, n_params + len(self.gauge)), axis=0)
+
 
 GAUGE_SD = 1e-12
 """How exactly a gauge holds, in the unit of its parameters."""

@@ -283,6 +283,8 @@ class CalibrationWorker(threading.Thread):
         """Whether data came after the last solution."""
         self._includes_pending = True
         """Whether no message was added after the last solution with open windows."""
+        self._has_ended = False
+        """Whether the messages ended and no solution was made since."""
         self._covered: tuple[int, int, int] | None = None
         """State of the last picture of the coverage (see `_update_coverage`)."""
         self._trouble = ''
@@ -406,16 +408,17 @@ class CalibrationWorker(threading.Thread):
         The first solution after the end of the messages is followed by a diagnosis.
         """
         silence = self._read_at - (self._watch.last_arrival or 0.0)
-        messages_ended = not self._includes_pending and silence > IDLE
-        if messages_ended:
+        if not self._includes_pending and silence > IDLE:
             self._includes_pending = True
             self._new_windows = True
+            self._has_ended = True
         if not self._new_windows or not self._pacer.due(time.monotonic()):
             return
         self._new_windows = False
         try:
             self._publish_solution(pending=self._includes_pending)
-            if messages_ended:
+            if self._has_ended:
+                self._has_ended = False
                 self._diagnosis.want()
         except ImuCalibrationError as error:
             self._trouble = error.with_hint(self.hints)
@@ -512,6 +515,7 @@ class CalibrationWorker(threading.Thread):
         self.live = self.make_live()
         self._new_windows = False
         self._includes_pending = True
+        self._has_ended = False
         self._n_diagnosed = 0
         self.session_files.note_saved(0)
         self._trouble = ''

@@ -98,8 +98,8 @@ def relax(
         worth = np.zeros(len(seconds))
         worth[useful] = flat_useful @ prices.ravel() / seconds[useful]
         plan_seconds = scale * float(visits @ seconds)
-        # 2. Every 25 steps the certificate, the end of the search, and the useful motions: only the
-        #    certificate needs the worth of all.
+        # 2. Every 25 steps the certificate, the end of the search, and the choice of the useful
+        #    motions, which need the worth of all.
         if number % 25 == 0 or number == MAX_WEIGHT_STEPS - 1:
             worth = flat @ prices.ravel() / seconds
             factor = 1.0 / worth.max()

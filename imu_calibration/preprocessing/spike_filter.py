@@ -275,9 +275,9 @@ def _off_the_median(around: np.ndarray, place: np.ndarray, limit: np.ndarray) ->
     """
     Return where readings deviate from the median of nine, which two further outliers do not move.
 
-    The deviation is `SPIKE_SPREADS` times the range of the nine without the two lowest and the two
-    highest, and no neighbour has a smaller deviation, which would indicate a knock. Arguments as
-    for `_contradicted`.
+    The deviation exceeds `limit` and `SPIKE_SPREADS` times the range of the nine without the two
+    lowest and the two highest, and no neighbour has a visible smaller one, which would indicate a
+    knock. Arguments as for `_contradicted`.
     """
     ordered = np.sort(around, axis=1)
     deviations = np.abs(around - ordered[:, [SPIKE_NEIGHBOURS]])

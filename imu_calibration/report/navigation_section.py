@@ -181,7 +181,11 @@ def _constant_growth(time: np.ndarray, variances: np.ndarray, gravity: float) ->
 
 
 def _noise_growth(time: np.ndarray, densities: list[float], gravity: float) -> Growth:
-    """Return the Growth of white noise (`expected_growth`), one run; as of `noise_densities`."""
+    """
+    Return the Growth of white noise (`expected_growth`) as one run.
+
+    `densities`: of each axis, accelerometer and gyroscope (`noise_densities`).
+    """
     force, rate = densities
     force *= np.sqrt(3)
     rate *= np.sqrt(2)

@@ -166,7 +166,8 @@ def _progress(figure, plan):
     time = np.concatenate([[0.0], plan.ends])
     history = plan.history  # a column for each requested parameter
     labelled = set()  # sensors that are in the legend
-    for name, values in zip(itertools.compress(plan.model.param_names, plan.wanted), history.T):
+    names = itertools.compress(plan.model.param_names, plan.wanted)
+    for name, values in zip(names, history.T, strict=True):
         sensor = name.split('.')[0]
         colour = AXIS_COLOURS['x'] if sensor == SENSORS[0] else AXIS_COLOURS['z']
         label = None if sensor in labelled else sensor

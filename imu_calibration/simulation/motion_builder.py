@@ -184,7 +184,7 @@ class Profile:
         """
         Return position, rate, acceleration and jerk at times within the profile, (4, n, n_joints).
         """
-        if not np.all(time[1:] >= time[:-1]):
+        if np.any(time[1:] < time[:-1]):
             order = np.argsort(time, kind='stable')
             motion = np.empty((4, len(time), len(self.segments[0].start)))
             motion[:, order] = self._evaluate(time[order])

@@ -345,13 +345,9 @@ class TableController:
         return JointMotion(time, *motion)
 
     def _profile_motion(self, time: np.ndarray) -> JointMotion:
-        """
-        Return the motion of the joints before the first trajectory, at times of shape (m,).
-
-        The times of the result are not set.
-        """
+        """Return the motion of the joints before the first trajectory, at times of shape (m,)."""
         if self._profile is None:
-            return rest_at(np.tile(self._home, (len(time), 1)))
+            return replace(rest_at(np.tile(self._home, (len(time), 1))), time=time)
         if not self._repeat:
             return self._profile.at(time)
         # Each repetition starts from the position at the end of the previous one.

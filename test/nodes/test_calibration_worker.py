@@ -56,3 +56,20 @@ def test_what_came_while_a_solution_was_made_is_no_silence(station):
     worker._solve_when_due()
     worker._update_state()
     assert worker.state.streams.silent == ('imu', 'joints') and worker._includes_pending
+
+
+def test_a_diagnosis_follows_the_first_solution_after_the_end_though_it_is_late(
+    station, monkeypatch
+):
+    worker, waiting, clock = station
+    wanted = []
+    monkeypatch.setattr(worker._diagnosis, 'want', lambda: wanted.append(clock.now))
+    waiting.append(make_session(1, profile='quick').block)
+    worker._process_messages()
+    worker._solve_when_due()
+    clock.now += LONG
+    worker._process_messages()
+    for is_due in (False, True, True):
+        monkeypatch.setattr(worker._pacer, 'due', lambda now, is_due=is_due: is_due)
+        worker._solve_when_due()
+        assert len(wanted) == is_due

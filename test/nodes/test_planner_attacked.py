@@ -4,7 +4,6 @@ planner_node attacked over DDS.
 What is not known, not finite, not alone or not true stops the joints or keeps them from moving.
 """
 
-import re
 import time
 from contextlib import ExitStack
 
@@ -105,8 +104,8 @@ def test_stamps_that_stand_still_are_a_fault_within_the_silence(bench):
     table = bench(silence=3.0, stall_patience=60.0).moving()
     driver = table.planner.driver
     table.looks(lambda: driver.state is DriveState.STOPPED, 'the stop', elapsed=0.0)
-    assert float(re.search(r'([\d.]+) s ', driver.reason)[1]) >= 3.0, driver.reason
-    assert driver.stamp_fault(time.monotonic())
+    stopped_at = time.monotonic()
+    assert stopped_at - table.advanced_at >= 3.0 and driver.stamp_fault(stopped_at)
     table.looks(lambda: not table.trajectories[-1].points, 'the empty trajectory', elapsed=0.0)
     answer = table.ask('start', elapsed=0.0)
     assert not answer.success and driver.state is DriveState.STOPPED

@@ -5,6 +5,7 @@ With the joints, the controller and calibration_node of the test.
 """
 
 import json
+import time
 from functools import partial
 
 import numpy as np
@@ -70,6 +71,8 @@ class PlannerBench(OneProcess):
     def look(self, elapsed=PERIOD, **fields):
         """Publish a joint state so much later, and let everything be heard."""
         self.stamp += elapsed
+        if elapsed:
+            self.advanced_at = time.monotonic()
         message = JointState(
             name=NAMES,
             position=[float(value) for value in self.position],

@@ -135,15 +135,16 @@ def _of_estimated_rate(
         return ()
     rate = solution.values[rate_params]
     covariance = solution.covariance[rate_params, rate_params]
-    magnitude, sd = _magnitude(rate, covariance)
 
     # Without a latitude only the magnitude of the Earth's rate is known.
     if table.latitude is None:
+        magnitude, sd = _magnitude(rate, covariance)
         return (_excess(magnitude, sd),) if _exceeds_earth_rate(magnitude, sd) else ()
     up_sd = float(np.sqrt(covariance[2, 2]))
     severity = _severity(rate[2] - _vertical_rate(table), up_sd)
     if severity is not None:
         return (_vertical_finding(table, rate[2], up_sd, severity),)
+    magnitude, sd = _magnitude(rate, covariance)
     if _contradicts(magnitude - EARTH_RATE, sd):
         return (_finding('magnitude', magnitude, sd, expected=EARTH_RATE, severity=WARNING),)
     return ()

@@ -202,10 +202,10 @@ class WindowObservations:
         """
         prior = make_prior(result.solution.model)
         # The rows of the prior after one row for each parameter are those of the gauge, which are
-        # so precise that its directions have the largest singular values.
-        gauge = prior.root[len(result.tolerances) :]
+        # so precise that its directions have the largest singular values, and of sums.
+        conventions = prior.root[len(result.tolerances) :]
         values = tolerance_scaled_singular_values(
-            result.solution.information + gauge.T @ gauge, result.tolerances
+            result.solution.information + conventions.T @ conventions, result.tolerances
         )
         return values[len(prior.gauge) :]
 

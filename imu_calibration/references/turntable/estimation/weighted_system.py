@@ -178,12 +178,11 @@ class WeightedSystem(WindowMeans):
         design = np.einsum('kp,paq->kaq', means[:, :-3], slope)
         rows = np.concatenate([design, self.misfit(sensor, means, values)[:, :, None]], axis=2)
 
-        # Rows of the prior of these parameters. The last rows of its root are those of the gauge.
-        n_rows = len(self.prior.root) - len(gauge)
-        root = self.prior.root[:n_rows, acting]
-        used = np.flatnonzero(np.any(root != 0, axis=1))
-        offset = self.prior.root[used] @ (self.prior.mean - values)
-        parts = [np.concatenate([root[used] @ basis, offset[:, None]], axis=1)]
+        # Rows of the prior of these parameters.
+        root = self.prior.root_without_gauge
+        root = root[np.any(root[:, acting] != 0, axis=1)]
+        offset = root @ (self.prior.mean - values)
+        parts = [np.concatenate([root[:, acting] @ basis, offset[:, None]], axis=1)]
 
         # Weighted centred rows of the three axes.
         for factor, weight in self.weighed_rows(sensor, noise):

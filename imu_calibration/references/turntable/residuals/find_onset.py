@@ -273,7 +273,7 @@ def _follows_temperature(
     temperature = rows.space.recording.describe['temperature']
     if not np.all(np.isfinite(temperature)) or np.ptp(temperature) == 0:
         return False
-    # As many windows on either side of a temperature as before and after an onset.
+    # As for onsets, at least `MIN_ONSET_WINDOWS` windows on either side.
     limits = np.sort(temperature)[MIN_ONSET_WINDOWS:-MIN_ONSET_WINDOWS]
     for limit in limits[:: max(len(limits) // MOST_LIMITS, 1)]:
         above = (temperature > limit).astype(float)[:, None]

@@ -91,7 +91,7 @@ class ScatterSearch(RegimeSearch):
             excess = np.maximum(energy - count, 0.0)
             share = excess[0] / max(excess.sum(), TINY)
             cost = np.sum(variance_cost(energy, count))
-            if share < MOST_OF_IT or cost >= largest_cost:
+            if not (share >= MOST_OF_IT and cost < largest_cost):  # also where a cost is NaN
                 continue
             bounds = variable.bounds(bins)
             regimes.append(

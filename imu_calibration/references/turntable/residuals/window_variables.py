@@ -43,7 +43,7 @@ def variables_of(blocks: BlockMeans, joint_names: Sequence[str]) -> list[Variabl
         temperature = ref.temperature_c
         variables += of_value('temperature', temperature, 'C', least=0.5)
         # Slope of a polynomial, which smooths the steps of the thermometer: at least ten rows for
-        # each of its coefficients.
+        # each degree.
         degree = min(12, len(temperature) // 10)
         course = np.polynomial.Chebyshev.fit(ref.time, temperature, degree)
         slope = np.gradient(course(ref.time))

@@ -366,7 +366,8 @@ def _curvature(
     Return the relative error of the tangent of an effect at its estimate.
 
     For a lag it is its change from the linearisation times `DELAY_FREQUENCY`, for a time constant
-    the logarithm of the ratio. Other effects multiply the matrix of the sensor (`BILINEAR`).
+    the logarithm of the ratio. For other effects it is `BILINEAR`: some are multiplied by the
+    matrix of the sensor, which an omitted effect may have changed by that share.
     """
     effect = question.effect
     value = values[list(question.parameters)]
