@@ -184,9 +184,13 @@ def _exchange(rclpy, context, case, speed):
             executor.spin_once(timeout_sec=max(moment - time.monotonic(), 0.0))
         for publisher in publishers.values():
             publisher.publish(data)
-    _spin_until(
-        executor, lambda: all(len(store) >= len(messages) for store in received.values()), 30.0
-    )
+
+    # Nodes hold back the first messages of violent motion, so the last one is not known by number.
+    def have_last():
+        last = case.imu_a.stamp_ns[-1]
+        return all(store and parse_imu(store[-1]).stamp_ns == last for store in received.values())
+
+    _spin_until(executor, have_last, 30.0)
     executor.shutdown(timeout_sec=1.0)
     node.destroy_node()
     parsed = {name: map(parse_imu, store) for name, store in received.items()}

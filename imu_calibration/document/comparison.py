@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import exit_code_of
@@ -465,6 +464,8 @@ def _groups(
     The distance is computed with the correlations C and the differences e in standard deviations:
     ``d' P^-1 d = e' C^-1 e``. C may be singular; its rank is then the degrees of freedom.
     """
+    from scipy.special import chdtrc  # here: compensator_node compares, but needs no test
+
     effects = [name.rpartition('.')[0] for name in names]
     groups = []
     for name in dict.fromkeys(effects):

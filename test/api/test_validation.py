@@ -178,9 +178,9 @@ def test_one_imu_predicts_another_live(recordings):
     pytest.importorskip('rclpy')
     with candidates_in_scripts('none'):
         case = arm_live.prepare(recordings, 'array_2', 'array_5', seconds=40.0)
-    found, count = arm_live.residuals(
-        case, arm_live.play(case, speed=5.0, domain_id=arm_live.DOMAIN + 1)
-    )
+    came = arm_live.play(case, speed=5.0, domain_id=arm_live.DOMAIN + 1)
+    assert [max(messages) for messages in came.values()] == 2 * [case.imu_a.stamp_ns[-1]]
+    found, count = arm_live.residuals(case, came)
     before, after = arm_live.rms(found['turned']), arm_live.rms(found['moved'])
     print(
         f'live: one IMU from another, {len(found["moved"])} samples, {before:.2f} m/s^2, with the'

@@ -35,7 +35,21 @@ PRELOADED = (
     'imu_calibration.api.recordings',
     'msg_adapters.bag',
     'msg_adapters.live',
+    # What nodes import later, where they need it first.
+    'scipy.interpolate',
+    'scipy.optimize',
+    'scipy.stats',
+    # What rclpy imports.
+    'diagnostic_msgs.msg',
+    'rcl_interfaces.msg',
+    'rcl_interfaces.srv',
+    'rosidl_generator_py',
     'sensor_msgs.msg',
+    'std_msgs.msg',
+    'std_srvs.srv',
+    'trajectory_msgs.msg',
+    'visualization_msgs.msg',
+    'yaml',
 )
 """
 What nodes import, except rclpy: its libraries give all processes that are forked afterwards the
