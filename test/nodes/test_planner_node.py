@@ -312,7 +312,8 @@ class Loop(Station):
     def begin(self, folder, planner=None, calibration=None, **simulator):
         """Start the three nodes and wait until they know each other."""
         self.watch_diagnostics()
-        self.calibration_node(folder, **(calibration or {}))
+        # The planner asks for the solutions that it needs: few others are made.
+        self.calibration_node(folder, **{'solve_share': 0.02, **(calibration or {})})
         self.simulator = self.start(
             'simulator_node',
             {
