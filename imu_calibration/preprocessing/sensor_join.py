@@ -132,10 +132,14 @@ class OtherSensor:
 
 def finite_stream(stamp_ns: np.ndarray, values: np.ndarray) -> SensorStream:
     """Return the finite readings of one sensor whose stamps exceed all stamps before."""
-    finite = SensorStream(stamp_ns, values).select(np.isfinite(values).all(axis=1))
-    newest = np.maximum.accumulate(finite.stamp_ns)
-    advances = np.append(True, finite.stamp_ns[1:] > newest[:-1])[: len(finite)]
-    return finite.select(advances)
+    readings = SensorStream(stamp_ns, values)
+    is_finite = np.isfinite(values).all(axis=1)
+    # A long recording is not copied where all of it is used.
+    if not is_finite.all():
+        readings = readings.select(is_finite)
+    newest = np.maximum.accumulate(readings.stamp_ns)
+    advances = np.append(True, readings.stamp_ns[1:] > newest[:-1])[: len(readings)]
+    return readings if advances.all() else readings.select(advances)
 
 
 def join_sensors(
@@ -251,25 +255,32 @@ def _gravity_windows(accelerometer: SensorStream) -> _GravityWindows | None:
         return None
     time = (accelerometer.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
     half = max(int(round(0.5 * DELAY_WINDOW / (accelerometer.period_ns * 1e-9))), 1)
-    length = np.linalg.norm(accelerometer.values, axis=1)
-    median_length = np.median(length)
+    median_length = np.median(np.linalg.norm(accelerometer.values, axis=1))
     if not median_length > 0.0 or len(time) < 4 * half:
         return None
-    # A specific force near zero has no direction.
-    has_direction = (length > 0.1 * median_length)[:, None]
-    direction = unit_rows(np.where(has_direction, accelerometer.values, 1.0))
-
     start = np.arange(0, len(time) - 2 * half, half)
     # Without a gap: of a slow sensor a window has two periods, which may be jittered.
     longest = 2.0 * DELAY_WINDOW + 4e-9 * accelerometer.period_ns
     start = start[time[start + 2 * half] - time[start] < longest]
     stop = start + 2 * half
+    force = accelerometer.values
+    least_length = 0.1 * median_length
     return _GravityWindows(
         start=time[start],
         stop=time[stop],
-        middle=direction[start + half],
-        change=direction[stop] - direction[start],
+        middle=_directions(force[start + half], least_length),
+        change=_directions(force[stop], least_length) - _directions(force[start], least_length),
     )
+
+
+def _directions(force: np.ndarray, least_length: float) -> np.ndarray:
+    """
+    Return the unit vectors of specific forces, shape (n, 3).
+
+    A force near zero has no direction: that of (1, 1, 1) stands for those up to `least_length`.
+    """
+    has_direction = np.linalg.norm(force, axis=1) > least_length
+    return unit_rows(np.where(has_direction[:, None], force, 1.0))
 
 
 def _delay_within(
@@ -328,10 +339,12 @@ class _DelayCost:
     """
 
     def __init__(self, gyroscope: SensorStream, time: np.ndarray, windows: _GravityWindows):
-        # Times of the gyroscope, s, and integral of its rates up to them, rad, shape (n, 3).
+        # Times of the gyroscope, s, and integral of its rates up to them, rad, shape (3, n).
         self._time = time
-        steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
-        self._integral = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._integral = np.zeros((3, len(time)))
+        half_step = np.diff(time) * 0.5
+        for axis, rate in enumerate(gyroscope.values.T):
+            np.cumsum(half_step * (rate[1:] + rate[:-1]), out=self._integral[axis, 1:])
         self._windows = windows
 
         # Parts of the windows, in order. A sum over the windows of a part is a matrix product.
@@ -380,8 +393,8 @@ class _DelayCost:
         start, stop = self._windows.start, self._windows.stop
         turned = np.empty((len(start), 4))
         for axis in range(3):
-            turned[:, axis] = np.interp(stop + delay, self._time, self._integral[:, axis])
-            turned[:, axis] -= np.interp(start + delay, self._time, self._integral[:, axis])
+            turned[:, axis] = np.interp(stop + delay, self._time, self._integral[axis])
+            turned[:, axis] -= np.interp(start + delay, self._time, self._integral[axis])
         turned[:, 3] = stop - start
         # Sums over a part: (9, n) @ (n, 16) are the products of [u x].T [u x] (j, k) with those of
         # `turned` (l, m), as (j, k, l, m).

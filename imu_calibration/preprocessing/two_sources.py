@@ -116,36 +116,62 @@ def two_clusters(outputs: np.ndarray) -> np.ndarray:
 
     """
     # The two clusters of an output are separated by its widest gap, outliers at the ends excepted.
-    ordered = np.sort(outputs, axis=1)
-    gaps = np.diff(ordered, axis=1)[:, LEAST_CLUSTER - 1 : -(LEAST_CLUSTER - 1)]
-    below = np.argmax(gaps, axis=1)[:, None] + LEAST_CLUSTER - 1
-    limit = np.take_along_axis(ordered, below, axis=1)
-    upper = outputs > limit
+    outputs = np.ascontiguousarray(np.swapaxes(outputs, 1, 2))  # shape (n, 6, n_samples)
+    ordered = np.sort(outputs, axis=2)
+    gaps = np.diff(ordered, axis=2)[..., LEAST_CLUSTER - 1 : -(LEAST_CLUSTER - 1)]
+    below = np.argmax(gaps, axis=2)[..., None] + LEAST_CLUSTER - 1
+    upper = outputs > np.take_along_axis(ordered, below, axis=2)
 
+    # All outputs of a sample belong to one sensor: they divide the samples of a run alike. Noise
+    # divides them apart, so that few runs are examined further.
+    examined = np.flatnonzero(_most_alike(upper) >= MIN_AXES)
+    is_double = np.zeros(len(outputs), bool)
+    is_double[examined] = _change_together(outputs[examined], upper[examined])
+    return is_double
+
+
+def _most_alike(upper: np.ndarray) -> np.ndarray:
+    """
+    Return how many outputs divide the samples of each run alike, at most, shape (n,).
+
+    `upper`: whether a sample is in the upper cluster, bool, shape (n, 6, n_samples). Equal and
+    exchanged clusters are the same division.
+    """
+    differs_from_first = upper ^ upper[..., :1]
+    packed = np.packbits(differs_from_first, axis=2)
+    most = np.ones(len(upper), int)
+    for output in range(packed.shape[1]):
+        is_same = (packed == packed[:, output, None]).all(axis=2)
+        most = np.maximum(most, is_same.sum(axis=1))
+    return most
+
+
+def _change_together(outputs: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """
+    Return in which runs several outputs change together between two separate clusters, (n,).
+
+    Both arguments have the shape (n, 6, n_samples).
+    """
     # Means of the two clusters, and the standard deviation within them.
-    n_upper = np.maximum(upper.sum(axis=1), 1)
-    n_lower = np.maximum((~upper).sum(axis=1), 1)
-    mean_upper = np.where(upper, outputs, 0.0).sum(axis=1) / n_upper
-    mean_lower = np.where(upper, 0.0, outputs).sum(axis=1) / n_lower
-    within = outputs - np.where(upper, mean_upper[:, None], mean_lower[:, None])
-    noise = np.sqrt((within**2).mean(axis=1))
+    n_upper = np.maximum(upper.sum(axis=2), 1)
+    n_lower = np.maximum((~upper).sum(axis=2), 1)
+    mean_upper = np.where(upper, outputs, 0.0).sum(axis=2) / n_upper
+    mean_lower = np.where(upper, 0.0, outputs).sum(axis=2) / n_lower
+    within = outputs - np.where(upper, mean_upper[..., None], mean_lower[..., None])
+    noise = np.sqrt((within**2).mean(axis=2))
     distance = mean_upper - mean_lower
-    rounding = 1e-9 * np.abs(outputs).max(axis=1)
+    rounding = 1e-9 * np.abs(outputs).max(axis=2)
     constant = noise <= rounding
     separate = (distance > rounding) & (distance > MIN_SEPARATION * noise)
 
     # A motion passes from one value to the other once; two sensors change all the time.
-    changes = (upper[:, 1:] != upper[:, :-1]).sum(axis=1)
+    changes = (upper[..., 1:] != upper[..., :-1]).sum(axis=2)
     separate &= changes >= LEAST_CLUSTER
 
-    # All outputs of a sample belong to one sensor: each output divides the samples of a run as the
-    # first separate output does, with equal or exchanged clusters. Shape of `label`: (n, n_samples,
-    # 1).
+    # Each output divides the samples as the first separate output does.
     reference = np.argmax(separate, axis=1)[:, None, None]
-    label = np.take_along_axis(
-        upper, np.broadcast_to(reference, (len(upper), upper.shape[1], 1)), axis=2
-    )
-    same = (upper == label).all(axis=1) | (upper != label).all(axis=1)
+    label = np.take_along_axis(upper, reference, axis=1)
+    same = (upper == label).all(axis=2) | (upper != label).all(axis=2)
     together = separate & same
     noisy = (together & ~constant).sum(axis=1) >= MIN_AXES
     return noisy | (together.sum(axis=1) >= MIN_AXES_CONSTANT)

@@ -430,7 +430,9 @@ def _solve(
         for kind, count in inliers.n_outliers.items():
             key = f'outlying {kind}'
             n_excluded[key] = n_excluded.get(key, 0) + count
-        if settled and not inliers.n_outliers:
+        if inliers.n_outliers:
+            integrated_turns = {}  # their numbers count the excluded turns too
+        elif settled:
             break
 
     # 5. Drift of the biases. That of the accelerometer is subtracted from the poses; that of the
@@ -438,7 +440,7 @@ def _solve(
     drifts = bias_movements(model, estimate.state.values, poses)
     if 'accelerometer' in drifts:
         poses = replace(poses, force=poses.force - drifts['accelerometer'].course)
-        estimate, _ = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd)
+        estimate, integrated_turns = solve_joint(model, poses, turns, gravity_sd=options.gravity_sd)
 
     # 6. Statistics, of all poses: also of the excluded and drifting ones.
     goals = tolerances_of(model.model, options.tolerances)
@@ -467,7 +469,9 @@ def _solve(
     return HandCalibration(
         model=model.model,
         values=estimate.state.values,
-        terms=_with_common_errors(GravityRows(model, poses, turns), estimate, drifts),
+        terms=_with_common_errors(
+            GravityRows(model, poses, turns, integrated_turns), estimate, drifts
+        ),
         held=estimate.held,
         noise=noise,
         residual_rms={},
