@@ -181,17 +181,16 @@ def parameter_shifts(
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(sources), len(solution.values)))
     for sensor, noise in noise_of_windows(solution).items():
-        # Design of each window, shape (n_samples, 3, n_params).
+        # Means of the design of each window. The designs of all windows at once need much memory.
         slope = coefficient_jacobian(solution.model, sensor, solution.values)
-        designs = [
-            np.einsum('nq,qap->nap', of_window[sensor].columns, slope) for of_window in outputs
-        ]
-        means = np.array([design.mean(axis=0) for design in designs])
+        means = np.array(
+            [_design(of_window[sensor].columns, slope).mean(axis=0) for of_window in outputs]
+        )
         weighted_means = _weighted_means(means, sources, noise)
         normal = normal + np.tensordot(weighted_means, means, ([0, 1], [0, 1]))
-        for k, (source, design, of_window) in enumerate(zip(sources, designs, outputs)):
+        for k, (source, of_window) in enumerate(zip(sources, outputs)):
             # Each sample stands for `stride` samples. Sums over samples and axes.
-            centred = design - means[k]
+            centred = _design(of_window[sensor].columns, slope) - means[k]
             weighted = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
             normal += np.tensordot(weighted, centred, ([0, 1], [0, 1]))
             output_changes = of_window[sensor].changes  # (n_changes, n_samples, 3)
@@ -203,6 +202,15 @@ def parameter_shifts(
     shifts = np.zeros_like(right)
     shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
     return shifts
+
+
+def _design(columns: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """
+    Return the derivative of the output by the parameters, shape (n_samples, 3, n_params).
+
+    From the columns, (n_samples, q), and the slopes of their coefficients, (q, 3, n_params).
+    """
+    return np.einsum('nq,qap->nap', columns, slope)
 
 
 def _weighted_means(
