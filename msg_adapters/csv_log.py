@@ -1334,20 +1334,24 @@ class _Table:
 
         Two columns are seconds and nanoseconds.
         """
-        values = self.raw(time.names[0])
         if len(time.names) == 2:
             seconds_and_ns = self.values(time.names)
-            # Rows without a number of seconds are refused below, with their count.
-            if np.isfinite(seconds_and_ns).all():
-                seconds, nanoseconds = seconds_and_ns.astype(np.int64).T
-                return seconds * 10**9 + nanoseconds
-        is_date = values.dtype.kind == 'M'
-        if is_date:
-            n_bad = np.count_nonzero(np.isnat(values))
-        else:
-            unit_s = _time_size(time.unit)
-            n_bad = np.count_nonzero(~(np.abs(values * unit_s) < MAX_TIME_SECONDS))
-        if n_bad == len(values):
+            # Neither of the two numbers is larger than seconds may be.
+            self._require_times(time, (np.abs(seconds_and_ns) < MAX_TIME_SECONDS).all(axis=1))
+            seconds, nanoseconds = seconds_and_ns.astype(np.int64).T
+            return seconds * 10**9 + nanoseconds
+        values = self.raw(time.names[0])
+        if values.dtype.kind == 'M':
+            self._require_times(time, ~np.isnat(values))
+            return values.astype(np.int64)
+        unit_s = _time_size(time.unit)
+        self._require_times(time, np.abs(values * unit_s) < MAX_TIME_SECONDS)
+        return stamps_of(values, unit_s)
+
+    def _require_times(self, time: Columns, is_time: np.ndarray) -> None:
+        """Raise InputError unless each row has a time; `is_time`: bool, shape (n,)."""
+        n_bad = np.count_nonzero(~is_time)
+        if n_bad == len(is_time):
             cell = self.first_row[self.column(time.names[0])].strip()
             raise InputError(
                 f'the time in {self.path} must be a number, a date with time or a time of day'
@@ -1362,7 +1366,6 @@ class _Table:
                 f' s, got {n_bad} without one; remove these rows',
                 code='csv_time',
             )
-        return values.astype(np.int64) if is_date else stamps_of(values, unit_s)
 
 
 def _has_decimal_comma(cell: str, delimiter: str | None) -> bool:

@@ -308,6 +308,20 @@ def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_us
     assert not bag.exists()
 
 
+@pytest.mark.parametrize('time', [(5, ''), ('', 5), (5, 1e300)])
+def test_a_row_without_seconds_or_nanoseconds_is_refused_with_their_number(tmp_path, time):
+    lines = [
+        'header.stamp.secs,header.stamp.nsecs,ax [g],ay [g],az [g],gx [deg/s],gy [deg/s],gz [deg/s]'
+    ]
+    for k in range(400):
+        seconds, nanoseconds = time if k == 200 else (1 + k // 100, 10_000_000 * (k % 100))
+        lines.append(f'{seconds},{nanoseconds},0,0,1,0,0,0')
+    path = tmp_path / 'two.csv'
+    path.write_text('\n'.join(lines) + '\n')
+    with refused(InputError, 'csv_time', 'got 1 '):
+        read_csv(path)
+
+
 @pytest.mark.parametrize('number', ['1e300', '1e10', 'nan', ''])
 def test_times_beyond_64_bits_are_refused_without_a_warning(tmp_path, number):
     rows = [(0.005 * k, 0.0, 0.0, 9.81, 1e308, 0.0, 0.0) for k in range(40)]
