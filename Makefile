@@ -37,9 +37,14 @@ PINS ?= constraints/pypi.txt
 endif
 
 STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
-PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
-# Every line of the list and of those that it names. The lists are complete: nothing is resolved, and each of four processes installs 45 at a time.
-ALL_PINS = cat $(PINS) $$(sed -n 's|^-r |constraints/|p' $(PINS))
+PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet --prefer-binary --use-pep517
+# Every line of the list and of those that it names. The lists are complete: nothing is resolved.
+ALL_PINS = cat $(PINS) $$(sed -n 's|^-r |constraints/|p' $(PINS)) | sed -n 's/ *\#.*//; /^[A-Za-z]/p'
+# uv installs a list in seconds. It does not read the configuration of pip: an index that pip has in place of PyPI needs pip.
+UV = test -x $(VENV)/bin/uv && ! $(PY) -m pip config list </dev/null | grep -q '[.]index-url=' && \
+  $(VENV)/bin/uv pip install --quiet --python $(PY)
+# $(call install,OPTIONS): options that both have.
+install = { $(UV) $(1); } || $(PIP) $(1)
 # Four processes on two cores: live tests mostly wait. conftest.py orders the files. test/run_lanes.py repeats live tests that failed.
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 4
@@ -58,11 +63,12 @@ $(STAMP): $(filter-out $(addprefix constraints/,docs.txt rosdebian.txt validate.
 	  { echo 'Python 3.10 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
 	  { echo 'The venv module of $(PYTHON) is missing; run: apt-get install python3-venv' >&2; exit 1; }
-	@echo 'Installing $(PINS) into $(VENV): a minute or two, once.'
+	@echo 'Installing $(PINS) into $(VENV), once: some seconds, or a minute or two with a slow network.'
 	@$(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
-	@$(PIP) $$($(ALL_PINS) | grep -oE '^(pip|setuptools|wheel)==[0-9.]+')
-	@$(ALL_PINS) | sed -n 's/ *#.*//; /^[A-Za-z]/p' | xargs -d '\n' -n 45 -P 4 $(PIP) --prefer-binary --no-deps --no-build-isolation --use-pep517
-	@$(PIP) --no-deps --no-build-isolation --use-pep517 --editable .
+	@$(PIP) $$($(ALL_PINS) | grep -oE '^(pip|setuptools|uv|wheel)==[0-9.]+')
+	@$(ALL_PINS) | { $(UV) --no-deps --no-build-isolation --requirement -; } || \
+	  $(ALL_PINS) | xargs -d '\n' -n 45 -P 4 $(PIP) --no-deps --no-build-isolation
+	@$(call install,--no-deps --no-build-isolation --editable .)
 	@touch $@
 
 demo: $(STAMP)
@@ -125,8 +131,8 @@ test-fast: $(STAMP)
 
 # Libraries that some tests compare with; without them these tests are skipped.
 oracles: $(STAMP)
-	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/oracles.txt
-	@$(PIP) --no-deps --requirement constraints/oracles-alone.txt
+	@$(call install,--constraint $(PINS) --requirement constraints/oracles.txt)
+	@$(call install,--no-deps --requirement constraints/oracles-alone.txt)
 
 # Unused names and arguments, line length, docstrings, annotations, size of the product, marker words: less than a minute, half with -j2.
 lint: lint-code lint-types lint-size lint-words
@@ -148,7 +154,7 @@ lint-words: $(STAMP)
 	@$(PY) tools/quoted_names.py
 
 $(STAMP)-lint: $(STAMP) constraints/lint.txt
-	@$(PIP) --prefer-binary --requirement constraints/lint.txt
+	@$(call install,--requirement constraints/lint.txt)
 	@touch $@
 
 # The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.10 to 3.12.
@@ -164,7 +170,7 @@ validate: $(STAMP)-validate
 	@$(PY) validation/run.py
 
 $(STAMP)-validate: $(STAMP) constraints/validate.txt
-	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/validate.txt
+	@$(call install,--constraint $(PINS) --requirement constraints/validate.txt)
 	@touch $@
 
 # The parameter files of the nodes from what the nodes declare, the tolerances from the catalogue of effects.
