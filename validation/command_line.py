@@ -1,13 +1,15 @@
 """The command line on a recording, as a user would call it."""
 
+import contextlib
+import io
 import os
-import subprocess
-import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import yaml
 
-from validation.recordings import BOARD, ROOT, SHAFT, reference
+from imu_calibration.cli.main import main
+from validation.recordings import BOARD, SHAFT, reference
 
 ALL = (
     *((name, '/imu/data_raw') for name in SHAFT),
@@ -18,7 +20,8 @@ ALL = (
     ('ferraris', None),
 )
 """Every recording, with the topic where there are several."""
-TIMEOUT = 1200
+WIDE = {'COLUMNS': '240', 'NO_COLOR': '1'}
+"""Environment in which no line is broken."""
 
 
 def options_of(folder, name, topic, work):
@@ -36,14 +39,21 @@ def options_of(folder, name, topic, work):
 
 
 def run_verb(verb, bag, options):
-    """Return (exit code, lines of standard output, last line of standard error)."""
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))
-    environment = {**os.environ, 'PYTHONPATH': path, 'COLUMNS': '240', 'NO_COLOR': '1'}
-    command = [sys.executable, '-m', 'imu_calibration', verb, str(bag), *options]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT)
-    errors = [line for line in done.stderr.splitlines() if line.strip()]
+    """
+    Return (exit code, lines of standard output, last line of standard error).
+
+    The verb runs in this process, which has imported the package once.
+    """
+    printed, complained = io.StringIO(), io.StringIO()
+    with (
+        patch.dict(os.environ, WIDE),
+        contextlib.redirect_stdout(printed),
+        contextlib.redirect_stderr(complained),
+    ):
+        code = main([verb, str(bag), *options])
+    errors = [line for line in complained.getvalue().splitlines() if line.strip()]
     return (
-        done.returncode,
-        [line.rstrip() for line in done.stdout.splitlines()],
+        code,
+        [line.rstrip() for line in printed.getvalue().splitlines()],
         errors[-1] if errors else '',
     )

@@ -16,7 +16,7 @@ from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.reference_effects import FAMILY, total_lags
 from imu_calibration.kinematics.table import Table
 from validation.section import Section, text
-from validation.shaft import read
+from validation.shaft import recording
 
 RECORDINGS = (
     'shaft_pitch_slow',
@@ -27,26 +27,8 @@ RECORDINGS = (
 )
 ONE_UNIT = (('shaft_roll_fast', 'shaft_roll_fast_later'),)
 """Two parts of one trial: one unit, one mounting, one motion."""
-LONGEST = None
-"""Seconds that are used of each recording; None for all."""
 WORSE = 1.05
 """No kind of motion may get worse by more."""
-
-
-@cache
-def recording(folder, name):
-    """Return (Table, SampleBlock) of a recording."""
-    table, blocks = read(folder, name)
-    parts = {
-        field: [getattr(block, field) for block in blocks if getattr(block, field) is not None]
-        for field in ('imu', 'joints')
-    }
-    imu, joints = (type(part[0]).concatenate(part) for part in parts.values())
-    if LONGEST is not None:
-        end = imu.stamp_ns[0] + int(1e9 * LONGEST)
-        imu = imu.select(imu.stamp_ns < end)
-        joints = joints.select(joints.stamp_ns < end)
-    return table, SampleBlock(imu, joints)
 
 
 def halves(block):

@@ -81,7 +81,8 @@ def real(folder) -> Iterator[Outcome]:
 
     Two parts of one trial, and halves, each calibrated on the one and judged on the other.
     """
-    from validation.cross import ONE_UNIT, RECORDINGS, halves, recording
+    from validation.cross import ONE_UNIT, RECORDINGS, halves
+    from validation.shaft import recording
 
     for first, second in ONE_UNIT:
         for made, used in ((first, second), (second, first)):

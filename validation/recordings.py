@@ -1,6 +1,7 @@
 """The real recordings, used in place."""
 
 import os
+from functools import cache
 from pathlib import Path
 
 import yaml
@@ -48,8 +49,9 @@ def gravity_of(folder, name):
     return reference(folder, name).get('gravity') or STANDARD_GRAVITY
 
 
+@cache
 def load(folder, name, topic=None):
-    """Return the cleaned ImuSamples of a recording, in SI."""
+    """Return the cleaned ImuSamples of a recording, in SI; several sections use the same ones."""
     with open_recording(folder / name, topic, want_joints=False) as recording:
         imu = read_recording(recording.blocks()).imu
     nominal = nominal_of(folder, name)

@@ -50,7 +50,6 @@ MPU9150 = slice(1, 2)
 SMALLEST: dict[str, Any] = {
     'arm_live.STRETCH_S': 40.0,
     'boards.BOARD': 2,
-    'cross.LONGEST': 120.0,
     'cross.ONE_UNIT': 0,
     'cross.RECORDINGS': slice(1, 2),
     'decisions.BY_HAND': MPU9150,
@@ -72,6 +71,7 @@ SMALLEST: dict[str, Any] = {
     'peers.TRIAL_SEEDS': 1,
     'scatter.BY_HAND': 1,
     'scatter.SESSIONS': 2,
+    'shaft.LONGEST': 60.0,
     'shaft.SHAFT': 1,
 }
 """

@@ -1,9 +1,12 @@
 """One joint is a table too: a motor shaft with a coarse encoder."""
 
+from functools import cache
+
 from imu_calibration.calibration.calibrate import calibrate_by_evidence
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.table import Table
@@ -17,23 +20,36 @@ KNOWN = {'shaft_pitch_slow': ('yy', 0.985), 'shaft_yaw_medium': ('zz', 1.005)}
 WITH_LAG = CalibrationOptions(
     'bias+matrix', 'bias+matrix+gyro_bandwidth', 'time_offset', as_asked=True
 )
+LONGEST = None
+"""Seconds that are used of each recording; None for all."""
 LAG = ('gyroscope.gyro_bandwidth.time_constant', 'reference.time_offset.offset')
 
 
-def read(folder, name):
-    """Return (Table, blocks) of a recording."""
+@cache
+def recording(folder, name):
+    """Return (Table, SampleBlock) of a recording; several sections use the same ones."""
     table = Table.from_mapping(from_text((folder / name / 'table.yaml').read_text()))
-    with open_recording(folder / name, imu_topic='/imu/data_raw') as recording:
-        return table, list(recording.blocks(table.joint_names))
+    with open_recording(folder / name, imu_topic='/imu/data_raw') as opened:
+        blocks = list(opened.blocks(table.joint_names))
+    parts = {
+        field: [getattr(block, field) for block in blocks if getattr(block, field) is not None]
+        for field in ('imu', 'joints')
+    }
+    imu, joints = (type(part[0]).concatenate(part) for part in parts.values())
+    if LONGEST is not None:
+        end = imu.stamp_ns[0] + int(1e9 * LONGEST)
+        imu = imu.select(imu.stamp_ns < end)
+        joints = joints.select(joints.stamp_ns < end)
+    return table, SampleBlock(imu, joints)
 
 
 def calibrations(folder, name):
     """Return {'default', 'with lag': Calibration or the refusal as text}."""
-    table, blocks = read(folder, name)
+    table, block = recording(folder, name)
     found: dict[str, Calibration | str] = {}
     for what, options in (('default', CalibrationOptions(as_asked=True)), ('with lag', WITH_LAG)):
         try:
-            recordings = TableReference(table).gather([blocks], options)
+            recordings = TableReference(table).gather([[block]], options)
             found[what] = calibrate_by_evidence(recordings, options).calibration
         except ImuCalibrationError as error:
             found[what] = str(error)
