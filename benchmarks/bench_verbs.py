@@ -89,11 +89,11 @@ CASES = (
 )
 
 
-def bench_verbs(repetitions=REPETITIONS, only='', share=1.0):
+def bench_verbs(repetitions=REPETITIONS, only='', *, share=1.0, further=()):
     """
     Yield (case, multiples of a bare iteration, seconds, MB, limit as multiple).
 
-    Multiples, seconds and MB of each repetition.
+    Multiples, seconds and MB of each repetition. `further` are more arguments of each verb.
     """
     with TemporaryDirectory() as folder:
         for number, (name, session) in enumerate(SESSIONS.items()):
@@ -106,7 +106,7 @@ def bench_verbs(repetitions=REPETITIONS, only='', share=1.0):
             limit = 1 / (SECONDS_PER_MESSAGE * session.messages)
             for case in cases:
                 runs = [
-                    _measure(case, bag, Path(folder, f'{case.verb}{number}_{k}'))
+                    _measure(case, bag, Path(folder, f'{case.verb}{number}_{k}'), further)
                     for k in range(repetitions)
                 ]
                 yield (
@@ -118,7 +118,7 @@ def bench_verbs(repetitions=REPETITIONS, only='', share=1.0):
                 )
 
 
-def _measure(case, bag, output):
+def _measure(case, bag, output, further):
     """
     Return (processor seconds of a bare iteration, processor seconds of the verb, its peak MB).
     """
@@ -132,7 +132,7 @@ def _measure(case, bag, output):
         )
     paths = {'TABLE': table, 'OUTPUT': output, 'CALIBRATION': calibration / 'calibration.yaml'}
     seconds, memory = run_verb(
-        _command(case.verb, bag, *(str(paths.get(each, each)) for each in case.arguments))
+        _command(case.verb, bag, *(str(paths.get(each, each)) for each in case.arguments), *further)
     )
     return iteration, seconds, memory
 
@@ -147,11 +147,12 @@ def main():
     parser.add_argument('--repetitions', type=int, default=REPETITIONS)
     parser.add_argument('--only', default='', help='run the cases with this text in the name')
     parser.add_argument('--share', type=float, default=1.0, help='share of the sessions, default 1')
-    add_smallest(parser, repetitions=1, only='by hand', share=0.1)
+    parser.add_argument('--further', nargs='+', default=(), help='further arguments of each verb')
+    add_smallest(parser, repetitions=1, only='by hand', share=0.1, further=['--no-report'])
     options = parser.parse_args()
     missed = False
     for case, multiples, seconds, memory, limit in bench_verbs(
-        options.repetitions, options.only, options.share
+        options.repetitions, options.only, share=options.share, further=options.further
     ):
         multiple = median(multiples)
         missed |= multiple > limit or max(memory) > case.memory_mb

@@ -49,6 +49,8 @@ NAMES = {
     TIME_KEY: 'correlation time τ',
     'quantisation': 'quantisation Q',
 }
+AXES = 6
+"""Of a record: three of each sensor."""
 BLOCKS = 500
 """Blocks of the Fisher information."""
 BEGIN, END = '<!-- records: begin -->', '<!-- records: end -->'
@@ -60,13 +62,13 @@ the record does not determine it.
 """
 
 
-def record_axes(length, grade, number, seed):
-    """Yield (truth, moments) of the six axes of one record."""
+def record_axes(length, grade, number, *, seed, axes):
+    """Yield (truth, moments) of the first of the six axes of one record."""
     period = 1.0 / RATE
     n = int(length * RATE)
     factors = averaging_factors(n)
     scales = scales_of(n, period)
-    for k, sensor in enumerate(2 * SENSORS[:1] + SENSORS[:1] + 3 * SENSORS[1:]):
+    for k, sensor in enumerate((3 * SENSORS[:1] + 3 * SENSORS[1:])[:axes]):
         rng = np.random.default_rng((seed, int(length), sorted(GRADES).index(grade), number, k))
         truth = draw_truth(grade, sensor, FORMS[rng.integers(len(FORMS))], rng)
         variance = overlapping_allan_variance(truth.draw(n, period, rng)[:, None], factors)[:, 0]
@@ -216,7 +218,7 @@ def _spectrum(process, frequency, period):
     }[process.name]
 
 
-def run(records, seed, *, lengths=tuple(LENGTHS), grades=tuple(GRADES), progress=print):
+def run(records, seed, *, lengths=tuple(LENGTHS), grades=tuple(GRADES), axes=AXES, progress=print):
     """
     Return the results of all axes: length -> list of `judged`; `records` for each grade and length.
     """
@@ -227,7 +229,7 @@ def run(records, seed, *, lengths=tuple(LENGTHS), grades=tuple(GRADES), progress
             judged(truth, moments)
             for grade in grades
             for number in range(records)
-            for truth, moments in record_axes(LENGTHS[label], grade, number, seed)
+            for truth, moments in record_axes(LENGTHS[label], grade, number, seed=seed, axes=axes)
         ]
         progress(f'{label}: {len(found[label])} axes in {time.monotonic() - start:.0f} s')
     return found
@@ -297,13 +299,14 @@ def statuses(axes):
     }
 
 
-def tables(found):
-    """Return the tables of docs/noise.md."""
+def tables(found, axes=AXES):
+    """Return the tables of docs/noise.md, of records with so many axes."""
     every = [axis for axes in found.values() for axis in axes]
+    records = {label: len(of_label) // axes for label, of_label in found.items()}
     lines = [
         (
-            f'{len(every) // 6} records of six axes'
-            f' ({", ".join(f"{len(axes) // 6} of {label}" for label, axes in found.items())};'
+            f'{len(every) // axes} records of {axes} axes'
+            f' ({", ".join(f"{count} of {label}" for label, count in records.items())};'
             f' {RATE:g} Hz).'
         ),
         '',
@@ -382,16 +385,18 @@ def main():
     parser.add_argument('--lengths', nargs='+', choices=LENGTHS, default=list(LENGTHS))
     parser.add_argument('--grades', nargs='+', choices=GRADES, default=list(GRADES))
     parser.add_argument('--write', action='store_true', help='write the tables into docs/noise.md')
-    add_smallest(parser, records=1, seed=1, lengths=['10 min'], grades=['tactical'])
+    parser.add_argument('--axes', type=int, default=AXES, help='axes of each record, default 6')
+    add_smallest(parser, records=1, seed=1, lengths=['10 min'], grades=['tactical'], axes=2)
     options = parser.parse_args()
     found = run(
         options.records,
         options.seed,
         lengths=options.lengths,
         grades=options.grades,
+        axes=options.axes,
         progress=lambda line: print(line, flush=True),
     )
-    text = tables(found)
+    text = tables(found, options.axes)
     print(text)
     if options.write:
         write(text)

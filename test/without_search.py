@@ -1,6 +1,8 @@
 """
 Scripts whose searches for effects test only some candidates, without reports.
 
+Of their recordings the noise of one axis is identified.
+
 Scripts are run as users run them, without an argument for the candidates of their searches.
 `python -m without_search 'EFFECT+... MODULE [ARGUMENT ...]' ...` runs modules one after the other,
 in one process that has imported the package once.
@@ -37,11 +39,12 @@ def candidates_in_scripts(candidates: str) -> Iterator[None]:
 
 if __name__ == '__main__':
     from worlds.no_reports import without_reports
+    from worlds.noise_worlds import identifying
 
     for line in sys.argv[1:]:
         names, *sys.argv = shlex.split(line)
         print(f'== {line}', flush=True)
-        with candidates_in_scripts(names), without_reports():
+        with candidates_in_scripts(names), without_reports(), identifying(0):
             try:
                 runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
             except SystemExit as end:
