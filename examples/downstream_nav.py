@@ -288,7 +288,8 @@ def run(domain_id, picture, seconds, folder):
     return 0 if corrected < raw else 1
 
 
-if __name__ == '__main__':
+def main(arguments=None):
+    """Read the arguments and compare both paths; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument(
         '--domain-id',
@@ -305,6 +306,10 @@ if __name__ == '__main__':
     parser.add_argument(
         '--seconds', type=float, default=120.0, help='length of the drive, default 120'
     )
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
-        sys.exit(run(options.domain_id, options.picture, options.seconds, Path(temporary)))
+        return run(options.domain_id, options.picture, options.seconds, Path(temporary))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

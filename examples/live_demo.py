@@ -439,7 +439,8 @@ def picture(path, watcher, calibration, *, errors, hidden):
     figure.savefig(path, dpi=110)
 
 
-if __name__ == '__main__':
+def main(arguments=None):
+    """Read the arguments and carry out the demonstration; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument(
         '--domain-id',
@@ -455,7 +456,11 @@ if __name__ == '__main__':
         action='store_true',
         help='the same steps in about half a minute, without a fault and its diagnosis',
     )
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
         length = SMALLEST if options.smallest else COMPLETE
-        sys.exit(run(options.domain_id, Path(temporary), options.output, length=length))
+        return run(options.domain_id, Path(temporary), options.output, length=length)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -174,10 +174,13 @@ def test_the_truth_of_python_ins_is_recovered():
 @pytest.mark.long
 @pytest.mark.live
 @pytest.mark.real_data
-def test_one_imu_predicts_another_live(recordings):
+def test_one_imu_predicts_another_live(recordings, monkeypatch):
     pytest.importorskip('rclpy')
+    from ros.forked_nodes import ForkedNodes
+
+    monkeypatch.setattr(arm_live, 'NodeProcesses', ForkedNodes)
     with candidates_in_scripts('none'):
-        case = arm_live.prepare(recordings, 'array_2', 'array_5', seconds=40.0)
+        case = arm_live.prepare(recordings, 'array_2', 'array_5', seconds=25.0)
     came = arm_live.play(case, speed=5.0, domain_id=arm_live.DOMAIN + 1)
     assert [max(messages) for messages in came.values()] == 2 * [case.imu_a.stamp_ns[-1]]
     found, count = arm_live.residuals(case, came)

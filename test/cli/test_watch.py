@@ -8,6 +8,7 @@ import io
 import math
 import os
 import pty
+import signal
 import subprocess
 import sys
 import time
@@ -150,6 +151,7 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
     pytest.importorskip('rclpy')
     from examples.processes import local_environment, node_command
 
+    from ros.forked_nodes import ForkedNode
     from ros.live_station import TABLE, free_domain
 
     domain_id, lock = free_domain()
@@ -164,12 +166,7 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
         and nobody.stderr.count('\n') == 1
     )
     nodes = [
-        subprocess.Popen(
-            node_command(name, parameters),
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        ForkedNode(node_command(name, parameters), environment, os.devnull)
         for name, parameters in (
             (
                 'simulator_node',
@@ -200,7 +197,7 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
                     break
                 if b'accel.' in drawn or time.monotonic() > deadline:
                     while running:
-                        running.pop().terminate()
+                        running.pop().send_signal(signal.SIGTERM)
             assert watching.wait(60) == 0
         assert (
             b'calibration_node has ended' in drawn
