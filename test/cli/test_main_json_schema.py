@@ -16,6 +16,7 @@ from imu_calibration.cli.watch import NodeStatus
 
 from worlds.candidates import searching_few
 from worlds.no_reports import without_reports
+from worlds.noise_worlds import identifying
 
 ROOT = Path(__file__).resolve().parents[2]
 SESSION, TABLE, TRUTH = (
@@ -110,7 +111,8 @@ def test_other_verbs(folder, monkeypatch, capsys):
     for verb, arguments in LONG.items():
         # The extra view is not among the oldest versions.
         if verb != 'view' or find_spec('foxglove'):
-            document_of([verb, *arguments], capsys)
+            with identifying(0):
+                document_of([verb, *arguments], capsys)
 
 
 @pytest.mark.long

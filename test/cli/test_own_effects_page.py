@@ -15,6 +15,8 @@ from worlds.no_reports import without_reports
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / 'docs' / 'own-effects.md'
+FEWER_SAMPLES = ['--imu-rate', '25', '--joint-rate', '25']
+"""Added to the simulation: the motion determines the effect at any rate."""
 
 
 @pytest.mark.long
@@ -32,6 +34,8 @@ def test_the_commands_of_the_page_run_in_its_order(tmp_path, monkeypatch, capsys
     for line in lines:
         program, *arguments = shlex.split(line)
         assert program == 'imu_calibration'
+        if '--profile' in arguments:
+            arguments += FEWER_SAMPLES
         with without_reports():
             assert main(searching_few(arguments, 'none')) in (0, 3), line
         printed[line] = capsys.readouterr().out

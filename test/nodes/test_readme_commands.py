@@ -234,9 +234,9 @@ def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
         terminals, (f'{command} {less}'.strip() for command, less in zip(THREE, LESS, strict=True))
     )
     calibrator.wait('/imu/data_raw from /simulator_node', 'JointState .*/simulator_node')
-    # The daemon that ros2 starts finds the nodes after a while.
+    # The daemon that ros2 starts finds the nodes after a while; each question costs half a second.
     while not lists(terminals('ros2 node list'), '/calibration_node'):
-        pass
+        time.sleep(1.0)
     for command in asked:
         if command not in of_files + of_topics:
             ask(terminals, command)
