@@ -1,5 +1,6 @@
 """Uncertainty of corrected samples from noise and parameters, to first order."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,15 +106,22 @@ class Uncertainty:
     ----------
     calibration : Calibration
     transfer : compensation.Transfer, optional
+    kernel : callable, optional
+        That of `make_kernel` for both, if the caller has it.
 
     """
 
-    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None):
+    def __init__(
+        self,
+        calibration: FittedErrors,
+        transfer: Transfer | None = None,
+        kernel: Callable | None = None,
+    ):
         self._calibration = calibration
         self._model, self._values = invertible_values(calibration)
-        self._kernel = make_kernel(calibration, transfer)
+        self._kernel = kernel or make_kernel(calibration, transfer)
         """Correction of a sample to the target point and frame."""
-        self._sensor_kernel = make_kernel(calibration)
+        self._sensor_kernel = self._kernel if transfer is None else make_kernel(calibration)
         """Correction of a sample in the frame of the sensor."""
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
 

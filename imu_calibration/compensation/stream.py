@@ -447,7 +447,7 @@ class SampleCompensation:
         """`RateSlope.n_changes` at the last update of the covariances by the derivative."""
         self._restarts = 0
         """`RateSlope.restarts` at that update."""
-        self._uncertainty = Uncertainty(calibration, transfer)
+        self._uncertainty = Uncertainty(calibration, transfer, self._kernel)
         self.refresh()
 
     def set_temperature(self, temperature_c: float) -> None:

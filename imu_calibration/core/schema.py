@@ -255,8 +255,13 @@ def array(shape: tuple[int, ...], each: Requirement) -> Requirement:
             raise Unmet(
                 'shape', place, f'have the shape {shape}', received=items.shape, code='shape'
             )
-        for index, item in zip(np.ndindex(shape), items.ravel()):
-            each(item, f'{place}{list(index)}')
+        try:
+            for item in items.ravel():
+                each(item, place)
+        except Unmet:
+            # Only an error needs the indices: a text per item is most of the time for a covariance.
+            for index, item in zip(np.ndindex(shape), items.ravel()):
+                each(item, f'{place}{list(index)}')
 
     return check
 

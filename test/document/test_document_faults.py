@@ -83,7 +83,7 @@ def calibration():
     """A calibration with something in every part of its document."""
     made = random_calibration(
         3,
-        ('accel_size_effect', 'accel_quadratic', 'accel_thermal_bias', 'accel_saturation'),
+        ('accel_size_effect', 'accel_thermal_bias', 'accel_saturation'),
         ('gyro_g_sensitivity', 'gyro_thermal_scale'),
         gauge={'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
         decision={'accelerometer': 'helps', 'gyroscope': 'helps'},
@@ -382,6 +382,11 @@ def test_damaged_documents_are_refused_in_one_line_or_can_be_used(good, read):
     is_noise = good is None
     if is_noise:  # the document of an identification, which takes a second
         good = documents.from_text(noise_seeds(None)[0].decode())
+        # Of a curve the first and the last entry stand for all.
+        for name, curve in good['allan_deviation'].items():
+            good['allan_deviation'][name] = (
+                curve[:: len(curve) - 1] if name == 'tau' else [d[:: len(d) - 1] for d in curve]
+            )
     refused = 0
     for path in list(places(good))[1:]:
         # Both sensors and all axes of a document of noise have one declaration: below the fields of
