@@ -81,7 +81,7 @@ def same(found, wanted):
 
 @pytest.mark.parametrize('name', SESSIONS)
 def test_check_reports_the_error_of_the_compensated_bag(name, tmp_path):
-    session = imu.simulate('quick', seed=4, **RATES, **SESSIONS[name])
+    session = imu.simulate('six_faces', seed=4, **RATES, **SESSIONS[name])
     session.save(tmp_path / 'bag')
     known = spoiled(session.truth)
     checked = imu.check(tmp_path / 'bag', known, session.table)
@@ -122,7 +122,7 @@ def test_the_proof_from_window_statistics_differs_by_the_square_of_the_errors():
     from imu_calibration.effects.forward_equations import applied_values
 
     effects = ['accel_quadratic', 'gyro_g_sensitivity']
-    session = imu.simulate('quick', seed=4, effects=effects)
+    session = imu.simulate('six_faces', seed=4, effects=effects)
     result = imu.calibrate(
         session.samples,
         session.table,
@@ -318,7 +318,7 @@ def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
         tolerance=1e-4,
         text='A formula.',
     )
-    session = imu.simulate('quick', seed=5, **RATES)
+    session = imu.simulate('six_faces', seed=5, **RATES)
     catalogue, mean = CATALOGUE.with_effects(effect), 0.5 * DEG
     moved = replace(
         session.samples, imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + mean)
@@ -363,7 +363,7 @@ def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
 def test_corrected_readings_travel_with_their_sample():
     from imu_calibration.preprocessing.window_finder import MotionGatherer
 
-    session = imu.simulate('quick', seed=2, stamp_jitter_us=3000.0)
+    session = imu.simulate('six_faces', seed=2, stamp_jitter_us=3000.0, **RATES)
     block = session.samples
     marked = replace(
         block,

@@ -168,7 +168,7 @@ def test_diagnose_hands_over_what_calibrate_does(case):
 
 
 def test_a_clean_session_adds_nothing():
-    pair = make_pair(None, 12, **COARSE)
+    pair = make_pair(None, 12, profile='six_faces', **COARSE)
     found = imu.calibrate(pair.first.block, Table.from_mapping(pair.table), candidates=FEW)
     assert not set(found.calibration.statistics) & {'added', 'denied', 'unexplained'}
 
@@ -496,7 +496,7 @@ def test_a_bias_that_steps_on_every_axis_is_found_with_its_size():
 @pytest.mark.long
 def test_a_wander_of_every_axis_passes_for_noise_and_is_told():
     session = make_session(
-        7, None, 'realistic', cause=Wander(sd=(0.02, 0.0)), profile='quick', **COARSE
+        7, None, 'realistic', cause=Wander(sd=(0.02, 0.0)), profile='six_faces', **COARSE
     )
     result = diagnosed(session)
     assert (
@@ -511,7 +511,7 @@ def test_a_wander_of_every_axis_passes_for_noise_and_is_told():
         and note[1:] in diagnosis_report(result)
     )
     assert result.document['notes'] == [note]
-    plain = make_session(7, None, 'realistic', profile='quick', **COARSE)
+    plain = make_session(7, None, 'realistic', profile='six_faces', **COARSE)
     assert not diagnosed(plain).notes
 
 

@@ -28,7 +28,7 @@ def session():
     return make_session(
         21,
         {'gyro_bias_drift': TRUE},
-        profile='quick',
+        profile='six_faces',
         noise='realistic',
         imu_rate=50.0,
         joint_rate=50.0,

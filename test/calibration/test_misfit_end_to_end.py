@@ -26,7 +26,7 @@ WORSE = 1.05
     [
         ('driver_lag', {'table': 'shaft', 'profile': 'sweeps'}),
         ('motor_ripple', {'table': 'shaft', 'profile': 'sweeps'}),
-        ('backlash', COARSE),
+        ('backlash', {'profile': 'six_faces', **COARSE}),
     ],
     ids=lambda value: value if isinstance(value, str) else value.get('table', 'gimbals'),
 )

@@ -22,7 +22,7 @@ NAMES = [f'accelerometer.accel_cubic.{axis}' for axis in 'xyz']
 def strange():
     """A session with such a cubic term, and its table."""
     session = physics.make_session(
-        41, {'accel_cubic': CUBIC}, profile='quick', imu_rate=50.0, joint_rate=50.0
+        41, {'accel_cubic': CUBIC}, profile='six_faces', imu_rate=50.0, joint_rate=50.0
     )
     return session.block, Table.from_mapping(session.table)
 
