@@ -12,12 +12,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
 from imu_calibration.cli.main import main
 from imu_calibration.document import files
 from imu_calibration.effects.expressions import ColumnGroup
-from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.applied_gain_of_windows import gains_of_formulas
 from imu_calibration.references.turntable.diagnosis_of_windows import build_diagnosis
 from imu_calibration.references.turntable.residuals import proposals
@@ -362,22 +360,38 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
         atol=5 * np.max(entry['terms'][0]['sd']),
     )
     assert name in (tmp_path / 'out' / 'report.html').read_text()
-
-    # Without the pages and the bag of the verb, whose options are those of the calibration.
-    def diagnosed_again(**choices):
-        """Return the document of a diagnosis with the formula in the catalogue."""
-        return imu.diagnose(
-            session.block,
-            Table.from_mapping(session.table),
-            catalogue=extended,
-            candidates=OF_RATES,
-            **choices,
-        ).document
-
-    again = diagnosed_again(gyroscope_model=f'bias+matrix+{name}')
+    model = ['--effects', str(extended), '--gyroscope-model', f'bias+matrix+{name}']
+    assert main(
+        [
+            'diagnose',
+            str(tmp_path / 'bag'),
+            *table,
+            *model,
+            '--output',
+            str(tmp_path / 'again'),
+            '--candidates',
+            OF_RATES,
+        ]
+    ) in (0, 3)
+    again = json.loads((tmp_path / 'again' / 'diagnosis.json').read_text())
     assert not again['unexplained']['gyroscope']['significant'] and not again['findings']
-    named = diagnosed_again()
-    assert [finding['effect'] for finding in named['findings']] == [name]
+    assert main(
+        [
+            'diagnose',
+            str(tmp_path / 'bag'),
+            *table,
+            '--effects',
+            str(extended),
+            '--output',
+            str(tmp_path / 'named'),
+            '--candidates',
+            OF_RATES,
+        ]
+    ) in (0, 3)
+    assert [
+        f['effect']
+        for f in json.loads((tmp_path / 'named' / 'diagnosis.json').read_text())['findings']
+    ] == [name]
     assert (
         main(
             [
