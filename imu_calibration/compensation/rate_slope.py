@@ -7,6 +7,7 @@ Samples of a clock count as equally spaced; irregular ones are fitted by least s
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -86,6 +87,29 @@ WITHOUT = (
 
 
 @dataclass(frozen=True, eq=False)
+class _RateNoise:
+    """Noise of the rate."""
+
+    precision: np.ndarray
+    """Inverse of its covariance, s^2/rad^2, shape (3, 3)."""
+    log_sd: float
+    """Logarithm of the product of the three standard deviations."""
+
+
+@lru_cache(maxsize=8)
+def _rate_noise(rate_cov: bytes) -> _RateNoise | None:
+    """
+    Return the noise of a covariance, nine numbers; None where a direction has none.
+
+    Kept, because most messages state the same covariance and each sample of a new window needs it.
+    """
+    covariance = np.frombuffer(rate_cov).reshape(3, 3)
+    if np.min(np.linalg.eigvalsh(covariance)) <= 0.0:
+        return None
+    return _RateNoise(np.linalg.inv(covariance), 0.5 * np.linalg.slogdet(covariance)[1])
+
+
+@dataclass(frozen=True, eq=False)
 class MotionEvidence:
     """Measured rate and its slopes, from which the probability of a motion follows."""
 
@@ -113,11 +137,11 @@ class MotionEvidence:
         square below that of the noise is no further evidence. With the log likelihoods L relative
         to motion, the result is ``1 / (1 + exp(L constant) + exp(L rest))``.
         """
-        # Without noise every change of the rate is a motion.
-        if np.min(np.linalg.eigvalsh(rate_cov)) <= 0.0:
+        noise = _rate_noise(rate_cov.tobytes())
+        if noise is None:  # without noise every change of the rate is a motion
             return 1.0
-        precision = np.linalg.inv(rate_cov)
-        log_rate_noise = 0.5 * np.linalg.slogdet(rate_cov)[1]  # of the product of the three sds
+        precision = noise.precision
+        log_rate_noise = noise.log_sd
 
         # Log likelihood of b = 0. One reading has no slope to test.
         log_zero_slope = 0.0
@@ -182,6 +206,46 @@ class FirstSlope:
     """From the oldest to the newest reading, s."""
 
 
+class RecentRows:
+    """
+    The newest rows of three numbers, at most `most`.
+
+    Each sample adds one row; in new windows each asks for the array too. The array is therefore
+    made of the one before and of the rows since then.
+    """
+
+    def __init__(self, most: int):
+        self._most = most
+        self._new: deque[tuple] = deque(maxlen=most)
+        """Rows since the array was made; where they are `most`, none of the array remains."""
+        self._parts = (np.empty((0, 3)), self._new)
+        """The array and these rows, replaced together: another thread may read both."""
+
+    def __len__(self) -> int:
+        return min(len(self._parts[0]) + len(self._new), self._most)
+
+    def append(self, row: tuple) -> None:
+        """Add a row, in the thread that calls `array`."""
+        self._new.append(row)
+
+    def extend(self, rows: np.ndarray) -> None:
+        """Add rows, shape (n, 3), in the thread that calls `array`."""
+        self._new.extend(map(tuple, rows[-self._most :].tolist()))
+
+    def array(self) -> np.ndarray:
+        """Return the rows, oldest first, shape (n, 3)."""
+        if self._new:
+            rows = self.copied()
+            self._new = deque(maxlen=self._most)
+            self._parts = (rows, self._new)
+        return self._parts[0]
+
+    def copied(self) -> np.ndarray:
+        """Return the rows as `array` does, in any thread."""
+        before, new = self._parts
+        return np.concatenate([before, np.array(list(new)).reshape(-1, 3)])[-self._most :]
+
+
 class RateSlope:
     """
     Derivative of the rate of a stream, one sample or one block at a time.
@@ -240,7 +304,7 @@ class RateSlope:
         """Rate of the newest sample, rad/s."""
         self._slope: tuple = NO_SLOPE
         """Derivative after the newest sample, rad/s^2."""
-        self._recent: deque[tuple] = deque(maxlen=RECENT_SPAN[1])
+        self._recent = RecentRows(RECENT_SPAN[1])
         """
         Newest derivatives, `UNKNOWN` where the window was not full, rad/s^2; without a derivative
         the newest rates, rad/s.
@@ -265,7 +329,7 @@ class RateSlope:
         """Number of samples after which the error was no longer the same."""
         self._n_growing = CLOCK_BLOCK
         """Samples of a new window for which the error is estimated again after each."""
-        self._n_in_window = 0
+        self.n_in_window = 0
         """Samples in the derivative since its window was begun, at most `_n_growing`."""
         self.n_without = 0
         """Samples without a derivative because their stamps are frozen."""
@@ -321,9 +385,9 @@ class RateSlope:
             self.restarts += 1
             self._n_growing = self._tracker.taps
         if is_restarted or not n_used:
-            self._n_in_window = 0
-        if self._n_in_window < self._n_growing:
-            self._n_in_window += 1
+            self.n_in_window = 0
+        if self.n_in_window < self._n_growing:
+            self.n_in_window += 1
             self.n_changes += 1
         return slope
 
@@ -395,8 +459,8 @@ class RateSlope:
         if is_first:
             self._size_before = self._size_at_start()
         else:
-            self._size_before = self._size(np.array(self._recent).reshape(-1, 3))
-        first_readings = list(self._recent)
+            self._size_before = self._size(self._recent.array())
+        first_readings = self._recent.array().tolist()
         self._begin_window(line)
 
         # The first readings were stored before there was a derivative and fill its window. Counted
@@ -422,10 +486,10 @@ class RateSlope:
             else:
                 self._tracker = StampedDerivative(self.derivative)
         seconds, least, most = RECENT_SPAN
-        self._recent = deque(maxlen=int(min(max(seconds * 1e9 / line.period_ns, least), most)))
+        self._recent = RecentRows(int(min(max(seconds * 1e9 / line.period_ns, least), most)))
         self._slope = NO_SLOPE
         self._is_unreviewed = True
-        self._n_in_window = 0
+        self.n_in_window = 0
         self._n_growing = CLOCK_BLOCK
 
     def _is_kept_for(self, line: StampLine) -> bool:
@@ -441,7 +505,7 @@ class RateSlope:
         if before.line is not None:
             self.settle(before.line)
             self._size_before = before._size_before
-            self._recent.extend(list(before._recent))
+            self._recent.extend(before._recent.copied())
 
     def follow(self, before: 'RateSlope') -> None:
         """Continue from the latest sample of another RateSlope, after `prepare`."""
@@ -505,7 +569,7 @@ class RateSlope:
             noise_gain = (d / l)^2 sum (weights of a_k - a_(k-l))^2
         """
         # Without a derivative the error is its size.
-        stored = np.array(list(self._recent)).reshape(-1, 3)
+        stored = self._recent.array()
         if self.line is None:
             return self._size_at_start()
         if self.derivative is None or self._tracker is None:
@@ -542,7 +606,7 @@ class RateSlope:
 
         With a full window only those of the last `PRESENT_SPAN`.
         """
-        recent = np.array(list(self._recent)).reshape(-1, 3)
+        recent = self._recent.array()
         if tracker.n_used < tracker.taps:
             return recent
         n_present = PRESENT_SPAN / tracker.period
@@ -558,7 +622,7 @@ class RateSlope:
         # is known, `_recent` has rates; afterwards derivatives.
         n = min(len(self._stamps), len(self._recent))
         stamps = np.array(list(self._stamps)[len(self._stamps) - n :], np.int64)
-        readings = np.array(list(self._recent)[len(self._recent) - n :]).reshape(-1, 3)
+        readings = self._recent.array()[len(self._recent) - n :]
         if n:
             age = (stamps.max() - stamps) * 1e-9
             is_recent = age <= START_SPAN[1]
@@ -729,7 +793,7 @@ class RateSlope:
         self._newest_rate = tuple(reading.tolist())
         self._slope = tuple(slopes[-1].tolist())
         self._n_until_review = (self._n_until_review - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
-        self._recent.extend(map(tuple, recent[-(self._recent.maxlen or len(recent)) :].tolist()))
+        self._recent.extend(recent)
 
 
 def _is_frozen(line: StampLine) -> bool:

@@ -34,6 +34,11 @@ from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranc
 from imu_calibration.preprocessing.stamping import REGULAR, StampLine, describe_stamps
 
 NO_VIBRATION: tuple = (0.0, 0.0, 0.0)
+FOLLOWED_NS = 500_000
+"""
+Time between updates of the covariances in a new window, ns: at several kHz an update for each
+sample takes longer than the samples do, and messages are lost.
+"""
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
 """A topic with this ending is refused, because a second correction would be wrong."""
 
@@ -447,6 +452,8 @@ class SampleCompensation:
         """`RateSlope.n_changes` at the last update of the covariances by the derivative."""
         self._restarts = 0
         """`RateSlope.restarts` at that update."""
+        self._followed_ns = 0
+        """Stamp of the sample of that update, ns."""
         self._uncertainty = Uncertainty(calibration, transfer, self._kernel)
         self.refresh()
 
@@ -497,7 +504,11 @@ class SampleCompensation:
             self.fastest_squared = rate_squared
         self.corrected += 1
         if self.needs_slope and self.slope.n_changes != self._n_changes:
-            self._follow_slope()
+            # The second reading of a window has the noisiest derivative; each later one is better.
+            may_wait = self.slope.n_in_window > 2
+            if not may_wait or abs(stamp_ns - self._followed_ns) >= FOLLOWED_NS:
+                self._followed_ns = stamp_ns
+                self._follow_slope()
         return vx, vy, vz, ux, uy, uz
 
     def covariances(

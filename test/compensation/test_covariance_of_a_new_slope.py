@@ -5,6 +5,7 @@ The stated covariance while the slope of the rate is not known yet: at the start
 import numpy as np
 import pytest
 
+from imu_calibration.compensation import stream
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.rate_slope import POSSIBLE, POSSIBLE_RATE, MotionEvidence
 from imu_calibration.core.samples import ImuSamples
@@ -102,3 +103,30 @@ def test_the_first_message_of_a_stream_states_the_possible_angular_acceleration(
     # The inverse matrices differ from identity by up to 6 %.
     np.testing.assert_allclose(np.sqrt(stated[:2]), 0.6 * POSSIBLE, rtol=0.15)
     assert np.sqrt(stated[2]) < 0.15 * 0.6 * POSSIBLE + 2 * noise.max()
+
+
+def test_at_8_khz_few_updates_of_a_new_window_state_its_noise(monkeypatch):
+    """An update for each sample took longer than the samples did, and messages were lost."""
+    calibration = random_calibration(1)
+    noise = [calibration.noise(sensor)[0] for sensor in ('gyroscope', 'accelerometer')]
+    at_rest = np.zeros(3), np.array([0.0, 0.0, 9.81])
+    traces = []
+    updates = []
+    for every_ns in (stream.FOLLOWED_NS, 0):
+        monkeypatch.setattr(stream, 'FOLLOWED_NS', every_ns)
+        rng = np.random.default_rng(8)
+        compensation = stream.SampleCompensation(calibration)
+        stamp_ns = START
+        for k in range(1600):
+            # A pause restarts the window.
+            stamp_ns += 125_000 + 50_000_000 * (k % 200 == 199)
+            rate, force = (mean + sd * rng.standard_normal(3) for mean, sd in zip(at_rest, noise))
+            compensation.correct(stamp_ns, *rate, *force)
+            traces.append(np.trace(compensation.covariances(None, None)[0]))
+        updates.append(compensation.revision)
+    few, each = np.array(traces).reshape(2, -1)
+    # At the start of the stream the size of the derivative itself scatters from sample to sample.
+    ratio = (few / each)[200:]
+    print(f'{updates} updates, variance {ratio.min():.2f} to {ratio.max():.2f}')
+    assert updates[0] < 0.55 * updates[1]
+    assert 0.75 < ratio.min() and ratio.max() < 1.2

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imu_calibration.compensation.angular_acceleration import CausalDerivative, TimedDerivative
-from imu_calibration.compensation.rate_slope import RateSlope
+from imu_calibration.compensation.rate_slope import RateSlope, RecentRows
 from imu_calibration.compensation.stream import CompensationStream, derivative_for
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.nodes.message_compensation import LiveCompensation
@@ -406,3 +406,18 @@ def test_the_window_suits_the_period_that_was_found():
     stream = CompensationStream(calibration)
     stream.correct(imu)
     assert stream.slope.derivative.taps == derivative_for(calibration, PERIOD_NS * 1e-9).taps
+
+
+def test_recent_rows_are_the_newest_however_often_they_are_read():
+    rows = RecentRows(5)
+    for k in range(23):
+        if k % 7 == 3:
+            rows.extend(np.full((2, 3), float(k)))
+        else:
+            rows.append((float(k),) * 3)
+        if k in (1, 2, 9, 20):  # also after more rows than are kept
+            assert len(rows) == len(rows.array()) == min(k + 1, 5)
+            np.testing.assert_array_equal(rows.array(), rows.copied())
+    np.testing.assert_array_equal(rows.array()[:, 0], [18.0, 19.0, 20.0, 21.0, 22.0])
+    rows.extend(np.arange(21.0).reshape(7, 3))
+    np.testing.assert_array_equal(rows.array(), np.arange(6.0, 21.0).reshape(5, 3))
