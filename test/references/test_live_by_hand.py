@@ -28,7 +28,7 @@ CANDIDATES = 'accel_quadratic+gyro_g_sensitivity'
 OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(CANDIDATES))
 
 
-def blocks(imu, seed=0, mean=40):
+def blocks(imu, seed=0, mean=80):
     """Cut samples into uneven blocks as they would come from a topic."""
     edges = np.sort(np.random.default_rng(seed).integers(0, len(imu), len(imu) // mean))
     for start, stop in zip([0, *edges], [*edges, len(imu)]):
@@ -106,8 +106,8 @@ def test_solving_on_the_way_changes_nothing(session, expected):
     live, solved = make_live(), 0
     for number, block in enumerate(blocks(session, 3)):
         live.push(block)
-        if number % 12 == 11 and live.scan.attitudes >= 4:
-            live.solve(pending=number % 24 == 23)
+        if number % 6 == 5 and live.scan.attitudes >= 4:
+            live.solve(pending=number % 12 == 11)
             solved += 1
     assert solved >= 3
     assert_same(live.solve(pending=True), expected)
@@ -261,7 +261,7 @@ def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
         mean[0] + noise[0],
         mean[1] + noise[1],
     )
-    for block in blocks(still, mean=100):
+    for block in blocks(still, mean=300):
         live.push(block)
         largest = max(largest, len(live._store))
     assert largest < len(session) + 5000 and live.status().values['samples forgotten'] > 4_000

@@ -239,6 +239,7 @@ def _places_of(table, position):
     return places + turn.apply(table.mount_xyz)
 
 
+@lru_cache(maxsize=1)
 def truth(world):
     """
     Return {parameter: true value} of bias, matrix and arms, in the convention of the calibration.
