@@ -28,7 +28,7 @@ from imu_calibration.planning import posterior
 from imu_calibration.planning.campaign import make_separator
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.motion_library import MotionKind, MotionLibrary
-from imu_calibration.planning.planner import GOAL_REACHED, make_planner
+from imu_calibration.planning.planner import GOAL_REACHED, Planner, make_planner
 from imu_calibration.planning.planning_problem import LEAST_RESTS, PlanningProblem, noise_of_grade
 from imu_calibration.planning.posterior import SAMPLING, WindowPredictor, exact_information
 from imu_calibration.references.turntable.live_windows import LiveCalibration
@@ -78,8 +78,13 @@ def test_the_same_is_planned_again():
             'gravity': 9.81,
         }
     )
+    # Wider than TIGHT: a dozen motions, of which those after the first rests are searched.
+    wider = {
+        sensor: {name: 1.5 * value for name, value in of_sensor.items()}
+        for sensor, of_sensor in TIGHT.items()
+    }
     first, again = (
-        make_planner(table, noise=NOISE, tolerances=TIGHT).plan(with_bound=False) for _ in range(2)
+        make_planner(table, noise=NOISE, tolerances=wider).plan(with_bound=False) for _ in range(2)
     )
     assert len(first.motions) > 10 and [motion.words for motion in again.motions] == [
         motion.words for motion in first.motions
@@ -401,7 +406,9 @@ def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
     worst = {}
     for effect in model.effects:
         worst.setdefault(effect.sensor, {})[effect.name] = float(sd[model.slices[effect.key]].max())
-    plan = make_planner(table, noise=NOISE, tolerances=worst).plan(with_bound=False)
+    # The library has no tolerances: both problems share it.
+    coordinates = Coordinates(model, tolerances_of(model, worst))
+    plan = Planner(PlanningProblem(problem.library, coordinates, NOISE)).plan(with_bound=False)
     # With its six rests, which the profile lacks.
     assert plan.missing == () and plan.seconds <= 1.01 * profile.duration
 
