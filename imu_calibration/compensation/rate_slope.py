@@ -206,6 +206,16 @@ class FirstSlope:
     """From the oldest to the newest reading, s."""
 
 
+@dataclass(frozen=True, eq=False)
+class _ArrayAndNew:
+    """Rows of three numbers in an array, and those that were added since it was made."""
+
+    array: np.ndarray
+    """Oldest first, shape (n, 3)."""
+    new: deque[tuple]
+    """At most as many as are kept: where they are so many, none of the array remains."""
+
+
 class RecentRows:
     """
     The newest rows of three numbers, at most `most`.
@@ -216,34 +226,31 @@ class RecentRows:
 
     def __init__(self, most: int):
         self._most = most
-        self._new: deque[tuple] = deque(maxlen=most)
-        """Rows since the array was made; where they are `most`, none of the array remains."""
-        self._parts = (np.empty((0, 3)), self._new)
-        """The array and these rows, replaced together: another thread may read both."""
+        self._rows = _ArrayAndNew(np.empty((0, 3)), deque(maxlen=most))
+        """Replaced as a whole, because another thread may read both parts."""
 
     def __len__(self) -> int:
-        return min(len(self._parts[0]) + len(self._new), self._most)
+        return min(len(self._rows.array) + len(self._rows.new), self._most)
 
     def append(self, row: tuple) -> None:
         """Add a row, in the thread that calls `array`."""
-        self._new.append(row)
+        self._rows.new.append(row)
 
     def extend(self, rows: np.ndarray) -> None:
         """Add rows, shape (n, 3), in the thread that calls `array`."""
-        self._new.extend(map(tuple, rows[-self._most :].tolist()))
+        self._rows.new.extend(map(tuple, rows[-self._most :].tolist()))
 
     def array(self) -> np.ndarray:
         """Return the rows, oldest first, shape (n, 3)."""
-        if self._new:
-            rows = self.copied()
-            self._new = deque(maxlen=self._most)
-            self._parts = (rows, self._new)
-        return self._parts[0]
+        if self._rows.new:
+            self._rows = _ArrayAndNew(self.copied(), deque(maxlen=self._most))
+        return self._rows.array
 
     def copied(self) -> np.ndarray:
         """Return the rows as `array` does, in any thread."""
-        before, new = self._parts
-        return np.concatenate([before, np.array(list(new)).reshape(-1, 3)])[-self._most :]
+        rows = self._rows
+        new = np.array(list(rows.new)).reshape(-1, 3)
+        return np.concatenate([rows.array, new])[-self._most :]
 
 
 class RateSlope:
@@ -329,7 +336,7 @@ class RateSlope:
         """Number of samples after which the error was no longer the same."""
         self._n_growing = CLOCK_BLOCK
         """Samples of a new window for which the error is estimated again after each."""
-        self.n_in_window = 0
+        self._n_in_window = 0
         """Samples in the derivative since its window was begun, at most `_n_growing`."""
         self.n_without = 0
         """Samples without a derivative because their stamps are frozen."""
@@ -343,6 +350,15 @@ class RateSlope:
     def doubt(self) -> str:
         """Reason why there is no derivative; '' with one, or before the stamps are classified."""
         return f'{self.line}{WITHOUT}' if self.line is not None and self._tracker is None else ''
+
+    @property
+    def window_begins(self) -> bool:
+        """
+        Whether the newest sample is the first or second of a window.
+
+        The derivative of two readings is the noisiest; each later one is better than that before.
+        """
+        return self._n_in_window <= 2
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple:
         """Return the derivative (x, y, z) after one more sample, per second."""
@@ -385,9 +401,9 @@ class RateSlope:
             self.restarts += 1
             self._n_growing = self._tracker.taps
         if is_restarted or not n_used:
-            self.n_in_window = 0
-        if self.n_in_window < self._n_growing:
-            self.n_in_window += 1
+            self._n_in_window = 0
+        if self._n_in_window < self._n_growing:
+            self._n_in_window += 1
             self.n_changes += 1
         return slope
 
@@ -489,7 +505,7 @@ class RateSlope:
         self._recent = RecentRows(int(min(max(seconds * 1e9 / line.period_ns, least), most)))
         self._slope = NO_SLOPE
         self._is_unreviewed = True
-        self.n_in_window = 0
+        self._n_in_window = 0
         self._n_growing = CLOCK_BLOCK
 
     def _is_kept_for(self, line: StampLine) -> bool:

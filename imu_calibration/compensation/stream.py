@@ -504,9 +504,8 @@ class SampleCompensation:
             self.fastest_squared = rate_squared
         self.corrected += 1
         if self.needs_slope and self.slope.n_changes != self._n_changes:
-            # The second reading of a window has the noisiest derivative; each later one is better.
-            may_wait = self.slope.n_in_window > 2
-            if not may_wait or abs(stamp_ns - self._followed_ns) >= FOLLOWED_NS:
+            is_due = abs(stamp_ns - self._followed_ns) >= FOLLOWED_NS
+            if is_due or self.slope.window_begins:
                 self._followed_ns = stamp_ns
                 self._follow_slope()
         return vx, vy, vz, ux, uy, uz

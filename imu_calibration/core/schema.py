@@ -255,12 +255,11 @@ def array(shape: tuple[int, ...], each: Requirement) -> Requirement:
             raise Unmet(
                 'shape', place, f'have the shape {shape}', received=items.shape, code='shape'
             )
-        try:
-            for item in items.ravel():
+        for index, item in np.ndenumerate(items):
+            try:
                 each(item, place)
-        except Unmet:
-            # Only an error needs the indices: a text per item is most of the time for a covariance.
-            for index, item in zip(np.ndindex(shape), items.ravel()):
+            except Unmet:
+                # Only errors name their item: a text for each is most of the time of a covariance.
                 each(item, f'{place}{list(index)}')
 
     return check

@@ -150,7 +150,7 @@ class GravityRows:
     """Means at rest."""
     turns: Sequence[TurnData]
     """Turns between them."""
-    memory: dict[int, '_RememberedTurn'] = field(default_factory=dict)
+    memory: dict[TurnData, '_RememberedTurn'] = field(default_factory=dict)
     """
     Turns integrated before; for similar parameters they are corrected to first order instead of
     being integrated again.
@@ -182,9 +182,9 @@ class GravityRows:
             equations.of_calm_drifts(),
             equations.of_zero_sums(),
         ]
-        for number, turn in enumerate(self.turns):
+        for turn in self.turns:
             if turn.rotation is None or turn.rotation_cov is None:
-                rows.append(equations.of_turn(turn, number))
+                rows.append(equations.of_turn(turn))
             else:
                 rows.append(equations.of_known_turn(turn, turn.rotation, turn.rotation_cov))
         return Rows.concatenate(rows)
@@ -225,12 +225,12 @@ class _Equations:
     """The equations of poses and turns, linearised at a state."""
 
     def __init__(
-        self, model: HandModel, poses: Poses, state: State, memory: dict[int, _RememberedTurn]
+        self, model: HandModel, poses: Poses, state: State, memory: dict[TurnData, _RememberedTurn]
     ):
         self.model = model
         self.poses = poses
         self.state = state
-        # Number of the turn -> the turn as integrated before; new ones are added.
+        # Turns as integrated before; new ones are added.
         self.memory = memory
         # Two unit vectors across gravity in each pose, shape (k, 3, 2).
         self.across = tangent(state.up)
@@ -359,7 +359,7 @@ class _Equations:
             group=np.full(count, n_poses),
         )
 
-    def of_turn(self, data: TurnData, number: int) -> Rows:
+    def of_turn(self, data: TurnData) -> Rows:
         """
         Return two rows of a turn: the direction before it, rotated by the rates, is that after it.
 
@@ -372,7 +372,7 @@ class _Equations:
         i, j = data.first, data.last
         # The bias of the turn is that between the drifts of both poses.
         bias = self.gyro_bias + 0.5 * (state.drift[i] + state.drift[j])
-        mat_ji, turn = self._integrated(data, bias, number)
+        mat_ji, turn = self._integrated(data, bias)
         mat_ji = between_middles(self.poses, data, mat_ji)
         carried = mat_ji @ state.up[i]
         across_i = self.across[i]
@@ -400,15 +400,15 @@ class _Equations:
             end_group=np.full(2, j),
         )
 
-    def _integrated(self, data: TurnData, bias: np.ndarray, number: int) -> tuple[np.ndarray, Turn]:
+    def _integrated(self, data: TurnData, bias: np.ndarray) -> tuple[np.ndarray, Turn]:
         """
-        Return (mat_ji, Turn) of turn `number` at the present parameters.
+        Return (mat_ji, Turn) of a turn at the present parameters.
 
         A remembered turn is corrected to first order if the parameters have changed little.
         """
         further_values = self.state.values[self.further_of_gyroscope]
-        if number in self.memory:
-            remembered = self.memory[number]
+        if data in self.memory:
+            remembered = self.memory[data]
             mat_ji = remembered.moved(bias, self.gyro_matrix, further_values)
             if mat_ji is not None:
                 return mat_ji, remembered.turn
@@ -419,7 +419,7 @@ class _Equations:
             matrix=self.gyro_matrix,
             further=self._further_of_turn(data, bias),
         )
-        self.memory[number] = _RememberedTurn(bias, self.gyro_matrix, further_values, turn)
+        self.memory[data] = _RememberedTurn(bias, self.gyro_matrix, further_values, turn)
         return turn.mat_ji, turn
 
     def of_known_turn(self, data: TurnData, known: np.ndarray, known_cov: np.ndarray) -> Rows:

@@ -430,9 +430,7 @@ def _solve(
         for kind, count in inliers.n_outliers.items():
             key = f'outlying {kind}'
             n_excluded[key] = n_excluded.get(key, 0) + count
-        if inliers.n_outliers:
-            integrated_turns = {}  # their numbers count the excluded turns too
-        elif settled:
+        if settled and not inliers.n_outliers:
             break
 
     # 5. Drift of the biases. That of the accelerometer is subtracted from the poses; that of the
