@@ -386,6 +386,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     # A size of no instrument.
     assert not stands_out(of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair)
     monkeypatch.undo()
+    asked = lag.asked.calibration  # with the rule that is replaced below
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_, **settings: False)
     faint = imu.calibrate(late[0].block, late[1], candidates=LAGS).calibration
     rms = {sensor: rest['rms'] for sensor, rest in faint.statistics['unexplained'].items()}
@@ -398,9 +399,9 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     )
     place, was = (
         calibration.param_names.index('gyroscope.matrix.xx')
-        for calibration in (faint, lag.asked.calibration)
+        for calibration in (faint, asked)
     )
-    assert faint.sd[place] > 5 * lag.asked.calibration.sd[was]
+    assert faint.sd[place] > 5 * asked.sd[was]
 
 
 def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
