@@ -188,6 +188,7 @@ def wobble_at(
     return total
 
 
+_IDENTITY = np.eye(3)
 _CHAIN_BLOCK_SAMPLES = 1024
 """Samples per block, so that intermediate arrays fit in the processor's cache."""
 UP, RATE, ALPHA, FORCE = -4, -3, -2, -1
@@ -207,8 +208,17 @@ class _Link(NamedTuple):
     """From the frame of the link before to the joint's frame, shape (3, 3)."""
     column: int
     """Column of the readings in the motion."""
+    to_coordinate_axis: np.ndarray
+    """
+    From the joint's frame to one in which a turn is about a coordinate axis, shape (3, 3); the
+    identity if the joint slides.
+    """
+    sense: float
+    """+1 or -1: the joint turns about ``sense`` times the coordinate axis `third`."""
+    third: int
+    """Index of the coordinate axis that the joint turns about."""
     across: np.ndarray
-    """`axis_error_directions`, shape (2, 3)."""
+    """`axis_error_directions` in the frame of the coordinate axis, shape (2, 3)."""
 
 
 class _Displacement(NamedTuple):
@@ -226,13 +236,7 @@ class _Step(NamedTuple):
     before: _Displacement
     """From the joint before to this one."""
     link: _Link
-    """The joint."""
-    sense: float
-    """+1 or -1: the joint turns about ``sense`` times the coordinate axis `third`."""
-    third: int
-    """Index of the coordinate axis that the joint turns about, after the displacement."""
-    across: np.ndarray
-    """Directions u, v of a lean after the displacement, shape (2, 3)."""
+    """The joint, which turns about a coordinate axis after the displacement."""
 
 
 class _Path(NamedTuple):
@@ -329,46 +333,48 @@ def _path_to_sensor(constants: _Constants, motion: JointMotion) -> _Path:
     # that rotation.
     matrix = np.eye(3)
     offset = np.zeros(3)
+    moves = _moving_columns(motion)
     for link in constants.links:
         offset = offset + matrix.T @ link.xyz
         matrix = link.mat_in @ matrix
 
         # A joint at rest is a constant rotation or offset.
-        if not link.joint.leans and not _moves(motion, link.column):
+        if not link.joint.leans and not moves[link.column]:
             position = link.joint.offset
             if len(motion.time):
                 position += link.joint.multiplier * motion.position[0, link.column]
             if link.joint.turns:
-                matrix = rotation(-position * link.axis) @ matrix
+                matrix = _turn_at_rest(link.joint.axis, float(position)) @ matrix
             else:
                 offset = offset + matrix.T @ (position * link.axis)
             continue
 
         # Turns are computed about a coordinate axis; the next step begins with the inverse of the
         # rotation to it.
-        to_coordinate_axis = np.eye(3)
-        sense = 1.0
-        third = 2
-        if link.joint.turns:
-            to_coordinate_axis, sense, third = _to_coordinate_axis(link.axis)
-        across = link.across @ to_coordinate_axis.T
-        before = _Displacement(offset, to_coordinate_axis @ matrix)
-        steps.append(_Step(before, link, sense, third, across))
-        matrix = to_coordinate_axis.T
+        steps.append(_Step(_Displacement(offset, link.to_coordinate_axis @ matrix), link))
+        matrix = link.to_coordinate_axis.T
         offset = np.zeros(3)
 
     offset = offset + matrix.T @ constants.mount_xyz
     return _Path(steps, _Displacement(offset, constants.mat_sl @ matrix))
 
 
-def _moves(motion: JointMotion, column: int) -> bool:
-    """Return whether the joint of a column changes its position or has a rate."""
-    position = motion.position[:, column]
-    if len(position) == 0:
-        return False
-    if np.any(position != position[0]):
-        return True
-    return bool(motion.rate[:, column].any() or motion.acceleration[:, column].any())
+def _moving_columns(motion: JointMotion) -> np.ndarray:
+    """Return which joints change their position or have a rate, shape (n_joints,)."""
+    changes = np.any(motion.position != motion.position[:1], axis=0)
+    return changes | motion.rate.any(axis=0) | motion.acceleration.any(axis=0)
+
+
+@lru_cache(maxsize=512)
+def _turn_at_rest(axis: tuple[float, float, float], position: float) -> np.ndarray:
+    """
+    Return the rotation to the frame of the link after a joint at rest, shape (3, 3).
+
+    The joints at rest in a window have one position for all differences of the kinematics.
+    """
+    matrix = rotation(-position * np.array(axis))
+    matrix.flags.writeable = False
+    return matrix
 
 
 def _to_coordinate_axis(axis: np.ndarray) -> tuple[np.ndarray, float, int]:
@@ -404,14 +410,21 @@ def _constants(table: Table) -> _Constants:
     columns = {name: column for column, name in enumerate(table.joint_names)}
     links = []
     for joint in table.joints:
+        axis = np.array(joint.axis)
+        to_coordinate_axis, sense, third = np.eye(3), 1.0, 2
+        if joint.turns:
+            to_coordinate_axis, sense, third = _to_coordinate_axis(axis)
         links.append(
             _Link(
                 joint,
-                axis=np.array(joint.axis),
+                axis=axis,
                 xyz=np.array(joint.xyz),
                 mat_in=joint.mat_before.T,
                 column=columns[joint.source],
-                across=axis_error_directions(np.array(joint.axis)),
+                to_coordinate_axis=to_coordinate_axis,
+                sense=sense,
+                third=third,
+                across=axis_error_directions(axis) @ to_coordinate_axis.T,
             )
         )
     mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
@@ -425,7 +438,7 @@ def _constants(table: Table) -> _Constants:
     # The constants are shared by all motions of the table: no motion may change them.
     shared = [constants.base, constants.mount_xyz, constants.mat_sl]
     for link in links:
-        shared += [link.axis, link.xyz, link.mat_in, link.across]
+        shared += [link.axis, link.xyz, link.mat_in, link.to_coordinate_axis, link.across]
     for array in shared:
         array.flags.writeable = False
     return constants
@@ -470,8 +483,9 @@ def _displace(columns: np.ndarray, displacement: _Displacement) -> np.ndarray:
         columns = columns.copy()
         arm = displacement.offset[:, None]
         columns[:, FORCE] += _arm_force(columns[:, RATE], columns[:, ALPHA], arm)
-    if not np.array_equal(displacement.matrix, np.eye(3)):
-        columns = np.tensordot(displacement.matrix, columns, 1)
+    if np.any(displacement.matrix != _IDENTITY):
+        # As tensordot, without its preparation, which takes longer than a short window.
+        columns = np.dot(displacement.matrix, columns.reshape(3, -1)).reshape(columns.shape)
     return columns
 
 
@@ -479,23 +493,23 @@ def _move(columns: np.ndarray, step: _Step, motion: JointMotion, part: slice) ->
     """Return `columns` in the frame of the link after a moving joint, with its motion added."""
     # The motion about the coordinate axis of the step is `sense` times that of the joint.
     link = step.link
-    factor = step.sense * link.joint.multiplier
+    factor = link.sense * link.joint.multiplier
     position = factor * motion.position[part, link.column]
-    position += step.sense * link.joint.offset
+    position += link.sense * link.joint.offset
     rate = factor * motion.rate[part, link.column]
     acceleration = factor * motion.acceleration[part, link.column]
     if not link.joint.turns:
         return _slide(columns, link.axis[:, None], position, rate, acceleration)
     if link.joint.leans:
         columns = _lean(
-            columns, step, step.sense * position, step.sense * rate, step.sense * acceleration
+            columns, link, link.sense * position, link.sense * rate, link.sense * acceleration
         )
-    return _turn(columns, step.third, position, rate, acceleration)
+    return _turn(columns, link.third, position, rate, acceleration)
 
 
 def _lean(
     columns: np.ndarray,
-    step: _Step,
+    link: _Link,
     angle: np.ndarray,
     rate: np.ndarray,
     acceleration: np.ndarray,
@@ -512,12 +526,12 @@ def _lean(
     The derivatives of u hold because up is fixed in space; the rotation of the Earth is negligible
     relative to the sag.
     """
-    joint = step.link.joint
+    joint = link.joint
     lean = np.zeros((3, 3, len(angle)))  # v, v', v''; coordinate; sample
     if joint.wobble:
         z = wobble_at(joint.wobble, angle, rate, acceleration=acceleration)
-        about_first = np.einsum('dn,k->dkn', z.real, step.across[0])
-        about_second = np.einsum('dn,k->dkn', z.imag, step.across[1])
+        about_first = np.einsum('dn,k->dkn', z.real, link.across[0])
+        about_second = np.einsum('dn,k->dkn', z.imag, link.across[1])
         lean += about_first + about_second
     if joint.sag:
         up = columns[:, UP]
@@ -525,11 +539,11 @@ def _lean(
         up_rate = cross(up, omega)
         up_acceleration = cross(up_rate, omega) + cross(up, columns[:, ALPHA])
         sag = np.zeros((3, 1))
-        sag[step.third] = step.sense * joint.sag
+        sag[link.third] = link.sense * joint.sag
         lean += np.stack([cross(up, sag), cross(up_rate, sag), cross(up_acceleration, sag)])
 
     # Two small turns about the coordinate axes across the joint: the components of v, v', v''.
-    for across in ((step.third + 1) % 3, (step.third + 2) % 3):
+    for across in ((link.third + 1) % 3, (link.third + 2) % 3):
         columns = _turn(columns, across, *lean[:, across])
     return columns
 
