@@ -23,7 +23,6 @@ from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.window import Window, WindowSettings
 from imu_calibration.references.turntable.collector import (
@@ -79,7 +78,7 @@ class LiveSnapshot:
         With all windows stored, columns are computed and linearised again as from a recording.
         Otherwise the gathered columns are solved once.
         """
-        check_units(self.gathered, self.model, self.table)
+        self.gathered.require_units(self.model, self.table)
         if not self.store.complete:
             data = WindowObservations(self.table, self.gathered, self.model)
             return solved_windows(data, options)

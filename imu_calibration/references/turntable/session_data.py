@@ -454,6 +454,18 @@ class SessionData(GatheredData):
     """Number of the recording of each window of `kept`."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
+    has_known_units: bool = False
+    """Whether `require_units` has accepted these windows."""
+
+    def require_units(self, model: SensorModel, table: Table) -> None:
+        """
+        Refuse units and axes other than those of the table; see `check_units`.
+
+        Windows are compared with the joints once, not again when other columns are computed.
+        """
+        if not self.has_known_units:
+            check_units(self, model, table)
+            self.has_known_units = True
 
     def take(self, window: WindowStatistics) -> None:
         """Add a reduced window."""
@@ -493,6 +505,7 @@ def merge(parts: Sequence[SessionData]) -> SessionData:
     first = parts[0]
     total = replace(first, accumulator=first.accumulator.copy(), held_out=first.held_out.copy())
     for part in parts[1:]:
+        total.has_known_units &= part.has_known_units
         total.accumulator.merge(part.accumulator)
         total.held_out.merge(part.held_out)
         total.poses = total.poses + part.poses
@@ -572,7 +585,7 @@ def join(
     named_parts = []
     for session, part in enumerate(parts):
         with naming(names, session):
-            check_units(part, model, table)
+            part.require_units(model, table)
         if len(parts) > 1:
             _require_like_the_first(parts[0], part, names[0], names[session])
             findings = tuple(finding.named(names[session]) for finding in part.findings)
