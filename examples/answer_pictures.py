@@ -41,8 +41,10 @@ def save(drawn: Figure, path: Path):
 
 
 def losses(names):
+    calibration = files.read_calibration(RESULT)
     return {
-        name: export_calibration(RESULT, name, bag='session', axes='flu').loss for name in names
+        name: export_calibration(calibration, name, bag='session', axes='flu').loss
+        for name in names
     }
 
 

@@ -20,7 +20,10 @@ from without_search import candidates_in_scripts
 
 from worlds.no_reports import without_reports
 
-SEARCHED = 'accel_size_effect+gyro_bias_drift+gyro_g_sensitivity+gyro_thermal_bias+time_offset'
+SEARCHED = (
+    'accel_size_effect+gyro_bias_drift+gyro_bias_trend+gyro_g_sensitivity+gyro_thermal_bias'
+    '+time_offset'
+)
 """Effects that the pages name, and others."""
 KEY = re.compile(r'[A-Za-z]\w*(?:[./]\w+)+|[A-Za-z]+_\w+')
 """Names of parameters, effects, files, topics and units."""
