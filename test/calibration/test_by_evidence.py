@@ -398,8 +398,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
         and OFFSET not in faint.param_names
     )
     place, was = (
-        calibration.param_names.index('gyroscope.matrix.xx')
-        for calibration in (faint, asked)
+        calibration.param_names.index('gyroscope.matrix.xx') for calibration in (faint, asked)
     )
     assert faint.sd[place] > 5 * asked.sd[was]
 

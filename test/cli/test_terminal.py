@@ -275,19 +275,15 @@ def test_no_line_of_an_error_is_wider_than_the_terminal(arguments):
 
 @pytest.mark.long
 @pytest.mark.live
-def test_an_inspection_has_colour_on_terminals_and_not_with_no_color(tmp_path):
-    shown = on_terminal(['inspect', SESSION])
+def test_an_inspection_has_colour_on_terminals_and_not_with_no_color(tmp_path, capsys):
+    bag = str(write_small_bag(tmp_path / 'bag'))
+    shown = on_terminal(['inspect', bag])
     assert b'\x1b[32m' in shown
     assert width_of(shown) <= 80
-    bag = str(write_small_bag(tmp_path / 'bag'))
     assert b'\x1b[3' not in on_terminal(['inspect', bag], NO_COLOR='1')
-    plain = subprocess.run(
-        [sys.executable, '-m', 'imu_calibration', 'inspect', bag],
-        cwd=ROOT,
-        capture_output=True,
-        check=True,
-    )
-    assert b'\x1b' not in plain.stdout + plain.stderr
+    assert main(['inspect', bag]) == 0  # no terminal
+    printed = capsys.readouterr()
+    assert printed.out and '\x1b' not in printed.out + printed.err
 
 
 def children_of(process):
