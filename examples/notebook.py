@@ -61,7 +61,7 @@ force[-1], rate[-1]
 # diagnosis finds it. Samples in memory replace the bag.
 
 # %%
-session = imu.simulate('short', effects=['gyro_g_sensitivity'], seed=11)
+session = imu.simulate('quick', effects=['gyro_g_sensitivity'], seed=11)
 session
 
 # %%
