@@ -33,8 +33,8 @@ MODEL = SensorModel(
 )
 
 
-SAMPLES = 75 * 50
-"""75 s at 50 Hz."""
+SAMPLES = 75 * 25
+"""75 s at 25 Hz."""
 
 
 def session(seed, values):
@@ -44,7 +44,7 @@ def session(seed, values):
         values,
         TABLE,
         profile=make_profile('quick', seed, TABLE),
-        options=SimulationOptions(50.0, 50.0),
+        options=SimulationOptions(25.0, 25.0),
         seed=seed,
     )
     return imu.select(slice(0, SAMPLES)), joints.select(slice(0, SAMPLES))
@@ -185,8 +185,8 @@ def test_a_fleet_excludes_the_times_of_all_units_and_of_one(recordings, tmp_path
     for unit in ('unit_a', 'unit_b'):
         calibration = read_calibration(tmp_path / 'fleet' / unit / 'calibration.yaml')
         dropped[unit] = calibration.statistics['dropped']['imu excluded']
-    # 50 Hz, two recordings of unit_b
-    assert dropped == {'unit_a': 100, 'unit_b': 500}
+    # 25 Hz, two recordings of unit_b
+    assert dropped == {'unit_a': 50, 'unit_b': 250}
     capsys.readouterr()
     assert main([*arguments, '--exclude', 'unit_d=4:7']) == 1
     assert "'unit_d=4:7'" in capsys.readouterr().err
