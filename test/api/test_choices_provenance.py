@@ -16,8 +16,6 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.document import files
 
-from worlds.candidates import FEW
-
 ROOT = Path(__file__).resolve().parents[2]
 SESSION, TABLE = ROOT / 'bags/sample_session', ROOT / 'bags/sample_session/table.yaml'
 
@@ -27,9 +25,7 @@ def place(tmp_path_factory):
     """A folder with the result of the sample session, with serial number and operator."""
     folder = tmp_path_factory.mktemp('place')
     (folder / 'table.yaml').write_bytes(TABLE.read_bytes())
-    assert (
-        main(calibrate(folder, '--serial', 'A-17', '--operator', 'Ada', '--candidates', FEW)) == 0
-    )
+    assert main(calibrate(folder, '--serial', 'A-17', '--operator', 'Ada', '--model-as-asked')) == 0
     return folder
 
 
@@ -50,7 +46,7 @@ def test_a_result_names_verb_options_files_serial_number_and_operator(place):
     found = yaml.safe_load((place / 'out/calibration.yaml').read_text())['provenance']
     assert (found['verb'], found['serial'], found['operator']) == ('calibrate', 'A-17', 'Ada')
     assert found['options'] == {
-        'candidates': FEW,
+        'model_as_asked': True,
         'table': {'name': 'table.yaml', 'sha256': files.hash_of(TABLE)},
         'tolerances': {
             'name': 'tolerances.yaml',

@@ -198,7 +198,7 @@ def session(tmp_path_factory):
         )
     )
     arm = Arm(folder / 'arm.urdf', site=folder / 'site.yaml')
-    made = simulate('within_limits_short', table=arm)
+    made = simulate('within_limits_short', table=arm, imu_rate=50.0, joint_rate=50.0)
     joints = made.samples.joints
     shuffled = JointSamples(
         joints.stamp_ns,
@@ -223,6 +223,7 @@ def test_an_arm_calibrates_as_a_table_does(session, tmp_path):
             str(folder / 'site.yaml'),
             '--output',
             str(tmp_path),
+            '--no-report',
             '--candidates',
             FEW,
         ]
