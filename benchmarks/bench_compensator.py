@@ -97,27 +97,54 @@ class Process:
             self.process.wait()
 
 
-def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0):
+class Ends:
     """
-    Send messages to `raw` and receive them from `corrected`.
+    The source and the sink of messages: two processes for all measurements.
 
-    Return (report of the source, report of the sink, CPU seconds).
+    Each measures once for every line of arguments that it reads.
     """
-    sink = subprocess.Popen(
-        [sys.executable, ENDS, 'sink', corrected],
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    source = _source(raw, rate, seconds, environment) if raw == corrected else None
-    _line(sink)
-    source = source or _source(raw, rate, seconds, environment)
-    _line(source)
-    before = cpu_seconds()
-    sent = json.loads(_line(source))
-    used = cpu_seconds() - before
-    source.communicate(timeout=60)
-    return sent, json.loads(sink.communicate(timeout=60)[0]), used
+
+    def __init__(self, environment):
+        self._source, self._sink = (
+            subprocess.Popen(
+                [sys.executable, ENDS, part],
+                env=environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            for part in ('source', 'sink')
+        )
+
+    def run_once(self, raw, corrected, rate, seconds, cpu_seconds=lambda: 0.0):
+        """
+        Send messages to `raw` and receive them from `corrected`.
+
+        Return (report of the source, report of the sink, CPU seconds).
+        """
+        _ask(self._sink, corrected)
+        is_direct = raw == corrected
+        if is_direct:  # each waits for the other
+            _ask(self._source, raw, rate, seconds)
+        _line(self._sink)
+        if not is_direct:
+            _ask(self._source, raw, rate, seconds)
+        _line(self._source)
+        before = cpu_seconds()
+        sent = json.loads(_line(self._source))
+        used = cpu_seconds() - before
+        return sent, json.loads(_line(self._sink)), used
+
+    def stop(self):
+        """End both: they have nothing more to read."""
+        for process in (self._source, self._sink):
+            process.communicate(timeout=60)
+
+
+def _ask(process, *arguments):
+    """Let a process measure once."""
+    assert process.stdin is not None, 'both processes read from a pipe'
+    print(json.dumps(arguments), file=process.stdin, flush=True)
 
 
 def _line(process):
@@ -126,12 +153,7 @@ def _line(process):
     return process.stdout.readline()
 
 
-def _source(topic, rate, seconds, environment):
-    command = [sys.executable, ENDS, 'source', topic, str(rate), str(seconds)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-
-
-def compare(nodes, seconds, environment, rate=1000.0):
+def compare(nodes, seconds, ends, rate=1000.0):
     """
     Measure each node and the direct connection alternately for `TURN` s at `rate`.
 
@@ -141,30 +163,27 @@ def compare(nodes, seconds, environment, rate=1000.0):
     for _ in range(max(1, round(seconds / TURN))):
         for node in nodes:
             raw, corrected = node.topics
-            sent, came, used = run_once(
-                raw, corrected, rate, min(TURN, seconds), environment, node.cpu_seconds
+            sent, came, used = ends.run_once(
+                raw, corrected, rate, min(TURN, seconds), node.cpu_seconds
             )
             node.cpu += used
             node.messages += came['came']
             node.lost += sent['sent'] - came['came']
             node.medians.append(came['late_us'][50])
             node.tails.append(came['late_us'][99])
-        direct.append(
-            run_once('/bench_direct', '/bench_direct', rate, min(TURN, seconds), environment)[1][
-                'late_us'
-            ][50]
-        )
+        _, came, _ = ends.run_once('/bench_direct', '/bench_direct', rate, min(TURN, seconds))
+        direct.append(came['late_us'][50])
     return median(direct)
 
 
-def highest_rate(node, environment, seconds, *, rates):
+def highest_rate(node, ends, seconds, *, rates):
     """
     Return [(requested rate, actual rate, lost messages)] with rising rates until messages are lost.
     """
     raw, corrected = node.topics
     rows = []
     for rate in rates:
-        sent, came, _ = run_once(raw, corrected, rate, seconds, environment)
+        sent, came, _ = ends.run_once(raw, corrected, rate, seconds)
         rows.append((rate, sent['rate'], sent['sent'] - came['came']))
         if rows[-1][2]:
             break
@@ -194,17 +213,19 @@ def bench_compensator(seconds=30.0, rates=RATES):
                 environment,
             ),
         ]
+        ends = Ends(environment)
         try:
             time.sleep(4.0)
-            direct = compare(nodes, seconds, environment)
+            direct = compare(nodes, seconds, ends)
             figures = {
                 node.name: (
                     _figures(node, direct)
-                    | {'rates': highest_rate(node, environment, min(5.0, seconds), rates=rates)}
+                    | {'rates': highest_rate(node, ends, min(5.0, seconds), rates=rates)}
                 )
                 for node in nodes
             }
         finally:
+            ends.stop()
             for node in nodes:
                 node.stop()
     relay, ours = figures['plain relay'], figures['compensator']

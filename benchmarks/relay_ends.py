@@ -78,6 +78,7 @@ def source(topic, rate, seconds):
     struct.pack_into('<d', data, number_at, END)
     publish(bytes(data))
     time.sleep(0.5)
+    node.destroy_node()
 
 
 class _Ended(Exception):
@@ -85,7 +86,7 @@ class _Ended(Exception):
 
 
 def sink(topic):
-    """Print the number and the latencies of the received messages; ends with the last message."""
+    """Print the number and the latencies of the received messages, after the last one."""
     node = rclpy.create_node('bench_sink')
     number_at = template()[1]
     late, numbers = [], []
@@ -113,6 +114,7 @@ def sink(topic):
         relay_loop.relay(node, SimpleNamespace(subscription=subscription), nowhere, convert=record)
     except _Ended:
         pass
+    node.destroy_node()
     late = np.array(late) * 1e-3
     print(
         json.dumps(
@@ -144,12 +146,12 @@ def main():
     split = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
     rclpy.init(args=arguments[split:])
     try:
-        if part == 'source':
-            topic, rate, seconds = arguments[:split]
-            source(topic, float(rate), float(seconds))
+        if part == 'relay':
+            plain_relay()
         else:
-            others: dict[str, Callable[..., None]] = {'sink': sink, 'relay': plain_relay}
-            others[part](*arguments[:split])
+            measures: dict[str, Callable[..., None]] = {'source': source, 'sink': sink}
+            for line in sys.stdin:  # JSON arguments of a measurement
+                measures[part](*json.loads(line))
     except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         pass
     rclpy.try_shutdown()
