@@ -33,8 +33,6 @@ from worlds.compensation_cases import random_calibration
 
 NAMES = ('outer', 'inner')
 FEW_PARAMETERS = {'accelerometer_model': 'bias+matrix', 'gyroscope_model': 'bias+matrix'}
-SOLVED_WHEN_ASKED = {'solve_share': 0.02}
-"""The planner asks for the solutions that it needs: few others are made."""
 POINTS = TrajectoryPoints(
     NAMES, np.array([1.0]), np.array([[0.1, 0.2]]), np.zeros((1, 2)), np.zeros((1, 2))
 )
@@ -397,7 +395,6 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
             },
             # The only diagnosis is that which the planner requests.
             FEW_PARAMETERS
-            | SOLVED_WHEN_ASKED
             | {'model_as_asked': True, 'diagnosis_period': 600.0, 'candidates': 'none'},
             calibration_file=truth,
         )
@@ -464,7 +461,7 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
                 'reach_deg': 60.0,
                 **FEW_PARAMETERS,
             },
-            FEW_PARAMETERS | SOLVED_WHEN_ASKED | {'model_as_asked': True, 'diagnosis_period': 0.0},
+            FEW_PARAMETERS | {'model_as_asked': True, 'diagnosis_period': 0.0},
             table_file=path,
             lag=0.8,
             time_factor=2.0,
@@ -521,7 +518,6 @@ def test_a_class_of_effects_after_six_faces_is_separated_and_an_ending_node_stop
                 **arms,
             },
             arms
-            | SOLVED_WHEN_ASKED
             | {
                 'model_as_asked': True,
                 'diagnosis_period': 600.0,

@@ -95,8 +95,9 @@ class Station:
         fixed = {
             'table_file': TABLE,
             'save_file': Path(folder) / 'calibration.yaml',
-            'solve_share': 0.2,
-            'diagnosis_period': 0.0,  # a test that needs a diagnosis asks for it
+            # A test that needs a solution or a diagnosis asks for it.
+            'solve_share': 0.02,
+            'diagnosis_period': 0.0,
         }
         return self.start('calibration_node', fixed | parameters, **options)
 

@@ -73,7 +73,7 @@ def soak(
         station.watch_diagnostics()
         running = {
             'calibration_node': station.calibration_node(
-                folder, autosave_period=10.0, diagnosis_period=diagnosis_period
+                folder, autosave_period=10.0, diagnosis_period=diagnosis_period, solve_share=0.2
             ),
             'compensator_node': station.start('compensator_node'),
         }
