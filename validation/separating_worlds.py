@@ -122,8 +122,12 @@ def appended(first: SampleBlock, second: SampleBlock) -> SampleBlock:
     return SampleBlock(*(joined_stream([first, later], stream) for stream in streams))
 
 
-def run(world: World) -> dict:
-    """Return one row: the hidden effect, the class, the planned motion, the final findings."""
+def run(world: World, longest: float = LONGEST_SEPARATION) -> dict:
+    """
+    Return one row: the hidden effect, the class, the planned motion, the final findings.
+
+    The planned motions take `longest` seconds at most.
+    """
     start = time.process_time()
     hidden = world.hidden()
     first = world.session(0, world.round(), hidden)
@@ -143,7 +147,7 @@ def run(world: World) -> dict:
                 table,
                 calibration=diagnosis.calibration,
                 diagnosis=diagnosis.document,
-                longest=LONGEST_SEPARATION - sum(earlier.seconds for earlier in plans),
+                longest=longest - sum(earlier.seconds for earlier in plans),
                 with_bound=False,
             ).plan
         except ImuCalibrationError as error:
@@ -222,11 +226,14 @@ def main() -> None:
     parser.add_argument('--first-seed', type=int, default=0)
     parser.add_argument('--effects', type=lambda text: text.split(','), default=HIDDEN)
     parser.add_argument('--most', type=int, default=400, help='worlds that are tried at most')
-    add_smallest(parser, worlds=1, most=1, first_seed=1)
+    parser.add_argument(
+        '--longest', type=float, default=LONGEST_SEPARATION, help='of the planned motions, s'
+    )
+    add_smallest(parser, worlds=1, most=1, first_seed=1, longest=60.0)
     options = parser.parse_args()
     rows, tried = [], 0
     for world in islice(worlds(options.first_seed, options.effects), options.most):
-        row = run(world)
+        row = run(world, options.longest)
         tried += 1
         if 'right' not in row:
             continue
