@@ -145,9 +145,10 @@ def test_standard_deviations_hold_when_biases_differ():
 
     The square of a t-distributed error has a heavy tail (nine degrees of freedom): 48 of them have
     a mean of 1 with a standard deviation of 0.3 at most, 200 of a normal distribution one of 0.1.
-    Without a value of the bias for each recording the first mean is 2.5 with these seeds.
+    Without a value of the bias for each recording the first mean is 2.3 with these seeds.
     """
-    motion = windows_and_columns(25.0)
+    # Every second window: biases of recordings do not need all.
+    motion = windows_and_columns(25.0)[::2]
     sds, errors = bias_sds(motion), []
     for seed in range(8):
         rng, values = np.random.default_rng([seed, 2]), random_values(MODEL, 'industrial', seed)
