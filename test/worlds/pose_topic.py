@@ -90,6 +90,11 @@ class PoseBlocks:
                 found.append((block, last.T @ first))
         return found
 
+    @cached_property
+    def turns(self):
+        """Rotations of the blocks by the readings: (effects, values) -> turns (`PoseRows`)."""
+        return {}
+
     @property
     def period(self):
         return float(np.median(np.diff(self.time)))
@@ -163,21 +168,36 @@ class PoseRows:
     def moved(self, state, step):
         return PoseState(state.values + step[1:], state.lag + step[0])
 
-    def linearise(self, state):
-        model, values = self.model, state.values
+    def turns(self, values):
+        """
+        Return (first rate, last rate, turn) of each block at parameters.
+
+        They are remembered: the search and all folds begin at the same ones.
+        """
+        model = self.model
+        effects = [effect for effect in model.further if effect.sensor == 'gyroscope']
+        key = tuple(effect.name for effect in effects), values.tobytes()
+        if key in self.data.turns:
+            return self.data.turns[key]
         bias = values[model.part('gyroscope', Role.OFFSET)]
         matrix = values[model.part('gyroscope', Role.LINEAR)].reshape(3, 3)
-        effects = [effect for effect in model.further if effect.sensor == 'gyroscope']
-        own = ~self.fixed
-        residual, late_columns, main = [], [], []
-        for block, mat_ref in self.data.blocks:
+        found = []
+        for block, _ in self.data.blocks:
             time, rate = self.data.time[block], self.data.rate[block]
             true = np.linalg.solve(matrix, (rate - bias).T).T
             further = None
             if effects:
                 further = output_of_effects(effects, model, values, ref=still(time, true))
             turn = integrate_turn(time, rate, bias=bias, matrix=matrix, further=further)
-            first, last = true[0], true[-1]
+            found.append((true[0], true[-1], turn))
+        self.data.turns[key] = found
+        return found
+
+    def linearise(self, state):
+        own = ~self.fixed
+        residual, late_columns, main = [], [], []
+        turns = self.turns(state.values)
+        for (_, mat_ref), (first, last, turn) in zip(self.data.blocks, turns, strict=True):
             late = (
                 small_rotation(state.lag * last) @ turn.mat_ji @ small_rotation(-state.lag * first)
             )
