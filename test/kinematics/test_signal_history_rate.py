@@ -50,6 +50,7 @@ def test_a_steady_change_has_its_slope_and_parts_give_the_same():
     np.testing.assert_array_equal(np.concatenate(joined), slope)
 
 
+@pytest.fixture(scope='module')
 def session_that_warms():
     """Return (samples, table) of a gyroscope whose biases are SIZE times the slope."""
     session = make_session(
@@ -71,8 +72,8 @@ def session_that_warms():
     return block, Table.from_mapping(session.table)
 
 
-def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
-    block, table = session_that_warms()
+def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated(session_that_warms):
+    block, table = session_that_warms
     options = CalibrationOptions(
         accelerometer_model='bias+matrix',
         gyroscope_model='bias+matrix+bias_while_warming',
@@ -110,9 +111,9 @@ def test_formulas_with_a_temperature_contain_its_slope():
 
 
 @pytest.mark.long
-def test_the_diagnosis_names_the_slope_of_the_temperature():
+def test_the_diagnosis_names_the_slope_of_the_temperature(session_that_warms):
     # A wander of all axes alike followed it, and nothing was found.
-    block, table = session_that_warms()
+    block, table = session_that_warms
     catalogue = CATALOGUE.with_candidates('gyro_thermal_bias+gyro_bias_drift+gyro_bias_trend')
     options = CalibrationOptions(catalogue=catalogue)
     diagnosis = diagnose_recording([block], TableReference(table), options).diagnosis
