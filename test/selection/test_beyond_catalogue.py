@@ -41,6 +41,7 @@ from worlds.candidates import with_candidates
 from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.misfit_coverage import COARSE
+from worlds.no_reports import without_reports
 from worlds.physics_beyond import Beyond
 
 FEW = (
@@ -361,33 +362,35 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
     )
     assert name in (tmp_path / 'out' / 'report.html').read_text()
     model = ['--effects', str(extended), '--gyroscope-model', f'bias+matrix+{name}']
-    assert main(
-        [
-            'diagnose',
-            str(tmp_path / 'bag'),
-            *table,
-            *model,
-            '--output',
-            str(tmp_path / 'again'),
-            '--candidates',
-            OF_RATES,
-        ]
-    ) in (0, 3)
+    with without_reports():
+        assert main(
+            [
+                'diagnose',
+                str(tmp_path / 'bag'),
+                *table,
+                *model,
+                '--output',
+                str(tmp_path / 'again'),
+                '--candidates',
+                OF_RATES,
+            ]
+        ) in (0, 3)
     again = json.loads((tmp_path / 'again' / 'diagnosis.json').read_text())
     assert not again['unexplained']['gyroscope']['significant'] and not again['findings']
-    assert main(
-        [
-            'diagnose',
-            str(tmp_path / 'bag'),
-            *table,
-            '--effects',
-            str(extended),
-            '--output',
-            str(tmp_path / 'named'),
-            '--candidates',
-            OF_RATES,
-        ]
-    ) in (0, 3)
+    with without_reports():
+        assert main(
+            [
+                'diagnose',
+                str(tmp_path / 'bag'),
+                *table,
+                '--effects',
+                str(extended),
+                '--output',
+                str(tmp_path / 'named'),
+                '--candidates',
+                OF_RATES,
+            ]
+        ) in (0, 3)
     assert [
         f['effect']
         for f in json.loads((tmp_path / 'named' / 'diagnosis.json').read_text())['findings']
@@ -409,7 +412,6 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
         )
         == 0
     )
-    assert main(['check', str(tmp_path / 'bag2'), '--calibration', str(extended), *table]) in (0, 3)
     assert main(
         [
             'compensate',
