@@ -99,6 +99,16 @@ def is_unexplained(windows: Sequence[Window], expected: Sequence[np.ndarray]) ->
     return _share(residual, measured) > LARGEST_UNEXPLAINED
 
 
+def unexplained_share(windows: Sequence[Window], table: Table) -> float:
+    """
+    Return the share of the squared rates in moving windows that the joints do not explain.
+
+    Bias and matrix of the sensor and a small delay are free, as in `description_error`.
+    """
+    readings = motion_readings(windows, MAX_SAMPLES)
+    return _share(_rate_residual(readings, table, readings.motion), readings.rate_s)
+
+
 def _sensor_fit(
     windows: Sequence[Window], expected: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

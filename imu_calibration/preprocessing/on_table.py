@@ -420,12 +420,14 @@ def _delay_cause(windows: Sequence[Window], table: Table) -> str:
     return _late(delay.seconds) if abs(delay.seconds) > LEAST_SHIFT and is_better else ''
 
 
-def a_period_late(windows: Sequence[Window], table: Table) -> CheckFinding | None:
+def a_period_late(
+    windows: Sequence[Window], table: Table, *, least_share: float = LEAST_SHARE_EXPLAINED
+) -> CheckFinding | None:
     """
     Return the finding for streams that agree clearly better with a delay, or None.
 
     Beyond the range of a lag: clocks that differ, or streams of a repeating motion that are a
-    period apart.
+    period apart. `least_share`: of the rates that the joints explain with the delay.
     """
     delay = _estimate_delay(windows, table)
     # A smaller delay is estimated as a lag, with the other parameters.
@@ -434,7 +436,7 @@ def a_period_late(windows: Sequence[Window], table: Table) -> CheckFinding | Non
     # Opposite rates: a wrong sign, or half a period.
     if delay.share_near_zero < -SAME:
         return None
-    if delay.share < max(LEAST_SHARE_EXPLAINED, delay.share_near_zero + SHARE_TIE):
+    if delay.share < max(LEAST_SHARE_EXPLAINED, least_share, delay.share_near_zero + SHARE_TIE):
         return None
     return CheckFinding(
         'on_table',

@@ -10,7 +10,7 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import rotation
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.joint_checks import standing_still
+from imu_calibration.preprocessing.frozen_joints import standing_still
 from imu_calibration.preprocessing.joint_geometry import description_error, with_axis
 from imu_calibration.preprocessing.window import Window
 

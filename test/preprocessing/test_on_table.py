@@ -15,7 +15,8 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.joint_checks import _rate_findings, standing_still
+from imu_calibration.preprocessing.frozen_joints import standing_still
+from imu_calibration.preprocessing.joint_checks import _rate_findings
 from imu_calibration.preprocessing.on_table import (
     ProductSums,
     _candidates,

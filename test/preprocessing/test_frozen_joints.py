@@ -1,0 +1,100 @@
+"""Joints whose states are frozen or jump while the table moves on are named, with the time."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.preprocessing.joint_checks import against_joints
+from imu_calibration.references.turntable.collector import Collector, GatherStep
+
+from worlds.live_sessions import TABLE, make_session
+
+SECONDS = 4.0
+RATE = 50.0
+
+
+@pytest.fixture(scope='module')
+def recording():
+    """IMU, joints and model of a session in which joints move alone and together."""
+    imu, joints, _, model = make_session(21, RATE, profile='random_short')
+    return imu, joints, model
+
+
+def found(imu, joints, model):
+    collector = Collector(GatherStep(TABLE, model))
+    collector.push(SampleBlock(imu, joints))
+    return against_joints(collector.finish(), model, TABLE)
+
+
+def fastest_time(joints, joint, others):
+    """Return the number of the sample from which `joint` moves most, beside the others or alone."""
+    is_moving = np.abs(joints.velocity) > 0.2
+    others_move = np.delete(is_moving, joint, axis=1).any(axis=1)
+    wanted = is_moving[:, joint] & (others_move if others else ~others_move)
+    return int(np.argmax(np.convolve(wanted, np.ones(int(SECONDS * RATE)), 'valid')))
+
+
+def frozen(joints, joint, start):
+    """Hold the state of a joint for some seconds; then it jumps to where the joint is."""
+    held = slice(start, start + int(SECONDS * RATE))
+    position, velocity = joints.position.copy(), joints.velocity.copy()
+    position[held, joint], velocity[held, joint] = position[start, joint], 0.0
+    return replace(joints, position=position, velocity=velocity)
+
+
+def times(text):
+    """Return the times in a message, s."""
+    return [float(value) for value in re.findall(r'([\d.]+) s\b', text)]
+
+
+@pytest.mark.parametrize('others', [True, False], ids=('beside moving joints', 'while all rest'))
+@pytest.mark.parametrize('joint', [0, 1, 2])
+def test_a_frozen_joint_is_named_with_the_time(recording, joint, others):
+    """
+    The joints before a frozen one turn about axes that its state no longer gives.
+
+    At rest by the joints, the IMU turns.
+    """
+    imu, joints, model = recording
+    start = fastest_time(joints, joint, others)
+    (finding,) = found(imu, frozen(joints, joint, start), model)
+    assert finding.check in ('frozen', 'joint_jump')
+    assert TABLE.joint_names[joint] in finding.text
+    first = start / RATE
+    assert all(first - 1.0 < time < first + SECONDS + 1.0 for time in times(finding.text))
+
+
+def test_a_zero_that_changes_is_a_jump(recording):
+    imu, joints, model = recording
+    position = joints.position.copy()
+    moving = fastest_time(joints, 1, True) + int(RATE)
+    position[moving:, 1] += 1.0
+    (finding,) = found(imu, replace(joints, position=position), model)
+    assert finding.check == 'joint_jump' and 'middle' in finding.text
+    assert times(finding.text)[0] == pytest.approx(moving / RATE, abs=0.3)
+
+
+@pytest.mark.parametrize('joint', [0, 2])
+def test_a_wrong_gear_ratio_is_no_frozen_joint(recording, joint):
+    """Rests of other joints are explained by a motion of theirs too, the other times are not."""
+    imu, joints, model = recording
+    position, velocity = joints.position.copy(), joints.velocity.copy()
+    position[:, joint] *= 0.7
+    velocity[:, joint] *= 0.7
+    changed = replace(joints, position=position, velocity=velocity)
+    assert 'frozen' not in {finding.check for finding in found(imu, changed, model)}
+
+
+@pytest.mark.parametrize('lag', [-0.03, 0.03, 0.3])
+def test_a_late_stream_is_no_frozen_joint(recording, lag):
+    imu, joints, model = recording
+    late = replace(imu, stamp_ns=imu.stamp_ns + int(lag * 1e9))
+    assert 'frozen' not in {finding.check for finding in found(late, joints, model)}
+    # A frozen joint in a stream that is little late is still found.
+    if lag == 0.03:
+        start = fastest_time(joints, 1, True)
+        (finding,) = found(late, frozen(joints, 1, start), model)
+        assert finding.check == 'frozen' and 'middle' in finding.text
