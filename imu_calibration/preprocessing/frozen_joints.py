@@ -32,6 +32,11 @@ LEAST_TURNING = 0.5
 """Least time that the IMU turns during a standstill, s."""
 MAX_REPEATED_RATE = 1e-6
 """Largest rate of a joint with a repeated state after smoothing of the positions, rad/s."""
+SAME_STATE = 1e-2
+"""
+Positions of a joint with a repeated state differ by at most this after smoothing, rad: a jump at
+its end affects some seconds.
+"""
 FROZEN_SHARE = 0.8
 """Share of the unexplained rate that the motion of a frozen joint explains, as a mean square."""
 SAME_GAIN = 0.05
@@ -41,8 +46,11 @@ LEAST_GAIN_ERROR = 0.3
 The unexplained rate along that axis is at least this share of the measured rate along it: a wrong
 gain causes less.
 """
-SMOOTHED = 0.5
-"""Seconds beside a standstill or a jump in which the rates of the joints may be wrong."""
+BESIDE_JUMP, BESIDE_STANDSTILL = 0.5, 5.0
+"""
+Seconds beside a jump of a joint's state, and beside a standstill that may end in one, in which the
+rates of the joints are wrong.
+"""
 JUMP_FACTOR = 2.0
 """Rate by the joints over the largest rate of the IMU in the recording from which a state jumps."""
 LONGEST_JUMP = 0.5
@@ -145,28 +153,26 @@ def _frozen_joint(
         Bias of the gyroscope, rad/s.
 
     """
-    frozen = _frozen_joints(windows, table, [rate + bias for rate in expected], rests)
-    if not frozen:
+    suspects = _suspects(windows, table, [rate + bias for rate in expected], rests)
+    if not suspects:
         return None
     # An IMU that is turned against its mount measures the rates of other joints about the axis of
     # one at rest too.
     turned = turned_rates(windows, expected)
     if turned is not None:
-        frozen = _frozen_joints(windows, table, turned, rests)
-        if not frozen:
-            return None
+        suspects = _suspects(windows, table, turned, rests)
+    frozen = [joint for joint in suspects if joint.gain > FROZEN_SHARE * joint.square]
 
-    # A delay or a wrong description explains the whole recording, a frozen joint all but that time.
-    spans = _joined([span for joint in frozen for span in joint.spans])
-    outside = outside_of(windows, spans)
-    unexplained = unexplained_share(outside, table) if outside else None
-    least_share = 0.0 if unexplained is None else 1.0 - unexplained
+    # A delay or a wrong description explains the whole recording, a frozen joint all but the time
+    # in which its state is constant.
+    spans = [span for joint in frozen for span in joint.spans]
+    outside = outside_of(windows, spans, margin=BESIDE_STANDSTILL)
+    unexplained = unexplained_share(outside, table) if outside else 0.0
+    least_share = 1.0 - unexplained if frozen and outside else 0.0
     other_cause = a_period_late(windows, table, least_share=least_share)
     other_cause = other_cause or description_error(windows, table)
-    if other_cause:
+    if other_cause or not frozen or unexplained > LARGEST_UNEXPLAINED:
         return other_cause
-    if unexplained is not None and unexplained > LARGEST_UNEXPLAINED:
-        return None
 
     best = frozen[0]
     names = [joint.name for joint in frozen if joint.gain > (1.0 - SAME_GAIN) * best.gain]
@@ -232,13 +238,15 @@ def jump_finding(jumps: Sequence[Jump], fastest: float) -> CheckFinding:
     )
 
 
-def outside_of(windows: Sequence[Window], spans: Sequence[tuple[float, float]]) -> list[Window]:
-    """Return the parts of moving windows that are more than `SMOOTHED` away from all spans, s."""
+def outside_of(
+    windows: Sequence[Window], spans: Sequence[tuple[float, float]], *, margin: float
+) -> list[Window]:
+    """Return the parts of moving windows that are more than `margin` away from all spans, s."""
     parts = []
     for window in windows:
         is_outside = np.ones(len(window), bool)
         for start, stop in spans:
-            is_outside &= (window.time < start - SMOOTHED) | (window.time > stop + SMOOTHED)
+            is_outside &= (window.time < start - margin) | (window.time > stop + margin)
         parts += [window.select(slice(start, stop)) for start, stop in runs_of(is_outside)]
     return parts
 
@@ -305,11 +313,13 @@ class _FrozenJoint:
     """When it does, s."""
     gain: float
     """Sum of squares of the rates that its motion explains, (rad/s)^2."""
+    square: float
+    """Sum of squares of the rates that its state does not explain, (rad/s)^2."""
 
 
 @dataclass(frozen=True)
 class _Standstill:
-    """A time in which the motion of a joint explains what the IMU measures, not its state."""
+    """A time in which the state of a joint is constant and the IMU turns about its axis."""
 
     start: float
     """First sample, s."""
@@ -317,16 +327,18 @@ class _Standstill:
     """Last sample, s."""
     gain: float
     """Sum of squares of the rates that the motion explains, (rad/s)^2."""
+    square: float
+    """Sum of squares of the rates that the state does not explain, (rad/s)^2."""
 
 
-def _frozen_joints(
+def _suspects(
     windows: Sequence[Window],
     table: Table,
     expected: Sequence[np.ndarray],
     rests: Sequence[Rest],
 ) -> list[_FrozenJoint]:
     """
-    Return the joints that are frozen, the one that explains most of the rates first.
+    Return the joints that may be frozen, the one whose motion explains most of the rates first.
 
     `expected`: rates in each window, rad/s, shape (n, 3).
     """
@@ -341,9 +353,35 @@ def _frozen_joints(
         for rest in turning:
             found += _turn_at_rest(rest, table, rest.rate_s - bias, joint=k)
         if found:
-            spans = _joined([(each.start, each.stop) for each in found])
-            joints.append(_FrozenJoint(name, spans, sum(each.gain for each in found)))
+            spans = [_while_constant(each, windows, rests, joint=k) for each in found]
+            spans = _joined(list(dict.fromkeys(spans)))
+            gain = sum(each.gain for each in found)
+            joints.append(_FrozenJoint(name, spans, gain, sum(each.square for each in found)))
     return sorted(joints, key=lambda joint: -joint.gain)
+
+
+def _while_constant(
+    standstill: _Standstill, windows: Sequence[Window], rests: Sequence[Rest], *, joint: int
+) -> tuple[float, float]:
+    """
+    Return from when to when the state of a joint is that in a standstill, s.
+
+    Also where the joint rests: its state is that of another place.
+    """
+    times = [window.time for window in windows]
+    positions = [window.motion.position[:, joint] for window in windows]
+    for rest in rests:
+        times.append(np.array([rest.start, rest.stop]))
+        positions.append(np.full(2, rest.position[joint]))
+    time, position = np.concatenate(times), np.concatenate(positions)
+    order = np.argsort(time, kind='stable')
+    time, position = time[order], position[order]
+
+    within = (time >= standstill.start) & (time <= standstill.stop)
+    is_same = np.abs(position - np.median(position[within])) < SAME_STATE
+    runs = time[runs_of(is_same) - [0, 1]]
+    start, stop = runs[(runs[:, 0] <= standstill.stop) & (runs[:, 1] >= standstill.start)][0]
+    return float(start), float(stop)
 
 
 def _standstills(
@@ -381,10 +419,11 @@ def _standstills(
         if (
             turning_seconds > LEAST_TURNING
             and square_along > len(residual_along) * MIN_TURN_RATE**2
-            and gain > FROZEN_SHARE * square
+            and max(gain, square_along) > FROZEN_SHARE * square
             and square_along > LEAST_GAIN_ERROR**2 * (measured_along @ measured_along)
         ):
-            yield _Standstill(float(window.time[start]), float(window.time[stop - 1]), gain)
+            first, last = float(window.time[start]), float(window.time[stop - 1])
+            yield _Standstill(first, last, gain, square)
 
 
 def _turn_at_rest(
@@ -397,8 +436,9 @@ def _turn_at_rest(
     motion = JointMotion(np.zeros(1), rest.position[None], unit, zero, zero)
     axis = reference_motion(table, motion, attitude=False).rate_s[0]
     square_along = float(rate @ axis) ** 2
-    if square_along > FROZEN_SHARE * float(rate @ rate):
-        yield _Standstill(rest.start, rest.stop, rest.count * square_along)
+    square = float(rate @ rate)
+    if square_along > FROZEN_SHARE * square:
+        yield _Standstill(rest.start, rest.stop, rest.count * square_along, rest.count * square)
 
 
 def _carried_rates(table: Table, motion: JointMotion, joint: int) -> np.ndarray:

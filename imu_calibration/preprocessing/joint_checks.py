@@ -11,6 +11,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse
 from imu_calibration.preprocessing.frozen_joints import (
+    BESIDE_JUMP,
     Rest,
     find_jumps,
     jump_finding,
@@ -160,7 +161,8 @@ def _rate_findings(
     fastest = max((float(np.linalg.norm(w.rate_s, axis=1).max()) for w in windows), default=0.0)
     jumps = find_jumps(windows, table, fastest)
     if jumps:
-        windows = outside_of(windows, [(jump.start, jump.stop) for jump in jumps])
+        spans = [(jump.start, jump.stop) for jump in jumps]
+        windows = outside_of(windows, spans, margin=BESIDE_JUMP)
     else:
         unit_findings = list(_rate_units(sums))
         if unit_findings:
