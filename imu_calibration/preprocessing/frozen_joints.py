@@ -67,7 +67,7 @@ noise.
 
 
 @dataclass(frozen=True, eq=False)
-class Rest:
+class JointRest:
     """Mean rate of the IMU while all joints are constant."""
 
     start: float
@@ -83,7 +83,7 @@ class Rest:
 
 
 def standing_still(
-    windows: Sequence[Window], table: Table, *, rests: Sequence[Rest] = ()
+    windows: Sequence[Window], table: Table, *, rests: Sequence[JointRest] = ()
 ) -> CheckFinding | None:
     """
     Return the finding of a joint or gyroscope that is frozen for a second in motion, or None.
@@ -99,7 +99,7 @@ def standing_still(
     windows : sequence of Window
         Moving windows with their samples.
     table : Table
-    rests : sequence of Rest
+    rests : sequence of JointRest
         Windows in which no joint moves.
 
     """
@@ -138,7 +138,7 @@ def _frozen_joint(
     expected: Sequence[np.ndarray],
     *,
     bias: np.ndarray,
-    rests: Sequence[Rest],
+    rests: Sequence[JointRest],
 ) -> CheckFinding | None:
     """
     Return the finding of a frozen joint, or of another cause that explains the same better.
@@ -335,7 +335,7 @@ def _suspects(
     windows: Sequence[Window],
     table: Table,
     expected: Sequence[np.ndarray],
-    rests: Sequence[Rest],
+    rests: Sequence[JointRest],
 ) -> list[_FrozenJoint]:
     """
     Return the joints that may be frozen, the one whose motion explains most of the rates first.
@@ -361,7 +361,7 @@ def _suspects(
 
 
 def _while_constant(
-    standstill: _Standstill, windows: Sequence[Window], rests: Sequence[Rest], *, joint: int
+    standstill: _Standstill, windows: Sequence[Window], rests: Sequence[JointRest], *, joint: int
 ) -> tuple[float, float]:
     """
     Return from when to when the state of a joint is that in a standstill, s.
@@ -427,7 +427,7 @@ def _standstills(
 
 
 def _turn_at_rest(
-    rest: Rest, table: Table, rate: np.ndarray, *, joint: int
+    rest: JointRest, table: Table, rate: np.ndarray, *, joint: int
 ) -> Iterator[_Standstill]:
     """Yield a rest in which the IMU turns about the axis of a joint at `rate`, rad/s, (3,)."""
     unit = np.zeros((1, len(rest.position)))

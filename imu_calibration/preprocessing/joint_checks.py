@@ -12,7 +12,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse
 from imu_calibration.preprocessing.frozen_joints import (
     BESIDE_JUMP,
-    Rest,
+    JointRest,
     find_jumps,
     jump_finding,
     outside_of,
@@ -139,7 +139,7 @@ def _seen_directions(sensor: str, reference: np.ndarray) -> tuple[np.ndarray, np
     return vectors @ vectors.T, vectors @ np.diag(1.0 / values[is_seen]) @ vectors.T
 
 
-def _rests(gathered: Reduced) -> list[Rest]:
+def _rests(gathered: Reduced) -> list[JointRest]:
     """Return the windows at rest of which the joint positions are kept."""
     positions = {(time, session): position for time, session, position in gathered.poses}
     rests = []
@@ -148,12 +148,12 @@ def _rests(gathered: Reduced) -> list[Rest]:
         if row.kind == 'static' and position is not None:
             half = 0.5 * row.duration
             rate_s = row.sensors['gyroscope'].mean[-3:]
-            rests.append(Rest(row.time - half, row.time + half, row.count, position, rate_s))
+            rests.append(JointRest(row.time - half, row.time + half, row.count, position, rate_s))
     return rests
 
 
 def _rate_findings(
-    sums: ProductSums, windows: list[Window], table: Table, *, rests: Sequence[Rest] = ()
+    sums: ProductSums, windows: list[Window], table: Table, *, rests: Sequence[JointRest] = ()
 ) -> list[CheckFinding]:
     """Return the finding of rates that are not those of the joints, apart from the IMU axes."""
     windows = [window for window in windows if len(window) == len(window.motion)]
