@@ -207,6 +207,8 @@ def find_jumps(windows: Sequence[Window], table: Table, fastest: float) -> list[
     largest rate that it measures in the recording, rad/s. Where such rates are not rare, they have
     another cause.
     """
+    if not windows:
+        return []
     windows = _unsaturated(windows)
     jumps = []
     n_fast = 0
@@ -366,7 +368,7 @@ def _while_constant(
     """
     Return from when to when the state of a joint is that in a standstill, s.
 
-    Also where the joint rests: its state is that of another place.
+    Where a joint with a frozen state rests in another place, the rates of the others are wrong too.
     """
     times = [window.time for window in windows]
     positions = [window.motion.position[:, joint] for window in windows]
@@ -379,9 +381,11 @@ def _while_constant(
 
     within = (time >= standstill.start) & (time <= standstill.stop)
     is_same = np.abs(position - np.median(position[within])) < SAME_STATE
-    runs = time[runs_of(is_same) - [0, 1]]
-    start, stop = runs[(runs[:, 0] <= standstill.stop) & (runs[:, 1] >= standstill.start)][0]
-    return float(start), float(stop)
+    for start, stop in runs_of(is_same):
+        first, last = float(time[start]), float(time[stop - 1])
+        if first <= standstill.stop and last >= standstill.start:
+            return first, last
+    return standstill.start, standstill.stop
 
 
 def _standstills(

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.preprocessing.joint_checks import against_joints
+from imu_calibration.preprocessing.joint_checks import _rate_findings, against_joints
+from imu_calibration.preprocessing.on_table import ProductSums
 from imu_calibration.references.turntable.collector import Collector, GatherStep
 
 from worlds.live_sessions import TABLE, make_session
@@ -75,6 +76,12 @@ def test_a_zero_that_changes_is_a_jump(recording):
     (finding,) = found(imu, replace(joints, position=position), model)
     assert finding.check == 'joint_jump' and 'middle' in finding.text
     assert times(finding.text)[0] == pytest.approx(moving / RATE, abs=0.3)
+
+
+def test_no_kept_samples_are_no_fault():
+    """One window may be longer than all samples that are kept."""
+    rates = np.eye(3)
+    assert _rate_findings(ProductSums(rates, rates, rates), [], TABLE) == []
 
 
 @pytest.mark.parametrize('joint', [0, 2])
