@@ -28,8 +28,6 @@ from imu_calibration.preprocessing.window import Window
 
 LASTING = 1.0
 """Least duration of a standstill, s; shorter ones are handled by other checks."""
-LEAST_TURNING = 0.5
-"""Least time that the IMU turns during a standstill, s."""
 MAX_REPEATED_RATE = 1e-6
 """Largest rate of a joint with a repeated state after smoothing of the positions, rad/s."""
 SAME_STATE = 1e-2
@@ -414,15 +412,11 @@ def _standstills(
         measured_along = (window.rate_s[start:stop] * axis).sum(axis=1)
         square_along = float(residual_along @ residual_along)
         square = float((residual**2).sum())
-        # A jump of the state at the end of a standstill disturbs the next window for some samples.
-        is_turning = np.abs(residual_along) > MIN_TURN_RATE
-        turning_seconds = is_turning.mean() * (motion.time[-1] - motion.time[0])
         carried = _carried_rates(table, motion, joint)
         left = _beyond_joint_motion(residual, carried, axis=axis, time=motion.time)
         gain = square - float((left**2).sum())
         if (
-            turning_seconds > LEAST_TURNING
-            and square_along > len(residual_along) * MIN_TURN_RATE**2
+            square_along > len(residual_along) * MIN_TURN_RATE**2
             and max(gain, square_along) > FROZEN_SHARE * square
             and square_along > LEAST_GAIN_ERROR**2 * (measured_along @ measured_along)
         ):
