@@ -191,9 +191,13 @@ def frozen_lines(parts: Sequence[FrozenPart], consequence: str) -> list[str]:
 
 
 def span_words(spans: Sequence[tuple[float, float]]) -> str:
-    """Return (start, stop), s, of three times in words, and the number of further ones."""
-    words = [f'from {start:.1f} s to {stop:.1f} s' for start, stop in spans[:3]]
-    return ', '.join(words) + (f' and {len(spans) - 3} times more' if len(spans) > 3 else '')
+    """Return (start, stop), s, in words as `first_of`."""
+    return first_of([f'from {start:.1f} s to {stop:.1f} s' for start, stop in spans])
+
+
+def first_of(times: Sequence[str]) -> str:
+    """Return three times in words, and the number of further ones."""
+    return ', '.join(times[:3]) + (f' and {len(times) - 3} times more' if len(times) > 3 else '')
 
 
 WHOLE_MS = 1_000_000

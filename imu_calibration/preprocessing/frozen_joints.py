@@ -6,6 +6,7 @@ And gyroscopes that repeat one reading while the joints turn.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from imu_calibration.core.samples import runs_of, smallest_step
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import span_words
+from imu_calibration.preprocessing.checks import first_of, span_words
 from imu_calibration.preprocessing.joint_geometry import (
     LARGEST_UNEXPLAINED,
     description_error,
@@ -101,9 +102,7 @@ def standing_still(
         Windows in which no joint moves.
 
     """
-    windows = [
-        window for window in windows if len(window) > 2 and len(window.motion) == len(window)
-    ]
+    windows = _with_motion(windows)
     if not windows:
         return None
     # 1. A frozen gyroscope.
@@ -119,10 +118,11 @@ def standing_still(
             'while the joints turn; check the sensor and its driver, and exclude that time',
         )
     # 2. A frozen joint.
-    windows = _unsaturated(windows)
+    unsaturated = _unsaturated(windows)
+    windows = list(compress(windows, unsaturated))
+    expected = list(compress(expected, unsaturated))
     if not windows:
         return None
-    expected = _expected_rates(windows, table)
     finding = _frozen_joint(windows, table, expected, bias=bias, rests=rests)
     if finding is not None:
         return finding
@@ -159,7 +159,7 @@ def _frozen_joint(
     turned = turned_rates(windows, expected)
     if turned is not None:
         suspects = _suspects(windows, table, turned, rests)
-    frozen = [joint for joint in suspects if joint.gain > FROZEN_SHARE * joint.square]
+    frozen = [joint for joint in suspects if joint.is_explained]
 
     # A delay or a wrong description explains the whole recording, a frozen joint all but the time
     # in which its state is constant.
@@ -183,6 +183,11 @@ def _frozen_joint(
     )
 
 
+def _with_motion(windows: Sequence[Window]) -> list[Window]:
+    """Return the windows with the motion of the joints at each of several samples."""
+    return [window for window in windows if len(window) > 2 and len(window.motion) == len(window)]
+
+
 @dataclass(frozen=True)
 class Jump:
     """A jump of a joint's state."""
@@ -194,20 +199,23 @@ class Jump:
     stop: float
     """Last sample, s."""
     rate: float
-    """Rate of the IMU by the joints, rad/s."""
+    """Largest rate of the IMU by the joints in this time, rad/s."""
+    fastest: float
+    """Largest rate that the IMU measures in the recording, rad/s."""
 
 
-def find_jumps(windows: Sequence[Window], table: Table, fastest: float) -> list[Jump]:
+def find_jumps(windows: Sequence[Window], table: Table) -> list[Jump]:
     """
     Return the jumps of the joint states in moving windows.
 
-    In a jump the joints turn the IMU, for a short time, several times as fast as `fastest`, the
-    largest rate that it measures in the recording, rad/s. Where such rates are not rare, they have
-    another cause.
+    In a jump the joints turn the IMU, for a short time, several times as fast as it ever turns in
+    the recording. Where such rates are not rare, they have another cause.
     """
+    windows = _with_motion(windows)
     if not windows:
         return []
-    windows = _unsaturated(windows)
+    fastest = max(float(np.linalg.norm(window.rate_s, axis=1).max()) for window in windows)
+    windows = list(compress(windows, _unsaturated(windows)))
     jumps = []
     n_fast = 0
     for window, expected in zip(windows, _expected_rates(windows, table)):
@@ -217,24 +225,22 @@ def find_jumps(windows: Sequence[Window], table: Table, fastest: float) -> list[
             first, last = float(window.time[start]), float(window.time[stop - 1])
             if last - first < LONGEST_JUMP:
                 joint = int(np.argmax(np.abs(window.motion.rate[start:stop]).max(axis=0)))
-                name = table.joint_names[joint]
-                jumps.append(Jump(name, first, last, float(rate[start:stop].max())))
+                largest = float(rate[start:stop].max())
+                jumps.append(Jump(table.joint_names[joint], first, last, largest, fastest))
     is_rare = n_fast < RARE_SHARE * sum(len(window) for window in windows)
     return jumps if is_rare else []
 
 
-def jump_finding(jumps: Sequence[Jump], fastest: float) -> CheckFinding:
-    """Return the finding of jumps; `fastest`: largest measured rate, rad/s."""
-    words = ', '.join(f'{jump.name} at {jump.start:.1f} s' for jump in jumps[:3])
-    if len(jumps) > 3:
-        words += f' and {len(jumps) - 3} times more'
+def jump_finding(jumps: Sequence[Jump]) -> CheckFinding:
+    """Return the finding of jumps."""
+    words = first_of([f'{jump.name} at {jump.start:.1f} s' for jump in jumps])
     by_joints = max(jump.rate for jump in jumps)
     return CheckFinding(
         'joint_jump',
         REFUSE,
         f'joint states must not jump, they do: {words} ({by_joints:.0f} rad/s by the joints, the'
-        f' IMU measures {fastest:.1f} rad/s at most); check the driver of the table, and exclude'
-        ' that time; if a zero has changed, use the time before or after it only',
+        f' IMU measures {jumps[0].fastest:.1f} rad/s at most); check the driver of the table, and'
+        ' exclude that time; if a zero has changed, use the time before or after it only',
     )
 
 
@@ -286,9 +292,9 @@ def _expected_rates(windows: Sequence[Window], table: Table) -> list[np.ndarray]
     return [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
 
 
-def _unsaturated(windows: Sequence[Window]) -> list[Window]:
+def _unsaturated(windows: Sequence[Window]) -> list[bool]:
     """
-    Return the windows in which no rate is at an end of its range.
+    Return for each window whether no rate in it is at an end of its range.
 
     The missing part of a saturated rate may lie along the axis of a joint that rests.
     """
@@ -300,21 +306,7 @@ def _unsaturated(windows: Sequence[Window]) -> list[Window]:
     is_limit = at_end.sum(axis=1) > SATURATED_SAMPLES
     saturated = (at_end & is_limit[:, None]).any(axis=(0, 2))
     parts = np.split(saturated, np.cumsum([len(window) for window in windows])[:-1])
-    return [window for window, part in zip(windows, parts) if not part.any()]
-
-
-@dataclass(frozen=True)
-class _FrozenJoint:
-    """A joint whose state is constant while the IMU turns about its axis."""
-
-    name: str
-    """Its name."""
-    spans: list[tuple[float, float]]
-    """When it does, s."""
-    gain: float
-    """Sum of squares of the rates that its motion explains, (rad/s)^2."""
-    square: float
-    """Sum of squares of the rates that its state does not explain, (rad/s)^2."""
+    return [not part.any() for part in parts]
 
 
 @dataclass(frozen=True)
@@ -326,9 +318,31 @@ class _Standstill:
     stop: float
     """Last sample, s."""
     gain: float
-    """Sum of squares of the rates that the motion explains, (rad/s)^2."""
+    """Sum of squares of the rates that a motion of the joint explains, (rad/s)^2."""
     square: float
-    """Sum of squares of the rates that the state does not explain, (rad/s)^2."""
+    """Sum of squares of the rates that its state does not explain, (rad/s)^2."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Suspect:
+    """A joint that may be frozen."""
+
+    name: str
+    """Its name."""
+    spans: list[tuple[float, float]]
+    """(start, stop) in which its state is constant, s."""
+    standstills: list[_Standstill]
+    """Parts of this time in which the IMU turns about its axis."""
+
+    @property
+    def gain(self) -> float:
+        """`_Standstill.gain` of all."""
+        return sum(standstill.gain for standstill in self.standstills)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether a motion of the joint explains what its state does not."""
+        return self.gain > FROZEN_SHARE * sum(each.square for each in self.standstills)
 
 
 def _suspects(
@@ -336,7 +350,7 @@ def _suspects(
     table: Table,
     expected: Sequence[np.ndarray],
     rests: Sequence[JointRest],
-) -> list[_FrozenJoint]:
+) -> list[_Suspect]:
     """
     Return the joints that may be frozen, the one whose motion explains most of the rates first.
 
@@ -345,45 +359,57 @@ def _suspects(
     # The bias is the rate of the slowest rest.
     bias = min((rest.rate_s for rest in rests), key=np.linalg.norm, default=np.zeros(3))
     turning = [rest for rest in rests if np.linalg.norm(rest.rate_s - bias) > MIN_TURN_RATE]
-    joints = []
+    suspects = []
     for k, name in enumerate(table.joint_names):
-        found = []
+        standstills: list[_Standstill] = []
         for window, rate in zip(windows, expected):
-            found += _standstills(window, table, rate, joint=k)
+            standstills += _standstills(window, table, rate, joint=k)
         for rest in turning:
-            found += _turn_at_rest(rest, table, rest.rate_s - bias, joint=k)
-        if found:
-            spans = [_while_constant(each, windows, rests, joint=k) for each in found]
-            spans = _joined(list(dict.fromkeys(spans)))
-            gain = sum(each.gain for each in found)
-            joints.append(_FrozenJoint(name, spans, gain, sum(each.square for each in found)))
-    return sorted(joints, key=lambda joint: -joint.gain)
+            standstills += _turn_at_rest(rest, table, rest.rate_s - bias, joint=k)
+        if standstills:
+            course = _JointCourse.of(windows, rests, joint=k)
+            spans = _joined([course.while_constant(standstill) for standstill in standstills])
+            suspects.append(_Suspect(name, spans, standstills))
+    return sorted(suspects, key=lambda suspect: -suspect.gain)
 
 
-def _while_constant(
-    standstill: _Standstill, windows: Sequence[Window], rests: Sequence[JointRest], *, joint: int
-) -> tuple[float, float]:
-    """
-    Return from when to when the state of a joint is that in a standstill, s.
+@dataclass(frozen=True, eq=False)
+class _JointCourse:
+    """The state of a joint in moving windows and at rest, in the order of time."""
 
-    Where a joint with a frozen state rests in another place, the rates of the others are wrong too.
-    """
-    times = [window.time for window in windows]
-    positions = [window.motion.position[:, joint] for window in windows]
-    for rest in rests:
-        times.append(np.array([rest.start, rest.stop]))
-        positions.append(np.full(2, rest.position[joint]))
-    time, position = np.concatenate(times), np.concatenate(positions)
-    order = np.argsort(time, kind='stable')
-    time, position = time[order], position[order]
+    time: np.ndarray
+    """s, shape (n,)."""
+    position: np.ndarray
+    """rad, shape (n,)."""
 
-    within = (time >= standstill.start) & (time <= standstill.stop)
-    is_same = np.abs(position - np.median(position[within])) < SAME_STATE
-    for start, stop in runs_of(is_same):
-        first, last = float(time[start]), float(time[stop - 1])
-        if first <= standstill.stop and last >= standstill.start:
-            return first, last
-    return standstill.start, standstill.stop
+    @classmethod
+    def of(
+        cls, windows: Sequence[Window], rests: Sequence[JointRest], *, joint: int
+    ) -> '_JointCourse':
+        """Return the state of a joint at the samples of windows, and at both ends of rests."""
+        times = [window.time for window in windows]
+        positions = [window.motion.position[:, joint] for window in windows]
+        for rest in rests:
+            times.append(np.array([rest.start, rest.stop]))
+            positions.append(np.full(2, rest.position[joint]))
+        time = np.concatenate(times)
+        order = np.argsort(time, kind='stable')
+        return cls(time[order], np.concatenate(positions)[order])
+
+    def while_constant(self, standstill: _Standstill) -> tuple[float, float]:
+        """
+        Return from when to when the state is that in a standstill, s.
+
+        Where a joint with a frozen state rests in another place, the rates of the others are wrong
+        too.
+        """
+        is_within = (self.time >= standstill.start) & (self.time <= standstill.stop)
+        is_same = np.abs(self.position - np.median(self.position[is_within])) < SAME_STATE
+        for start, stop in runs_of(is_same):
+            first, last = float(self.time[start]), float(self.time[stop - 1])
+            if first <= standstill.stop and last >= standstill.start:
+                return first, last
+        return standstill.start, standstill.stop
 
 
 def _standstills(

@@ -18,9 +18,7 @@ from imu_calibration.preprocessing.frozen_joints import (
     outside_of,
     standing_still,
 )
-from imu_calibration.preprocessing.joint_geometry import (
-    mount_rpy_deg,
-)
+from imu_calibration.preprocessing.joint_geometry import mount_rpy_deg
 from imu_calibration.preprocessing.on_table import (
     TESTED_RATE,
     AxisMatch,
@@ -156,10 +154,8 @@ def _rate_findings(
     sums: ProductSums, windows: list[Window], table: Table, *, rests: Sequence[JointRest] = ()
 ) -> list[CheckFinding]:
     """Return the finding of rates that are not those of the joints, apart from the IMU axes."""
-    windows = [window for window in windows if len(window) == len(window.motion)]
     # A jump adds rates of no motion, which the other checks must not see.
-    fastest = max((float(np.linalg.norm(w.rate_s, axis=1).max()) for w in windows), default=0.0)
-    jumps = find_jumps(windows, table, fastest)
+    jumps = find_jumps(windows, table)
     if jumps:
         spans = [(jump.start, jump.stop) for jump in jumps]
         windows = outside_of(windows, spans, margin=BESIDE_JUMP)
@@ -174,7 +170,7 @@ def _rate_findings(
     finding = exchanged(exchange, windows, table) if exchange else None
     finding = finding or standing_still(windows, table, rests=rests)
     if finding is None and jumps:
-        finding = jump_finding(jumps, fastest)
+        finding = jump_finding(jumps)
     finding = finding or same_motion(sums, windows, table)
     return [] if finding is None else [finding]
 

@@ -421,13 +421,13 @@ def _delay_cause(windows: Sequence[Window], table: Table) -> str:
 
 
 def a_period_late(
-    windows: Sequence[Window], table: Table, *, least_share: float = LEAST_SHARE_EXPLAINED
+    windows: Sequence[Window], table: Table, *, least_share: float = 0.0
 ) -> CheckFinding | None:
     """
     Return the finding for streams that agree clearly better with a delay, or None.
 
     Beyond the range of a lag: clocks that differ, or streams of a repeating motion that are a
-    period apart. `least_share`: of the rates that the joints explain with the delay.
+    period apart. With the delay the joints explain `least_share` of the rates at least.
     """
     delay = _estimate_delay(windows, table)
     # A smaller delay is estimated as a lag, with the other parameters.
