@@ -90,11 +90,16 @@ class Process:
         An executor of rclpy that looks at its context between the signal and its effect waits on.
         """
         self.process.terminate()
-        try:
-            self.process.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        _await_end(self.process)
+
+
+def _await_end(process):
+    """Wait until a process has ended, which reads nothing more; kill it after 10 s."""
+    try:
+        process.communicate(timeout=10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
 
 
 class Ends:
@@ -138,7 +143,7 @@ class Ends:
     def stop(self):
         """End both: they have nothing more to read."""
         for process in (self._source, self._sink):
-            process.communicate(timeout=60)
+            _await_end(process)
 
 
 def _ask(process, *arguments):

@@ -6,7 +6,7 @@ estimate, a search, a proof and a document need of it is here; the engine is the
 of gravity.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -68,6 +68,8 @@ class PoseBlocks:
     """Readings, rad/s, shape (n, 3)."""
     poses: Slerp
     """Attitudes of the body in the room, interpolated."""
+    turns: dict = field(default_factory=dict)
+    """(effects, values) -> rotations of the blocks by the readings, see `PoseRows.turns`."""
 
     unit: ClassVar[str] = 'windows'
     reference: ClassVar[str] = 'poses of motion capture'
@@ -89,11 +91,6 @@ class PoseBlocks:
                 first, last = self.poses(ends).as_matrix()
                 found.append((block, last.T @ first))
         return found
-
-    @cached_property
-    def turns(self):
-        """Rotations of the blocks by the readings: (effects, values) -> turns (`PoseRows`)."""
-        return {}
 
     @property
     def period(self):
